@@ -1,4 +1,4 @@
-"""The autonomous experiment: measure, infer, inquire, and write down each measurement (paper, section 2.2 and 2.3)."""
+"""The autonomous experiment: measure, infer, inquire, with a journal of measurements (paper, sections 2.2, 2.3)."""
 
 from probewise.experiment.arm_error import with_arm_error
 from probewise.experiment.asking import Field

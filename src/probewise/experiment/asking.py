@@ -1,4 +1,4 @@
-"""Inquire: what every reading that the arm can take would be worth, and which to take."""
+"""Inquire: the utility of every available reading, and the choice of the next."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["Field", "inquire", "next_poses"]
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """Where the arm can go and how its sensor then stands, and seconds from a pose to places, reading included.
+    """Reach of the arm, orientations of its sensor, and seconds from a pose to places, including the reading.
 
     `reachable` and `orientation_rad` have shape (n_places,); a design's own orientation is added to the latter.
     """
@@ -33,7 +33,7 @@ class Field:
 
     @classmethod
     def under(cls, instrument: Instrument, grid: Grid) -> Self:
-        """Ask an instrument."""
+        """Build from an instrument."""
         return cls(
             np.asarray(instrument.reachable(grid.places_mm), dtype=np.bool_),
             np.asarray(instrument.orientation_rad(grid.places_mm), dtype=np.float64),
@@ -44,18 +44,18 @@ class Field:
 def inquire(
     experiment: Experiment, posterior: Weighted, drawn: FloatArray, field: Field, *, at: Reading | None
 ) -> tuple[Prospect, UtilityMap]:
-    """Value every reading that the arm can take.
+    """Compute the utility of every available reading.
 
     Parameters
     ----------
     experiment, posterior
-        What is asked, what is believed.
+        The experiment, and the current posterior.
     drawn
-        A few equally weighted hypotheses of it, (n_samples, n_params).
+        A few equally weighted posterior samples, (n_samples, n_params).
     field
-        Where the arm can go.
+        Reach of the arm.
     at
-        The last reading, where the arm stands now; None before the first, when every place counts as near.
+        The last reading, at whose place the arm is; None before the first, when travel times do not count.
     """
     designs = experiment.designs
     rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.combinations))
@@ -73,7 +73,7 @@ def inquire(
     drawn = drawn.copy()
     drawn.flags.writeable = False
     theta, weight = posterior.theta, posterior.weight
-    if experiment.trust < 1:  # the samples of many kinds: no more than of one are asked
+    if experiment.trust < 1:  # samples of several kinds: use no more than for one
         some, share = thinned(weight, experiment.n_particles)
         theta, weight = theta[some], share / share.sum()
     prospect = Prospect(
@@ -94,12 +94,12 @@ def inquire(
 def next_poses(
     experiment: Experiment, prospect: Prospect, outlook: UtilityMap, *, rng: np.random.Generator
 ) -> tuple[Pose, ...]:
-    """Choose the next readings: one, or as many as are chosen at a time, each as often as its design repeats it."""
+    """Choose the next pose, or a batch of poses, each repeated as its design says."""
     if experiment.batch > 1:
         rows = choose_several(prospect, experiment.batch, rng=rng)
     else:
         rows = (choose(outlook.values, outlook.reachable, rng=rng),)
-    orientation_rad = prospect.plan.orientation_rad  # as the sensor will really stand there
+    orientation_rad = prospect.plan.orientation_rad  # the orientation that the sensor will have there
     designs = [(experiment.designs[row], float(orientation_rad[row])) for row in rows]
     return tuple(
         Pose(design.x_mm, design.y_mm, standing, dict(design.settings).get("height_mm"))

@@ -1,4 +1,4 @@
-"""Look over the robot's shoulder: what another sensor model makes of the readings that it did not choose."""
+"""Shadow run: the posterior of another sensor model from the same readings."""
 
 from __future__ import annotations
 
@@ -24,14 +24,13 @@ def beside(
     Parameters
     ----------
     steps
-        Of the run, as they come (`explore`).
+        Steps of the run, as they arrive (`explore`).
     other
-        The same question asked of another sensor model. What it would read next it never gets, unless the run
-        asks for it too.
+        The same experiment with another sensor model. Its own choices of readings are not carried out.
     field
         Where the arm can go.
     rng
-        Source of randomness of the other's inference; the run has its own.
+        Random generator of the other's inference; the run has its own.
     """
     prior_bits = prior_entropy(other.prior, rng=rng)
     state = begin(other, field, rng=rng)

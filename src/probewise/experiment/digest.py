@@ -1,4 +1,4 @@
-"""Recognise a value again in another process: a digest of its type and every bit of its numbers."""
+"""Digest of a value's types and numbers, reproducible across processes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def value_digest(value: object) -> str:
     Raises
     ------
     ParameterError
-        If it holds anything else, for instance a function: such a thing cannot be recognised again.
+        If it holds anything else, such as a function, which has no reproducible digest.
     """
     digest = hashlib.sha256()
     _feed(digest, value)

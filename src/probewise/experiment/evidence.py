@@ -1,9 +1,9 @@
-"""Take an evidence anew from the samples of its posterior, by a bridge to kernels fitted about them.
+"""Re-estimate an evidence from posterior samples, by bridge sampling with kernels fitted to them.
 
-What a run carries from reading to reading grows uncertain by what every step adds. Kernels about the
-samples are a density that can be drawn from; the samples and those draws are two ends of a bridge whose
-length is the evidence (Meng & Wong 1996), absolute, whatever has been carried. Each half of the
-samples is held against kernels fitted to the other half: about themselves they would seem denser than they are.
+The sequential estimate of the evidence accumulates errors from reading to reading. Bridge sampling (Meng & Wong 1996)
+between the samples and draws from a kernel density fitted to them gives an estimate independent of the history. Each
+half of the samples is compared with kernels fitted to the other half, to avoid the bias of evaluating a density at its
+own points.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["Bridged", "bridged", "redrawn"]
 
-_WIDE = 3.0  # times as wide as the samples around are some kernels, so that the draws reach past them
-_OF_WIDE = 0.15  # share of the draws that comes from those
+_WIDE = 3.0  # factor on the width of some kernels, so that draws extend beyond the samples
+_OF_WIDE = 0.15  # share of the draws from those
 _STEPS = 60
 _CLOSE = 1e-4
 
 
 @dataclass(frozen=True)
 class Bridged:
-    """The log evidence, its standard error, and the likelihood evaluations that it cost."""
+    """Log evidence, its standard error, and the number of likelihood evaluations."""
 
     log_z: float
     error: float
@@ -50,16 +50,16 @@ def bridged(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Gener
     rng
         Source of randomness.
     n_draws
-        Draws from the kernels, in all.
+        Total number of draws from the kernels.
 
     Returns
     -------
     Bridged
-        The mean of the two halves' estimates; the error is their own, or their difference where that is more.
+        The mean of the two halves' estimates; the error is their standard error, or their difference if larger.
     """
     n = len(posterior.theta) // 2 * 2
     rows = resampled(posterior.weight, n, rng)
-    # Copies of one sample are in one half: their rows stand together.
+    # Copies of a sample are adjacent, and so are in the same half.
     halves = np.split(rows, 2)
     found = []
     for own, other in (halves, halves[::-1]):
@@ -84,14 +84,14 @@ def bridged(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Gener
 def redrawn(
     points: FloatArray, names: tuple[str, ...], problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
 ) -> Weighted:
-    """Draw from kernels about points and weigh: the posterior wherever they reach, whatever their own shares are.
+    """Sample the posterior by importance sampling from kernels about points.
 
     Parameters
     ----------
     points
-        Where the posterior may be, (n_points, n_params); of several origins.
+        Points near the posterior, (n_points, n_params), of any origin and weight.
     names
-        Of the parameters.
+        Names of the parameters.
     problem, rng, n_draws
         As for `bridged`.
 
@@ -117,7 +117,7 @@ def redrawn(
 
 @dataclass(frozen=True, eq=False)
 class _Density:
-    """Kernels as wide as the samples around, and some that are wider."""
+    """A mixture of kernels with local widths, and some wider ones."""
 
     near: LocalKernels
     far: LocalKernels
@@ -136,14 +136,14 @@ class _Density:
 
 
 def _bridge(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> tuple[float, float]:
-    """Log evidence and its error from log ratios of target to density at draws and at `n_samples` samples' worth."""
+    """Return the log evidence and its error from log ratios of target to density at draws and samples."""
     n_draws = len(at_draws)
     if not np.isfinite(at_draws).any():
         return -math.inf, math.inf
     lean = math.log(n_samples / n_draws)
     log_z = float(logsumexp(at_draws)) - math.log(n_draws)
     for _ in range(_STEPS):
-        # expit weighs each point by which end it belongs to.
+        # expit weights each point between the two ends of the bridge.
         up = _log_mean(np.log(np.maximum(expit(at_draws - log_z + lean), 1e-300)))
         down = _log_mean(np.log(np.maximum(expit(-(at_samples - log_z + lean)), 1e-300)))
         step = up - down - lean

@@ -1,4 +1,4 @@
-"""What a run found, as a value and as files: result.json and samples.csv."""
+"""The result of a run, as a value and as files: result.json and samples.csv."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["FORMAT", "OFF_MM", "FoundParameter", "FoundShape", "found_shape", "r
 FORMAT = "exploration/1"
 
 OFF_MM = 12.0
-"""An error that the stopping rule rules out, three times its 4 mm."""
+"""Three times the 4 mm of the stopping rule: a larger error counts as wrong."""
 
 _POLYGONS = {3: "triangle", 4: "square", 5: "pentagon", 6: "hexagon", 8: "octagon"}
 
@@ -42,7 +42,7 @@ class FoundParameter:
 
 @dataclass(frozen=True)
 class FoundShape:
-    """The most probable shape, its probability among those that might lie there, and its parameters given it."""
+    """The most probable shape, its probability, and its parameters given that shape."""
 
     name: str
     probability: float
@@ -50,7 +50,7 @@ class FoundShape:
 
 
 def found_shape(run: Exploration) -> FoundShape:
-    """Sum up the posterior after the last reading: the most probable shape and its parameters."""
+    """Summarise the posterior after the last reading: the most probable shape and its parameters."""
     shape, last = run.experiment.shape, run.last
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
     name = last.likely_shape or _name(shape)
@@ -73,7 +73,7 @@ def found_shape(run: Exploration) -> FoundShape:
 
 
 def result_json(run: Exploration) -> str:
-    """Write what was found and what it cost as strict JSON, format "exploration/1"."""
+    """Serialise the result and its cost as strict JSON, format "exploration/1"."""
     require_exploration(run)
     document = {
         "format": FORMAT,
@@ -90,9 +90,9 @@ def result_json(run: Exploration) -> str:
 
 
 def samples_csv(run: Exploration) -> str:
-    """Write the weighted posterior samples of the shape as CSV: a column "weight", then one a parameter.
+    """Return the weighted posterior samples of the shape as CSV: a column "weight", then one per parameter.
 
-    Of a set of shapes the column "shape" names each sample's, and parameters of the others are left empty.
+    For a set of shapes, the column "shape" names each sample's shape, and parameters of other shapes are empty.
     """
     require_exploration(run)
     shape, names = run.experiment.shape, run.last.names

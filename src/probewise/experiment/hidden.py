@@ -1,4 +1,4 @@
-"""What lies on a simulated field: a shape that the arm does not know, given or drawn from its prior."""
+"""The hidden shape on a simulated field, given or drawn from its prior."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Truth = Sequence[float] | Mapping[str, float] | Mapping[str, Sequence[float]] | 
 
 @dataclass(frozen=True, eq=False)
 class Hidden:
-    """One shape with its parameters, theta (n_params,), by the name that it has among those that may lie there."""
+    """A shape with its parameters, theta (n_params,), and its name among the possible shapes."""
 
     name: str
     shape: Shape
@@ -34,12 +34,12 @@ class Hidden:
 
     @classmethod
     def given(cls, name: str, shape: Shape, theta: FloatArray, *, called: str = "truth") -> Hidden:
-        """Take parameters that the shape's prior allows; `called` is what messages call them.
+        """Build from parameters that the shape's prior allows; `called` is their name in messages.
 
         Raises
         ------
         ParameterError
-            If there are not as many numbers as parameters, or one that the prior excludes.
+            If the number of parameters is wrong, or the prior excludes one.
         """
         prior = shape.prior
         values = floats(theta, called)
@@ -65,12 +65,12 @@ class Hidden:
 
     @classmethod
     def of(cls, truth: Truth | None, members: Mapping[str, Shape], field: Field, *, rng: np.random.Generator) -> Hidden:
-        """Take the truth that is given: of the first member, or of a shape by name; without one draw it.
+        """Build from a given truth, of the first member or of a named shape; if None, draw it.
 
         Raises
         ------
         ParameterError
-            If it names no shape, or holds numbers that the shape's prior excludes.
+            If the name is unknown, or the shape's prior excludes the numbers.
         """
         if truth is None:
             return cls.drawn(members, rng=rng)
@@ -85,12 +85,12 @@ class Hidden:
 
     @property
     def document(self) -> dict[str, str | float]:
-        """What a journal keeps of it: a run that goes on must go on over the same."""
+        """Its entry in a journal, since a resumed run needs the same shape."""
         return {"shape": self.name, **self.parameters}
 
     @property
     def surface(self) -> Surface:
-        """What the world paints: geometry alone crosses over."""
+        """Its surface in the simulated world, which shares only geometry with the models."""
         return surface_under(self.shape.region(self.theta[None, :]), self.name)
 
     @property
@@ -104,18 +104,18 @@ class Hidden:
         return dict(zip(self.shape.prior.names, self.theta.tolist(), strict=True))
 
     def named_as(self, names: Sequence[str]) -> dict[str, float]:
-        """Name them as a hypothesis does: in a set of shapes "rectangle.width_mm", with the centre shared."""
+        """Return its parameters by the hypothesis' names: in a set, "rectangle.width_mm", with shared centre."""
         known, prefix = self.parameters, f"{self.name}."
         return {name: known[name.removeprefix(prefix)] for name in names if name.removeprefix(prefix) in known}
 
 
 def members_of(shape: Shape) -> dict[str, Shape]:
-    """List the shapes that may lie there by name: those of a set, or the one."""
+    """Return the possible shapes by name: those of a set, or the single one."""
     return dict(shape.shapes) if isinstance(shape, AnyOf) else {type(shape).__name__.lower(): shape}
 
 
 def _in_order(names: Sequence[str], values: object) -> FloatArray:
-    """Put parameters in the order of a shape's, (n_params,), where they are given by name."""
+    """Convert parameters given by name to the shape's order, (n_params,)."""
     if not isinstance(values, Mapping):
         return floats(values, "truth")  # type: ignore[arg-type]
     if set(values) != set(names):
@@ -124,7 +124,7 @@ def _in_order(names: Sequence[str], values: object) -> FloatArray:
 
 
 def _bounds(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Find the least and the greatest of each parameter where the others are those of theta, all (n_params,)."""
+    """Return the range of each parameter given the others, all (n_params,)."""
     own = np.eye(len(theta), dtype=np.bool_)
     with np.errstate(invalid="ignore"):  # of a ratio of infinities
         given = prior.to_unit_cube(theta[None])

@@ -1,14 +1,12 @@
-"""A run as it happens: one JSON line a measurement, on disk before the next one is asked for.
+"""The journal of a run: one JSON line per measurement, on disk before the next one is taken.
 
-Format "journal/1". The first line says what was run: field, shape, model, likelihood, the
-fingerprint of the sensor, seed, options. Every further line is a measurement: its index,
-pose, time, reading and covariates, then what was believed after it (mean and sd of each
-parameter, bits gained) and where to look next.
+Format "journal/1". The first line holds the settings: field, shape, model, likelihood, fingerprint of the sensor, seed,
+options. Every further line is a measurement: index, pose, time, reading and covariates, then the posterior after it
+(mean and sd of each parameter, bits gained) and the next pose.
 
-A line reaches the disk in two parts. The reading is written and synchronised as soon as it
-is taken, since it cost the arm a journey; the belief follows when it has been inferred. So a
-process that is killed at any moment loses no reading: a last line without its belief is read
-back as a reading alone, and one that is torn earlier is dropped with a note.
+A line reaches the disk in two parts. The reading is written and synchronised as soon as it is taken; the posterior
+summary ("belief") follows after inference. So a process that is killed at any time loses no reading: a last line
+without its belief is read as a reading alone, and one truncated earlier is dropped with a note.
 """
 
 from __future__ import annotations
@@ -52,13 +50,13 @@ __all__ = [
 FORMAT = "journal/1"
 PATTERN = "field"
 BELIEF = ', "belief": '
-# Settings in which a run that goes on may differ: files and folders may have moved, an arm may be called otherwise.
+# Settings in which a resumed run may differ: files may have moved, and an arm may have another name.
 _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
 
 
 @dataclass(frozen=True)
 class Belief:
-    """What was believed after a measurement: mean and sd by parameter, bits gained, the next pose."""
+    """Posterior summary after a measurement: mean and sd by parameter, bits gained, the next pose."""
 
     mean: Mapping[str, float]
     sd: Mapping[str, float]
@@ -68,7 +66,7 @@ class Belief:
 
 @dataclass(frozen=True)
 class Entry:
-    """One measurement of a journal; `belief` is None where the run was killed before it was inferred."""
+    """One measurement of a journal; `belief` is None if the run was killed before inference."""
 
     index: int
     reading: Reading
@@ -77,10 +75,10 @@ class Entry:
 
 @dataclass(frozen=True, eq=False)
 class Journal:
-    """Hold what a journal file says: its settings, its measurements, notes on what was dropped.
+    """Content of a journal file: settings, measurements, notes on dropped lines.
 
-    `n_bytes` is the length of what counts, up to the last whole line or the reading of a torn one; `n_torn` that of
-    what follows, which is cut off on resuming.
+    `n_bytes` is the length of the valid part, up to the last whole line or the reading of a truncated one; `n_torn`
+    that of the rest, which is removed on resuming.
     """
 
     path: str
@@ -92,13 +90,13 @@ class Journal:
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """The readings in the order they were taken."""
+        """The readings in order of time."""
         return tuple(entry.reading for entry in self.entries)
 
     def recording(
         self, *, patterns: Mapping[str, Pattern] | None = None, instrumentation: Instrumentation | None = None
     ) -> Recording:
-        """Turn the readings into a recording over the pattern "field"; see `recording_of`."""
+        """Convert the readings to a recording over the pattern "field"; see `recording_of`."""
         return recording_of(self.readings, patterns=patterns, instrumentation=instrumentation, source=self.path)
 
 
@@ -109,18 +107,18 @@ def recording_of(
     instrumentation: Instrumentation | None = None,
     source: str = "",
 ) -> Recording:
-    """Collect readings into a recording: one scan, over the pattern "field".
+    """Convert readings to a recording: one scan, over the pattern "field".
 
     Parameters
     ----------
     readings
-        In the order they were taken.
+        Readings in order of time.
     patterns
-        What lay on the field, {"field": ...}, where it is known; a hypothesis takes its place otherwise.
+        The pattern on the field, {"field": ...}, if known; otherwise hypotheses take its place.
     instrumentation
-        What took the readings, with unit and range.
+        Instrument, with unit and range.
     source
-        Where they come from, for messages.
+        Source of the readings, for messages.
 
     Returns
     -------
@@ -150,12 +148,12 @@ def _column(readings: Sequence[Reading], value: Any) -> FloatArray:
 
 
 def read_journal(path: str | Path) -> Journal:
-    """Read a journal back, whatever the moment at which its writer was killed.
+    """Read a journal, even if its writer was killed at any time.
 
     Raises
     ------
     FileError
-        If the file is missing, is no journal of this version, or is damaged before its last line.
+        If the file is missing, is not a journal of this version, or is damaged before its last line.
     """
     raw = read_bytes(require_path("path", path), "a journal written by this package")
     *lines, tail = raw.split(b"\n")
@@ -195,7 +193,7 @@ def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
 
 
 def _first_part(tail: bytes) -> bytes:
-    """Cut a line without its end off behind its reading, before what was believed after it."""
+    """Return the part of an incomplete line up to its reading, without the belief."""
     mark = BELIEF.encode()
     head = tail.split(mark)[0]
     torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
@@ -203,8 +201,8 @@ def _first_part(tail: bytes) -> bytes:
 
 
 def _salvaged(path: str | Path, head: bytes, index: int) -> Entry | None:
-    """Recover the reading from the first part of a line, or None where the reading itself is torn."""
-    # The covariates come last and are an object: only a whole first part closes with one more brace.
+    """Recover the reading from the first part of a line; None if the reading itself is incomplete."""
+    # The covariates come last and are an object: only a complete first part becomes valid with one more brace.
     try:
         entry = _entry(path, _parse(path, head + b"}", index + 1), index + 1)
     except FileError:
@@ -239,7 +237,7 @@ def _belief(line: Mapping[str, Any]) -> Belief:
 
 
 def _or_null(value: float) -> float | None:
-    """JSON has no NaN; a missing reading or covariate is null."""
+    """Convert NaN, a missing reading or covariate, to null, since JSON has no NaN."""
     return value if math.isfinite(value) else None
 
 
@@ -248,7 +246,7 @@ def _or_nan(value: float | None) -> float:
 
 
 def _number(value: object) -> float:
-    """Take a JSON number, not a text that Python could make one of."""
+    """Return a JSON number as a float; texts are refused."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{shown(value)} is no number")
     return float(value)
@@ -261,12 +259,12 @@ def _pose(line: Mapping[str, Any]) -> Pose:
 
 
 def _pose_line(pose: Pose) -> dict[str, float]:
-    """Write a pose; a height only where it was chosen."""
+    """Convert a pose to JSON; with the height only if it was chosen."""
     return {name: value for name, value in dataclasses.asdict(pose).items() if value is not None}
 
 
 def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None:
-    """Raise FileError naming every setting in which a journal differs from the run that wants to resume it.
+    """Raise FileError with every setting in which a journal differs from the run that would resume it.
 
     Version, arm and the name of the sensor's file may differ.
     """
@@ -283,7 +281,7 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
 
 
 def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Name every single setting, so that a message shows what differs and no more: "options.repeats"."""
+    """Flatten nested settings, such as "options.repeats", so that a message shows only the differences."""
     out: dict[str, Any] = {}
     for name, value in settings.items():
         inner = value.items() if isinstance(value, dict) else ()
@@ -293,9 +291,9 @@ def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(eq=False)
 class JournalWriter:
-    """Append to a journal; every call returns when the line is on the disk. Use as a context manager.
+    """Appends to a journal; every call returns when the line is on disk. Use as a context manager.
 
-    As long as it is open no other process can write to the journal.
+    While it is open, no other process can write to the journal.
     """
 
     path: Path
@@ -304,7 +302,7 @@ class JournalWriter:
 
     @classmethod
     def begin(cls, path: str | Path, settings: Mapping[str, Any]) -> JournalWriter:
-        """Begin a new journal with these settings, in a directory that is made if missing.
+        """Begin a new journal with these settings; missing directories are created.
 
         Raises
         ------
@@ -328,9 +326,9 @@ class JournalWriter:
 
     @classmethod
     def resume(cls, journal: Journal) -> JournalWriter:
-        """Go on behind the last whole line of a journal, or behind the reading of a torn one; what is torn is cut off.
+        """Continue after the last whole line of a journal, or the reading of a truncated one, and remove the rest.
 
-        A reading that the last line holds stays in the file: what was believed after it is written behind it.
+        A reading in an incomplete last line is kept, and its belief is appended.
 
         Raises
         ------
@@ -363,7 +361,7 @@ class JournalWriter:
         self._write(json.dumps(line, allow_nan=False)[:-1])
 
     def belief(self, belief: Belief) -> None:
-        """Write what was believed after that reading, the rest of its line."""
+        """Write the belief after that reading, the rest of its line."""
         line = {
             "mean": dict(belief.mean),
             "sd": dict(belief.sd),

@@ -1,4 +1,4 @@
-"""Judge a posterior: what it says of the shape, whether any hypothesis explains the readings, whether to stop."""
+"""Summaries of a posterior: moments, goodness of fit, stopping rule."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ __all__ = ["OFF_SDS", "chance_off", "doubt", "fit", "information", "learnt", "mo
 
 
 OFF_SDS = 3.0
-"""How far off, in sds that the run ends on, a length is to be called wrong: 12 mm for 4 mm."""
+"""Error, in units of the stopping rule's sd, above which a length counts as wrong: 12 mm for 4 mm."""
 
 
 def information(posterior: Weighted) -> float:
-    """Relative entropy of posterior to prior, nats: the mean log likelihood less the log evidence."""
-    some = posterior.weight > 0  # what has been ruled out has a log likelihood of minus infinity
+    """Return the relative entropy of posterior to prior, nats: mean log likelihood minus log evidence."""
+    some = posterior.weight > 0  # excluded samples have a log likelihood of minus infinity
     return float(posterior.weight[some] @ posterior.log_likelihood[some]) - posterior.log_z
 
 
 def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, FloatArray, dict[str, float]]:
-    """Mean and sd of the shape's parameters, (n_params,) both, and shape probabilities.
+    """Return mean and sd of the shape's parameters, (n_params,) each, and shape probabilities.
 
-    Of a set of shapes: given its most probable shape, and NaN for parameters that it does not have.
+    For a set of shapes: given the most probable shape, with NaN for parameters that it does not have.
     """
     theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
     if not isinstance(experiment.shape, AnyOf):
@@ -50,9 +50,9 @@ def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, Fl
 
 
 def chance_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
-    """Probability that a length is farther than `off_mm` from its posterior mean.
+    """Return the probability that a length differs by more than `off_mm` from its posterior mean.
 
-    Of a set of shapes: from the mean given the most probable shape, and every other shape counts as far off.
+    For a set of shapes: from the mean given the most probable shape, and other shapes count as wrong.
     """
     theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
     mean, _, _ = moments(experiment, posterior)
@@ -67,16 +67,16 @@ def chance_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> fl
 
 
 def learnt(experiment: Experiment, posterior: Weighted) -> dict[str, tuple[float, float]]:
-    """Posterior mean and sd of the sensor's parameters by name; empty where the sensor is known."""
+    """Return posterior mean and sd of the sensor's parameters by name; empty if the sensor is known."""
     n_sensor = int(experiment.shape_columns[0])
     mean, sd = posterior.mean(), posterior.sd()
     return {name: (float(mean[k]), float(sd[k])) for k, name in enumerate(experiment.names[:n_sensor])}
 
 
 def fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
-    """How well the best hypothesis fits: upper tail of chi-square, and the reading it explains worst.
+    """Return the p-value of the best hypothesis (upper tail of chi-square), and its worst-fitting reading.
 
-    One degree of freedom a reading, whatever was fitted, so that it errs towards fitting.
+    It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.
     """
     recording = problem.recording
     best = posterior.theta[[int(posterior.log_likelihood.argmax())]]
@@ -87,7 +87,7 @@ def fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> 
 
 
 def doubt(p_value: float, worst: int, readings: Sequence[Reading]) -> str:
-    """Say that no hypothesis explains the readings, and where it shows most."""
+    """Return the message that no hypothesis explains the readings, with the worst-fitting one."""
     return (
         f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "
         f"({readings[worst].value:g}); the hypothesis space excludes what lies there, or the sensor model "
@@ -104,7 +104,7 @@ def stop_reason(
     n_readings: int,
     max_readings: int | None,
 ) -> str | None:
-    """Say why a run ends, or None where it goes on."""
+    """Return the reason why a run ends, or None if it continues."""
     widest = widest_mm(experiment.shape.prior.names, sd)
     if known and p_value < experiment.doubt_p:
         return (

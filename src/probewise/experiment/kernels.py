@@ -1,8 +1,7 @@
-"""Propose from Gaussians about posterior samples, each as wide and as turned as the samples around it.
+"""Proposals from a mixture of Gaussians about posterior samples, with local covariances.
 
-A posterior after a few readings is a thin bent shell (all circles whose edge passes under one grey
-reading); one covariance for all of it proposes nothing that fits. The neighbours of a sample show
-which way the shell runs there.
+The posterior after a few readings is a thin curved shell (all circles whose edge passes under one grey reading), for
+which a global covariance is useless. The neighbours of a sample give the local direction of the shell.
 """
 
 from __future__ import annotations
@@ -19,14 +18,14 @@ from probewise._arrays import FloatArray
 __all__ = ["MOST_KERNELS", "LocalKernels"]
 
 MOST_KERNELS = 250
-_NEIGHBOURS = 10  # for each parameter, so that their covariance is known
-_RIDGE = 1e-6  # of the overall covariance, so that none is singular
-_BLOCK = 256  # points at a time: their densities stay in the cache
+_NEIGHBOURS = 10  # neighbours per parameter, enough for a covariance
+_RIDGE = 1e-6  # of the overall covariance, to avoid singular ones
+_BLOCK = 256  # points per batch, to fit the cache
 
 
 @dataclass(frozen=True, eq=False)
 class LocalKernels:
-    """Mix Gaussians of equal share: `centre` (n_kernels, n_params), `root` of each covariance, and what weighs a point.
+    """A mixture of equally weighted Gaussians: `centre` (n_kernels, n_params), and `root` of each covariance.
 
     `form` (n_features, n_kernels) gives the log density of each kernel as a product with a point's
     features: one, the coordinates about `origin`, and their products.
@@ -41,7 +40,7 @@ class LocalKernels:
     def about(
         cls, points: FloatArray, *, rng: np.random.Generator, widened: float = 1.0, most: int = MOST_KERNELS
     ) -> Self:
-        """Fit at most so many to equally weighted samples, (n_samples, n_params), `widened` times as wide as those."""
+        """Fit at most `most` kernels to equally weighted samples, (n_samples, n_params), widened by a factor."""
         n_samples, n_params = points.shape
         origin = points.mean(axis=0)
         away = points - origin
@@ -72,7 +71,7 @@ class LocalKernels:
         return np.asarray(self.origin + self.centre[which] + np.einsum("nij,nj->ni", self.root[which], white))
 
     def log_density(self, points: FloatArray) -> FloatArray:
-        """Natural log of the density, (n, n_params) -> (n,)."""
+        """Return the natural log of the density, (n, n_params) -> (n,)."""
         upper = np.triu_indices(points.shape[1])
         out = np.empty(len(points))
         for start in range(0, len(points), _BLOCK):
@@ -80,7 +79,7 @@ class LocalKernels:
             features = np.concatenate([np.ones((len(away), 1)), away, away[:, upper[0]] * away[:, upper[1]]], axis=1)
             each = features @ self.form
             most = each.max(axis=1)
-            # Only the nearest kernels count: single precision serves a density that proposes.
+            # Only the nearest kernels matter, and single precision suffices for a proposal density.
             each -= most[:, None]
             out[start : start + _BLOCK] = most + np.log(np.exp(each.astype(np.float32)).sum(axis=1))
         return out - math.log(len(self.centre))

@@ -1,4 +1,4 @@
-"""The kinds of hypotheses that a run weighs against each other: what lies there, and what the sensor leaves out."""
+"""The kinds of hypotheses that a run compares: combinations of a shape and an effect that the sensor leaves out."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ __all__ = ["Kind", "kinds_of"]
 
 @dataclass(frozen=True, eq=False)
 class Kind:
-    """Hypotheses that share their parameters and differ in their values: a model of its own, with its own evidence.
+    """A model with its own parameters and evidence, whose hypotheses are parameter values.
 
     Attributes
     ----------
     shape
-        Which shape of a set; empty where there is one only.
+        Its shape in a set of shapes; empty for a single shape.
     left_out
-        What the sensor model leaves out; empty where nothing.
+        The effect that the sensor model leaves out; empty if none.
     log_prior
-        Natural log of its probability before the first reading.
+        Natural log of its prior probability.
     prior, model, likelihood
-        Of its own parameters.
+        Prior, model and likelihood of its own parameters.
     placed
-        Writes its hypotheses, (n, n_own), as hypotheses of the whole experiment, (n, n_params): what they
-        do not say follows the prior, what the sensor leaves out is left aside.
+        Converts its hypotheses, (n, n_own), to those of the whole experiment, (n, n_params): missing parameters are
+        drawn from the prior, and those of the effect are dropped.
     whole_names
         Names of the experiment's parameters.
     effect
-        What is left out, where it is an effect on the mean; its parameters are the last of the kind's.
+        The effect left out, if it is on the mean; its parameters are the last ones.
     """
 
     shape: str
@@ -73,22 +73,22 @@ def kinds_of(
     trust: float = 1.0,
     rivals: Sequence[Rival] = (),
 ) -> tuple[Kind, ...]:
-    """List the kinds of an experiment.
+    """Return the kinds of an experiment.
 
     Parameters
     ----------
     shape
-        What may lie there: each shape of a set is a kind.
+        The possible shape; each shape of a set is a kind.
     sensor_prior
-        Of the parameters before the shape's, which every kind has; or None.
+        Prior of the parameters before the shape's, shared by every kind; or None.
     prior, likelihood
-        Of all parameters of the experiment.
+        Prior and likelihood of all parameters of the experiment.
     models
-        The sensor model as the plain kinds ask it, with its tables, and the chain that effects are added to.
+        The sensor model for kinds without effects, with its tables, and the chain to which effects are added.
     trust
-        Probability that the sensor model leaves nothing out; the rivals share the rest evenly.
+        Prior probability that the sensor model is complete; the rivals share the rest equally.
     rivals
-        What it may leave out, beside each shape; those of one name share what one has.
+        Effects that it may leave out, for each shape; rivals of one name share the probability of one.
     """
     quick, chain = models
     ways = Counter(rival.name for rival in rivals)
@@ -116,10 +116,9 @@ def kinds_of(
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One shape: its prior with the sensor's, its share, and which columns of the whole its parameters are.
+    """One shape: its prior with the sensor's, its prior probability, and the columns of its parameters.
 
-    `number` is its place in the set and `n_sensor` how many columns come before the shape's; None for an only shape,
-    whose columns are all.
+    `number` is its index in the set, None for a single shape; `n_sensor` the number of columns before the shape's.
     """
 
     label: str
@@ -141,7 +140,7 @@ class _Part:
         return np.asarray(full)
 
     def model(self, whole: SensorModel) -> SensorModel:
-        """Ask a model of all parameters, and of an effect's behind them, for this shape alone."""
+        """Restrict a model of all parameters, followed by those of an effect, to this shape."""
         if self.number is None:
             return whole
         middle = self.whole.from_unit_cube(np.full((1, len(self.whole.names)), 0.5))[0]
@@ -166,7 +165,7 @@ def _parts(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_Part
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """A model of which some parameters are asked; the others, which make no difference, stay as they are."""
+    """A model restricted to some parameters; the others, which have no influence, are fixed."""
 
     whole: SensorModel
     names: tuple[str, ...]
@@ -182,7 +181,7 @@ class _Asked:
 
 @dataclass(frozen=True, eq=False)
 class _Called:
-    """An effect's prior with its parameters called as a chain calls them."""
+    """An effect's prior with the parameter names of a chain."""
 
     effect: str
     own: Prior

@@ -1,8 +1,8 @@
-"""Learn the sensor along with the shape: what is known of it from its calibration, and how it may have changed.
+"""Infer the sensor jointly with the shape, with a prior from its calibration and possible changes since.
 
-Paper, Conclusion: "calibration on the fly". The calibrated SSF keeps its form; its size along the
-sensor's two axes, its place and the two levels are free. Their prior is the calibration's posterior,
-widened by how much a sensor may have changed since: another height, another mounting, another lamp.
+Paper, Conclusion: "calibration on the fly". The calibrated SSF keeps its form; its size along the sensor's two axes,
+its place and the two levels are free. Their prior is the calibration's posterior, widened for possible changes since:
+another height, mounting or lamp.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ __all__ = ["AdjustedMixture", "Change", "sensor_prior"]
 
 @dataclass(frozen=True)
 class Change:
-    """How much a sensor may have changed since its calibration, as sds.
+    """Prior sds of a sensor's changes since its calibration.
 
     `log_size` of the footprint along each axis (0.3: a third wider or narrower), `shift_mm` of its
     centre, `level` of dark and bright readings as a share of the difference between them.
@@ -43,7 +43,7 @@ class Change:
 
 @dataclass(frozen=True, eq=False)
 class AdjustedMixture:
-    """A known mixture, stretched about its mean along the sensor's axes and shifted: four parameters."""
+    """A known mixture, scaled about its mean along the sensor's axes and shifted: four parameters."""
 
     mixture: FixedMixture
 
@@ -53,7 +53,7 @@ class AdjustedMixture:
         return ("log_size_u", "log_size_v", "shift_u_mm", "shift_v_mm")
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Mixture of each hypothesis, theta (n_samples, 4)."""
+        """Return the mixture of each hypothesis, theta (n_samples, 4)."""
         require_columns(theta, self.names)
         size_u, size_v = np.exp(theta[:, None, 0:1]), np.exp(theta[:, None, 1:2])
         whole = self.mixture.footprint(np.empty((1, 0)))
@@ -69,7 +69,7 @@ class AdjustedMixture:
 
 
 def sensor_prior(sensor: FittedSensor, change: Change | None = None) -> Product:
-    """Believe what the calibration found, give or take its own uncertainty and what may have changed.
+    """Return the prior of the sensor: the calibration's posterior, widened for possible changes.
 
     The parameters are those of `AdjustedMixture`, then I_min and I_max.
     """
@@ -91,7 +91,7 @@ def sensor_prior(sensor: FittedSensor, change: Change | None = None) -> Product:
 
 
 def _moments(footprint: Footprint) -> Mapping[str, FloatArray]:
-    """Mean and sd of whole footprints along the sensor's axes, (n_samples,) each."""
+    """Return mean and sd of whole footprints along the sensor's axes, (n_samples,) each."""
     weight = footprint.weight[:, 0]
     u, v = (weight * footprint.u_mm[:, 0]).sum(axis=1), (weight * footprint.v_mm[:, 0]).sum(axis=1)
     var_u = (weight * (footprint.var_u[:, 0] + footprint.u_mm[:, 0] ** 2)).sum(axis=1) - u**2

@@ -1,4 +1,4 @@
-"""What a run believes its sensor model leaves out: by name, in a sentence, and written into the sensor."""
+"""Effects that a run's sensor model may leave out: probabilities, a sentence, and the repaired sensor."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["CLEAN", "LeftOut", "left_out_of", "repaired"]
 CLEAN = "clean"
 _CREDIBLE = 0.95
 _NAMED = 0.5
-# What belongs to the hours of one run, not to the sensor: the next run has another clock.
+# Effects in the time of one run, which do not belong to the sensor.
 _OF_THE_RUN = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name})
 _ALIASES = (
     "No reading of the field can show a tilt of the sensor, an offset of the arm or one error of scale along both "
@@ -29,7 +29,7 @@ _ALIASES = (
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Probability of each thing, by name, most probable first; `sentence` says it, `leading` is the most probable."""
+    """Probability of each effect by name, most probable first, with a sentence; `leading` is the most probable."""
 
     probability: Mapping[str, float]
     sentence: str
@@ -41,7 +41,7 @@ class LeftOut:
 
     @property
     def credible_set(self) -> tuple[str, ...]:
-        """Names of the fewest that hold 0.95."""
+        """Names in the 95 % credible set."""
         held, names = 0.0, []
         for name, p in self.probability.items():
             names.append(name)
@@ -51,7 +51,7 @@ class LeftOut:
         return tuple(names)
 
     def as_json(self) -> dict[str, Any]:
-        """Write it as result.json has it."""
+        """Return its entry in result.json."""
         hypotheses = [
             {"effects": [] if name == CLEAN else [name], "probability": p} for name, p in self.probability.items()
         ]
@@ -59,7 +59,7 @@ class LeftOut:
 
 
 def left_out_of(last: Step, trust: float) -> LeftOut:
-    """Sum up what is believed after a step, in a run that trusted its sensor so much."""
+    """Summarise the probabilities after a step, in a run with this prior trust in its sensor."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     probability = {name: p for p, name in shares}
     if trust == 1:
@@ -81,7 +81,7 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
 
 
 def _said(last: Step, name: str) -> str:
-    """Say what an effect does, with its numbers, where it has any."""
+    """Describe an effect, with its numbers if it has any."""
     best = max(
         (k for k, kind in enumerate(last.kinds.kinds) if kind.left_out == name), key=lambda k: last.kinds.log_odds[k]
     )
@@ -95,9 +95,9 @@ def _said(last: Step, name: str) -> str:
 
 
 def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:
-    """Write the effect that a run found into its sensor, with the doubt that it left.
+    """Return the sensor with the effect that a run found, and with its remaining uncertainty.
 
-    An effect of the noise, and one that belongs to the hours of the run, is told in a note alone.
+    A noise effect, or one in the time of the run, is only mentioned in a note.
     """
     name, p = max(last.left_out.items(), key=lambda item: item[1])
     if not name or p < _NAMED:

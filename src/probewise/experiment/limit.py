@@ -1,4 +1,4 @@
-"""How few readings an experiment could do with, on average, whatever chose them."""
+"""A lower bound on the mean number of readings of an experiment, for any strategy."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ from probewise.inquiry import Bound, capacity_bits, fewest_readings, prior_entro
 
 __all__ = ["least_readings"]
 
-_MET = 5.0  # noise sds from what is read beside the shape, so that a reading says that the shape is there
+_MET = 5.0  # noise sds from the background at which a reading counts as on the shape
 
 
 def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_samples: int = 20_000) -> Bound:
-    """Bits needed over bits that readings can carry, search and refinement apart.
+    """Return the bound: bits needed over bits per reading, for search and refinement separately.
 
-    The search ends with the first reading on the shape. The best first place lies on it with some
-    probability p: its reading carries no more than a yes or no of that probability, and the yes leaves
-    a share p of all hypotheses. From there to the sd that is asked for every reading carries no more than
-    the sensor's capacity.
+    The search ends with the first reading on the shape. The best first place is on the shape with some probability p:
+    its reading carries at most the information of a yes or no with that probability, and a yes leaves a share p of all
+    hypotheses. From there to the target sd, every reading carries at most the sensor's capacity.
 
     Parameters
     ----------
     experiment
-        One shape, known sensor: its prior, its sensor, the sd that it ends on.
+        An experiment with one shape and a known sensor.
     rng, n_samples
-        Draw hypotheses from the prior.
+        Random generator and number of draws from the prior.
     """
     prior = experiment.prior
     theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))

@@ -1,7 +1,7 @@
-"""Measure, infer, inquire, until every length is known well enough (paper, the machine learning system).
+"""Measure, infer, inquire, until the target precision is reached (paper, the machine learning system).
 
-`step` takes one reading by hand; `explore` is the plain loop around it, a generator, so that
-the command line, notebooks and reports see the same steps; `run` collects them.
+`step` processes one reading; `explore` is the loop around it, a generator, so that the command line, notebooks and
+reports see the same steps; `run` collects them.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ from probewise.nested.importance import Weighted
 __all__ = ["begin", "explore", "run", "step"]
 
 WARY = 12.0
-"""Times as readily as it is believed that something is left out, by which a run chooses its readings and its end."""
+"""Factor on the odds that the sensor model is incomplete, for the choice of readings and the stopping rule."""
 
 
 def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> State:
-    """Choose the first place: the map of hypotheses drawn from the prior.
+    """Choose the first place, by the map of hypotheses drawn from the prior.
 
     Parameters
     ----------
     experiment
-        What is asked.
+        The experiment.
     field
-        Where the arm can go, and how long it takes.
+        Reach of the arm, and travel times.
     rng
         Source of randomness.
 
@@ -60,7 +60,7 @@ def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> 
     ReachError
         If no place is reachable.
     ParameterError
-        If the prior has no mass, every place promises the same, or the only one nothing.
+        If the prior has no mass, or no place is more informative than others.
     """
     posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
     joined = posterior.joined(rng=rng)
@@ -87,22 +87,22 @@ def step(
     rng: np.random.Generator,
     max_readings: int | None = None,
 ) -> tuple[State, Step]:
-    """Infer from one more reading and ask where the next would tell most.
+    """Update the posterior with one reading, and choose the next.
 
     Parameters
     ----------
     state
         The readings so far and the posterior given them.
     reading
-        The new one.
+        The new reading.
     experiment, field
         See `begin`.
     prior_bits
         Differential entropy of the prior, see `inquiry.prior_entropy`.
     rng
-        Source of randomness of this step.
+        Random generator of this step.
     max_readings
-        Say that the run is over at this many readings, if not before.
+        Limit of readings at which the run ends.
 
     Raises
     ------
@@ -115,7 +115,7 @@ def step(
     readings = (*state.readings, reading)
     problem = experiment.problem(readings)
     with warnings.catch_warnings():
-        # Each step keeps its own doubts; a warning a reading would bury them.
+        # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         carried = experiment.learning.updated(state.posterior, problem.recording, rng=rng)
     posterior = carried.joined(rng=rng)
@@ -125,7 +125,7 @@ def step(
     leader = carried.kinds[carried.leader]
     p_value, worst = fit(experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording))
     if leader.likelihood is not experiment.likelihood:
-        p_value = 1.0  # that law of the noise expects readings that are far off
+        p_value = 1.0  # this noise model allows for outliers
     notes = () if posterior.run is None else posterior.run.warnings
     if p_value < experiment.doubt_p:
         notes = (*notes, doubt(p_value, worst, readings))
@@ -161,13 +161,13 @@ def step(
 
 
 def _wary(carried: Posterior, rng: np.random.Generator) -> tuple[Posterior, Weighted]:
-    """Doubt the sensor more than it is believed that it deserves: what the next reading and the end are decided by."""
+    """Return the posterior with larger odds of an incomplete sensor model, for choosing readings and stopping."""
     wary = carried.doubting(WARY)
     return wary, wary.joined(rng=rng)
 
 
 def _is_known(experiment: Experiment, posterior: Weighted) -> bool:
-    """Tell whether a posterior meets the stopping rule."""
+    """Return whether a posterior meets the stopping rule."""
     _, sd, shapes = moments(experiment, posterior)
     return experiment.is_known(sd, shapes, chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm))
 
@@ -181,43 +181,41 @@ def explore(
     journal: str | Path | Journal | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Generator[Step, None, None]:
-    """Let the robot find the shape: yield one step a reading until its lengths are known (paper, section 2).
+    """Let the robot find the shape: yield one step per reading until the target precision (paper, section 2).
 
-    A run that is left before its end holds its journal against others until it is closed.
+    A generator that is not exhausted keeps its journal locked until it is closed.
 
     Parameters
     ----------
     instrument
-        What takes the readings, entered already (`with arm:`); or an object of your own with a `measure(pose)`, see
+        The instrument, already entered (`with arm:`), or your own object with `measure(pose)`, see
         `probewise.arm.instrument_of`.
     experiment
-        What is asked, of which sensor, how long.
+        The experiment: shape, sensor model, stopping rule.
     rng
-        Gives the run its seed: a child of its seed sequence, from which each reading has a
-        child of its own. So one seed gives the whole run, and a resumed run goes on bit for bit
-        as if it had never been interrupted.
+        Source of the run's seed: a child of its seed sequence, with a child for each reading. So one seed determines
+        the whole run, and a resumed run continues bit for bit as if it had not been interrupted.
     max_readings
-        End here if the lengths are not known by then.
+        Largest number of readings.
     journal
-        File that gets one JSON line a measurement. Where it exists already the run resumes: the
-        readings it holds are taken from it, not from the instrument, and their steps are
-        yielded again with `replayed` set. An instrument that cannot read its state from the world,
-        such as a simulated one, must stand where the last of them left it: read the journal, place
-        the instrument, and hand the journal over as it was read. Folders that are missing are made.
+        File with one JSON line per measurement. If it exists, the run resumes: its readings are taken from the journal
+        instead of the instrument, and their steps are yielded again with `replayed` set. A simulated instrument must be
+        in the state after the last of them: read the journal, place the instrument, and pass the journal as read.
+        Missing folders are created.
     about
-        What the journal's first line says besides, such as which sensor it is and what a simulated field hides:
-        a run that goes on must agree with it too (but for the names of arm and file, see `require_same_settings`).
+        Further entries of the journal's first line, such as the sensor and the hidden shape of a simulated field; a
+        resumed run must agree with them (except for names of arm and file, see `require_same_settings`).
 
     Raises
     ------
     ReachError
-        If the arm can reach no place of the grid.
+        If no place of the grid is reachable.
     FileError
         If the journal is damaged, belongs to a run with other settings, or is written to by another process.
     NotConvergedError
         If no hypothesis could have given the readings.
     LinkError
-        If the instrument fails, or returns what the sensor cannot read.
+        If the instrument fails, or returns a reading out of range.
     """
     require_measures("instrument", instrument)
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
@@ -228,7 +226,7 @@ def explore(
     before = journal if isinstance(journal, Journal) else None
     if before is None and path is not None and path.exists():
         before = read_journal(path)
-    settings = {} if path is None else experiment.settings(seed) | dict(about or {})  # not all can be named
+    settings = {} if path is None else experiment.settings(seed) | dict(about or {})  # settings may lack a name
     if before is not None:
         require_same_settings(before, settings)
         seed = np.random.SeedSequence(seed.entropy, spawn_key=tuple(before.settings["spawn_key"]))
@@ -252,10 +250,9 @@ def run(
     hidden: Hidden | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Exploration:
-    """Run `explore` to its end and collect the steps; `progress` is called with each as it comes.
+    """Run `explore` to its end and collect the steps; `progress` is called with each step.
 
-    `hidden` says what a simulated field holds, for those who look at the result and for the journal; the run knows
-    nothing of it.
+    `hidden` is the true shape of a simulated field, for reports and the journal; the run does not use it.
     """
     if progress is not None:
         require_callable("progress", progress, "a function that is called with every Step, or None")
@@ -283,14 +280,14 @@ def _steps(
     field = Field.under(instrument, experiment.grid)
     first = _rng_of(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
-    state = begin(experiment, field, rng=first)  # before there is a journal: what cannot begin leaves none
+    state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
     with _writer(path, before, settings) as writer:
         stopped = False
         while not stopped:
             number = len(state.readings) + 1
             entry = replayed[number - 1] if number <= len(replayed) else None
             reading = instrument.measure(state.next_pose) if entry is None else entry.reading
-            _require_readable(experiment, reading)  # before it is written, lest a resume fail on it again
+            _require_readable(experiment, reading)  # before it is written, or a resumed run fails again
             if writer is not None and entry is None:
                 writer.reading(number, reading)
             state, info = step(
@@ -306,7 +303,7 @@ def _steps(
                 writer.belief(_belief(info, state))
             if entry is not None:
                 info = dataclasses.replace(info, replayed=True)
-                # The journal decides, also where another machine's arithmetic would choose another place.
+                # The journal's pose is used, even if another machine's arithmetic would choose another.
                 if entry.belief is not None:
                     state = dataclasses.replace(state, next_pose=entry.belief.next_pose)
             if number == 1 and notes:
@@ -316,7 +313,7 @@ def _steps(
 
 
 def _require_readable(experiment: Experiment, reading: Reading) -> None:
-    """Refuse what the sensor cannot have read: the instrument is at fault, and the run goes on when it is mended."""
+    """Raise LinkError for a reading out of range: the instrument is at fault, and the run can be resumed."""
     try:
         experiment.readout.require(reading.value)
     except ParameterError as error:
@@ -332,7 +329,7 @@ def _writer(
 
 
 def _child(rng: np.random.Generator) -> np.random.SeedSequence:
-    """Derive a run's seed: runs that share a generator differ, and do not depend on what else was drawn from it."""
+    """Derive a run's seed: runs that share a generator differ, independent of other draws from it."""
     seed = rng.bit_generator.seed_seq
     if not isinstance(seed, np.random.SeedSequence):
         seed = np.random.SeedSequence([int(word) for word in rng.integers(2**32, size=4)])
@@ -340,7 +337,7 @@ def _child(rng: np.random.Generator) -> np.random.SeedSequence:
 
 
 def _rng_of(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
-    """Seed the generator of one reading, the same whatever was drawn for the readings before."""
+    """Return the generator of one reading, independent of draws for earlier readings."""
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
 
 

@@ -1,4 +1,4 @@
-"""How a reading changes what a run believes: one Protocol, and sequential Monte Carlo, the default."""
+"""Methods of sequential inference: one Protocol, and sequential Monte Carlo, the default."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from probewise.recordings.plan import Recording
 
 __all__ = ["Method", "SequentialMonteCarlo", "from_scratch"]
 
-DLOGZ = 0.5  # the last live points are posterior samples too: letting them die one by one would only refine log Z
+DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 
 
 class Method(Protocol):
-    """Infer after every reading. A frozen dataclass, so that a journal can name it."""
+    """Inference after every reading. A frozen dataclass, so that a journal can record it."""
 
     @property
     def label(self) -> str:
-        """Name it in a few words, for a report."""
+        """Short name for reports."""
         ...
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Take in the last reading of a recording.
+        """Update the posterior with the last reading of a recording.
 
         Raises
         ------
@@ -44,7 +44,7 @@ class Method(Protocol):
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw the few hypotheses that are shown, and asked by the paper's utility, (n, n_params).
+        """Draw the few hypotheses that are drawn in figures and used by the paper's utility, (n, n_params).
 
         `joined` is the posterior over all kinds of hypotheses, given the recording.
         """
@@ -53,12 +53,12 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class SequentialMonteCarlo:
-    """Carry weighted samples from reading to reading; nested sampling takes over where a reading surprises.
+    """Sequential Monte Carlo with weighted samples; nested sampling takes over if no sample predicts a reading.
 
     Parameters
     ----------
     n_particles
-        Samples of a kind of hypotheses that counts.
+        Samples of a probable kind of hypotheses.
     n_live
         Live points of nested sampling.
     """
@@ -89,13 +89,13 @@ class SequentialMonteCarlo:
 
 
 def from_scratch(problem: SensorProblem, n_live: int, rng: np.random.Generator) -> NestedResult:
-    """Infer from all readings at once by nested sampling: where the samples so far cannot be carried on."""
+    """Infer from all readings at once by nested sampling, when the samples cannot be updated."""
     return run(
         problem,
         rng=rng,
         n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
         move=KernelMove(),
         stop=RemainingEvidence(DLOGZ),
-        max_cost=1.0,  # the robot waits
+        max_cost=1.0,  # speed matters, since the robot waits
         return_interrupted=False,
     )

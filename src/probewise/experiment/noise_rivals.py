@@ -1,6 +1,6 @@
-"""Other laws of the noise than the one that a sensor is said to have: rivals that leave the mean as it is.
+"""Alternative noise models to the declared one, as rivals with the same mean.
 
-Each scores all readings of a run at once, over equally weighted nodes of its prior.
+Each likelihood is marginalised over equally weighted nodes of its prior.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from probewise.sensor import NoiseLevel
 
 __all__ = ["Correlated", "Flickering", "Lost", "OnLattice", "Tailed", "WithSignal", "noise_laws"]
 
-_REACH = 5.0  # sds beyond its range that a sensor may read
+_REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
-_EXACT = 1e-3  # of the noise sd: how exactly a lost reading holds its value
+_EXACT = 1e-3  # of the noise sd: tolerance of a lost reading's value
 _PHASES = 7
-_PER_PHASE = 0.16  # of the amplitude: as far as the sines of neighbouring phases lie apart, about, they are spread
-_COARSE = 0.3  # noise sds, from which on a lattice of the readings matters
-_PRINTED = 0.05  # noise sds: how closely readings that are not rounded would lie on a lattice by chance
-_FREE = 2  # readings that lie on a lattice of their own choice
+_PER_PHASE = 0.16  # of the amplitude: width of each phase's component, about the spacing of neighbouring phases
+_COARSE = 0.3  # noise sds from which rounding of the readings matters
+_PRINTED = 0.05  # noise sds: smallest lattice that is not likely by chance for unrounded readings
+_FREE = 2  # readings that determine the lattice
 
 
 def _mean_over(nodes: list[FloatArray]) -> FloatArray:
@@ -35,9 +35,9 @@ def _mean_over(nodes: list[FloatArray]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class Tailed:
-    """Score readings of which some scatter more widely, over the prior of how many and how widely.
+    """Likelihood with outliers, marginalised over their share and width.
 
-    `sd` and `step` are those of the plain noise (step 0: not rounded); `shares` and `sizes`, (n_nodes,), are equally
+    `sd` and `step` are those of the declared noise (step 0: not rounded); `shares` and `sizes`, (n_nodes,), are equally
     weighted nodes.
     """
 
@@ -58,9 +58,9 @@ class Tailed:
 
 @dataclass(frozen=True, eq=False)
 class Lost:
-    """Score readings of which some are lost, whatever lies under the sensor.
+    """Likelihood with lost readings, independent of the target.
 
-    To black, exactly or within the noise, or to anything in its range.
+    Lost readings are black, exactly or within the noise, or anything in the range.
     """
 
     sd: float
@@ -85,7 +85,7 @@ class Lost:
 
 @dataclass(frozen=True, eq=False)
 class Correlated:
-    """Score readings whose noise remembers that of the reading before, over the prior of how well."""
+    """Likelihood with AR(1) noise, marginalised over the correlation."""
 
     sd: float
     step: float
@@ -107,7 +107,7 @@ class Correlated:
 
 @dataclass(frozen=True, eq=False)
 class WithSignal:
-    """Score readings whose noise grows with the light, over the prior of how much."""
+    """Likelihood with noise that grows with the signal, marginalised over the ratio."""
 
     sd: float
     step: float
@@ -129,10 +129,9 @@ class WithSignal:
 
 @dataclass(frozen=True, eq=False)
 class Flickering:
-    """Score readings under a lamp that flickers faster than they come: each has a phase of its own.
+    """Likelihood under a lamp that flickers faster than the readings: each reading has a random phase.
 
-    `amplitudes` are equally weighted nodes. A sine of even phase is a mixture of a few, each spread as far as its
-    neighbours are away.
+    `amplitudes` are equally weighted nodes. A sine of uniform phase is approximated by a mixture over a few phases.
     """
 
     sd: float
@@ -152,7 +151,7 @@ class Flickering:
 
 @dataclass(frozen=True, eq=False)
 class OnLattice:
-    """Score readings that come in coarser steps than is declared; where they lie on no lattice, as the plain noise."""
+    """Likelihood with coarser rounding than declared; without a lattice, the same as the declared noise."""
 
     sd: float
     step: float
@@ -172,14 +171,14 @@ Law = Tailed | Lost | Correlated | WithSignal | Flickering | OnLattice
 
 
 def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, Law]:
-    """List the laws by the names of the vocabulary.
+    """Return the noise models by their names in the vocabulary.
 
     Parameters
     ----------
     sd, step
-        Of the plain noise; step 0: readings are not rounded.
+        Sd and rounding step of the declared noise; step 0: not rounded.
     ends
-        What the sensor reads over black and over white.
+        Readings over black and over white.
     """
     dark, bright = ends
     low, high = sorted(ends)
@@ -196,7 +195,7 @@ def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, L
 
 
 def _each(readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, step: float) -> FloatArray:
-    """Log density of each reading, or log probability of its cell, (n_samples, n_points)."""
+    """Return the log density of each reading, or log probability of its cell, (n_samples, n_points)."""
     if not step:
         return log_gaussian_density(readings, predicted, np.asarray(sd))
     level = NoiseLevel(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
@@ -204,7 +203,7 @@ def _each(readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, s
 
 
 def _about(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
-    """As `_each`, of noise that is wider than its cell: by the density in the cell's middle, its own width added."""
+    """Return the same for noise wider than the cell, by the density at the cell's middle with its variance added."""
     if sd < step:
         return _each(readings, predicted, sd, step)
     wide = math.hypot(sd, step / math.sqrt(12.0))

@@ -1,7 +1,7 @@
-"""Count a run's time in readings: whether one takes a second or a minute, a lamp warms up over some of them.
+"""A run's own time, counted in readings, so that priors of drifts do not depend on the speed of the instrument.
 
-What drifts in a run, or happens at one moment of it, has its prior before anything is known of how fast the
-instrument is. So effects that change with time are asked at a time of the run's own, eight seconds a reading.
+Priors of effects in time are set before the speed of the instrument is known. So these effects use the run's own time,
+of eight seconds per reading.
 """
 
 from __future__ import annotations
@@ -28,25 +28,25 @@ _COLUMN = "paced_s"
 
 @dataclass(frozen=True)
 class Pace:
-    """When a run began, and the seconds from one reading to the next, on average."""
+    """Start time of a run, and mean seconds per reading."""
 
     start_s: float = 0.0
     each_s: float = EACH_S
 
     @classmethod
     def of(cls, readings: Sequence[Reading]) -> Self:
-        """Measure it."""
+        """Estimate it from readings."""
         if len(readings) < 2 or readings[-1].time_s <= readings[0].time_s:
             return cls(readings[0].time_s if readings else 0.0)
         return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
 
     def on(self, plan: Plan) -> Plan:
-        """Write the run's own time beside the clock's."""
+        """Add a column with the run's own time to a plan."""
         own = (plan.time_s - self.start_s) * (EACH_S / self.each_s)
         return replace(plan, covariates={**plan.covariates, _COLUMN: own})
 
     def on_recording(self, recording: Recording) -> Recording:
-        """Write it into a recording's plan."""
+        """Add the column to a recording's plan."""
         return replace(recording, plan=self.on(recording.plan))
 
 
@@ -60,7 +60,7 @@ class Told(Effect[Any], Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Paced(Effect[FloatArray]):
-    """An effect that changes with time, in the run's own time where a plan has it."""
+    """An effect in time, evaluated at the run's own time if the plan has it."""
 
     effect: Told
 
@@ -78,24 +78,24 @@ class Paced(Effect[FloatArray]):
 
     @property
     def prior(self) -> Prior:
-        """Of the effect, in the run's own time."""
+        """Prior of the effect, in the run's own time."""
         return self.effect.prior
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Apply it."""
+        """Apply the effect."""
         own = plan.covariates.get(_COLUMN)
         return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
 
     def by_the_clock(self, theta: FloatArray, pace: Pace) -> FloatArray:
-        """Turn parameters in the run's own time into seconds of the clock, any shape (..., n_params)."""
+        """Convert parameters from the run's own time to seconds, any shape (..., n_params)."""
         powers = np.array([self.powers.get(name, 0) for name in self.prior.names])
         return np.asarray(theta * (pace.each_s / EACH_S) ** powers)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say what it does."""
+        """Describe the effect."""
         return self.effect.sentence(mean, sd)
 
 
 def clocked(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
-    """Give an effect's parameters by the clock, whether or not it is a `Paced` one."""
+    """Return an effect's parameters in seconds, whether or not it is `Paced`."""
     return effect.by_the_clock(theta, pace) if isinstance(effect, Paced) else theta

@@ -1,8 +1,8 @@
-"""The paper's own experiment: nested sampling anew after every reading, fifty samples, the entropy of their answers.
+"""The paper's experiment: a nested sampling run after every reading, fifty samples, entropy of their predictions.
 
-Paper, "The Machine Learning System" and "Models Describing a Light Sensor". What its printing leaves open or cannot
-mean is settled as the rest of the package does (docs/explanation/errata.md): the Student-t's sigma has proper bounds,
-the SSF is the mean field's mixture in closed form rather than a sum over pixels of 1 mm.
+Paper, "The Machine Learning System" and "Models Describing a Light Sensor". Ambiguities and errors of the paper are
+resolved as in the rest of the package (docs/explanation/errata.md): the Student-t's sigma has proper bounds, the SSF is
+the mean field's mixture in closed form rather than a sum over pixels of 1 mm.
 """
 
 from __future__ import annotations
@@ -60,24 +60,24 @@ N_LIVE = 300
 
 _N_SAMPLES = 50
 _N_STEPS = 1000
-_N_EACH = 20  # readings over black and over white
-_LEAST_SHARE = 1e-3  # of the difference of the levels: the least sd of the noise, and what counts as wholly black
+_N_EACH = 20  # number of readings over black and over white
+_LEAST_SHARE = 1e-3  # of the levels' difference: least noise sd, and tolerance for uniform black or white
 
 
 @dataclass(frozen=True)
 class NestedSampling:
-    """Infer from all readings anew after each; diversify the samples that are drawn (paper, machine learning system).
+    """Nested sampling on all readings after each one, with diversified samples (paper, machine learning system).
 
     Parameters
     ----------
     n_live
         Live points; the paper has 300.
     stop
-        When nested sampling ends; the paper's rule is a change of ln Z below 1e-8.
+        Stopping rule of nested sampling; in the paper a change of ln Z below 1e-8.
     n_steps
         Metropolis-Hastings steps of each drawn sample; the paper takes about 1000.
     move
-        How nested sampling draws new points.
+        Move that draws new points.
     """
 
     n_live: int = N_LIVE
@@ -91,7 +91,7 @@ class NestedSampling:
         return f"the paper's: nested sampling anew after each reading, {self.n_live} live points"
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """See `Method.updated`; every kind of hypotheses has a run of its own."""
+        """See `Method.updated`; every kind of hypotheses has its own run."""
         found = tuple(
             self._anew(had, kind, recording, rng) for kind, had in zip(previous.kinds, previous.particles, strict=True)
         )
@@ -103,7 +103,7 @@ class NestedSampling:
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
-        """See `Method.drawn`; samples of a nested run may be replications, so each takes its own steps."""
+        """See `Method.drawn`; samples of a nested run may be copies, so each takes its own steps."""
         which = resampled(posterior.probability, n, rng)
         drawn = []
         for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
@@ -124,7 +124,7 @@ class NestedSampling:
                 max_cost=1.0,  # the robot waits
                 return_interrupted=False,
             )
-        except NotConvergedError:  # nothing of this kind could have given the readings
+        except NotConvergedError:  # no hypothesis of this kind could have given the readings
             return replace(had, weighted=replace(had.weighted, log_z=-math.inf, log_z_error=math.inf))
         found = _weighted(result, had.weighted.n_calls + result.n_calls)
         return Particles(found, np.arange(len(found.theta)))
@@ -157,17 +157,17 @@ def paper_experiment(
     repeats: tuple[int, ...] = (1,),
     heights_mm: tuple[float, ...] = (),
 ) -> Experiment:
-    """Pose the paper's experiment: how it infers, what a reading is worth to it, and with which likelihood.
+    """Build the paper's experiment: its method of inference, utility and likelihood.
 
     Parameters
     ----------
     sensor, shape, field
         As for `experiment_for`.
     model
-        "ssf": the Student-t likelihood, whose sd is not known. "naive": two levels, each with its own sd.
+        "ssf": Student-t likelihood with unknown sd. "naive": two levels, each with its own sd.
     nested_stop
-        "change": nested sampling ends at a change of ln Z below 1e-8, as in the paper; "remaining": where ln Z can rise
-        by 0.05 at most.
+        "change": nested sampling ends at a change of ln Z below 1e-8, as in the paper; "remaining": when ln Z can rise
+        by at most 0.05.
     naive
         Levels and sds of the naive model, from repeated readings over black and over white; see `levels_from` and
         `levels_in`.
@@ -177,7 +177,7 @@ def paper_experiment(
     Raises
     ------
     ParameterError
-        If the naive model has no levels, or is to choose heights.
+        If the naive model has no levels, or heights are given for it.
     """
     require_sensor(sensor, "in the order paper_experiment(sensor, shape, field)")
     for name, value, allowed in (("model", model, get_args(Model)), ("nested_stop", nested_stop, tuple(NESTED_STOP))):
@@ -200,22 +200,22 @@ def paper_experiment(
         raise ParameterError(
             "naive", None, 'levels and sds with the model "naive", from repeated readings over black and white'
         )
-    # The naive model knows no edge, where a reading never fits two levels: its fit is not doubted.
+    # The naive model has no partial coverage, so readings on edges never fit: its fit is not tested.
     return pose(NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), scene), naive, doubt_p=0.0)
 
 
 def student_t_bounds(levels: FixedLevels, step: float | None) -> OneScan:
-    """Bound the Student-t's sd: from rounding, or a thousandth of the levels' difference, up to that difference."""
+    """Bound the sd of the likelihood: from rounding, or 0.001 of the levels' difference, to that difference."""
     span = abs(levels.i_max - levels.i_min)
     floor = _least_sd(span, step)
     return OneScan(floor, max(span, 10.0 * floor))
 
 
 def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
-    """Take the naive model's levels and sds from the readings of a recording over black and over white.
+    """Estimate the naive model's levels and sds from a recording's readings over black and over white.
 
-    Those count over which the sensor sees no more than a thousandth of anything else: over sheets of one colour, and
-    of a scan across an edge the far ends.
+    Readings count if at most a thousandth of the footprint is on the other colour: over uniform sheets, and at the far
+    ends of scans across an edge.
 
     Raises
     ------
@@ -241,7 +241,7 @@ def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
 
 
 def levels_in(world: World, scale: LegoScale, *, rng: np.random.Generator, n_each: int = _N_EACH) -> Naive:
-    """Let a simulated sensor read a black and a white sheet `n_each` times, for the naive model's levels and sds."""
+    """Simulate `n_each` readings over a black and a white sheet, for the naive model's levels and sds."""
     black, white = (
         np.array(
             [
@@ -260,5 +260,5 @@ def _naive_of(black: FloatArray, white: FloatArray, step: float | None) -> Naive
 
 
 def _least_sd(span: float, step: float | None) -> float:
-    """Give the least sd that is believed: of rounding, or a thousandth of the difference of the levels."""
+    """Return the least plausible sd: of rounding, or a thousandth of the levels' difference."""
     return max((step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span)

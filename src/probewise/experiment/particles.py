@@ -1,13 +1,10 @@
-"""Carry weighted samples of one posterior from reading to reading: reweigh them, and move them when few still count.
+"""Sequential Monte Carlo: reweight samples after each reading, and resample and move them when needed.
 
-Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweighs the samples; where fewer
-than half of them still count, the reading is taken in by degrees, and at each the samples are drawn
-anew and moved by Metropolis-Hastings steps against everything read so far. The evidence is the
-product of the mean weights. What has been ruled out in a long search is remembered by thousands of
-samples, not by the few that a picture shows.
-
-How wrong the evidence may be is read off the genealogy: where few of the samples at the start are
-ancestors of those that count now, another start would have given another evidence (Lee & Whiteley 2018).
+Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweights the samples; if the effective sample size
+falls below half, the reading's likelihood is tempered, and at each temperature the samples are resampled and moved by
+Metropolis-Hastings steps on all readings so far. The evidence is the product of the mean weights. Thousands of samples
+represent what a long search has excluded. The error of the evidence is estimated from the genealogy: if few initial
+samples are ancestors of the current ones, another start would have given another evidence (Lee & Whiteley 2018).
 """
 
 from __future__ import annotations
@@ -30,17 +27,17 @@ from probewise.priors import Prior
 
 __all__ = ["BRIEF", "THOROUGH", "Effort", "Particles", "prior_particles", "resized", "sampled", "update"]
 
-KEEP = 0.5  # share of the samples that must count for them to be kept
-SURPRISED = 12.5  # nats by which every sample misses the last reading, five sds of Gaussian noise: none expected it
-STIFF = 0.5  # accepted steps a sample, below which the moves cannot be trusted
+KEEP = 0.5  # least effective share of the samples without resampling
+SURPRISED = 12.5  # nats by which even the best sample misses the last reading: five sds of Gaussian noise
+STIFF = 0.5  # accepted steps per sample below which the moves are unreliable
 MOST_ROUNDS = 6
 MANY_DEGREES = 4
-_LEAST_PART = 0.05  # of the samples: of fewer no kernels can be fitted
+_LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Accepted steps a sample that will do, and kernels to propose from."""
+    """Accepted steps per sample to aim for, and number of kernels in the proposal."""
 
     enough: float
     n_kernels: int
@@ -52,24 +49,24 @@ BRIEF = Effort(1.0, 75)
 
 @dataclass(frozen=True, eq=False)
 class Particles:
-    """Weighted samples, and what tells how far their evidence can be trusted.
+    """Weighted samples, with diagnostics of their evidence.
 
     Attributes
     ----------
     weighted
         The samples with the evidence.
     ancestor
-        Which sample of the last independent start each descends from, (n,).
+        Index of each sample's ancestor at the last independent start, (n,).
     start_variance
-        Variance of the log evidence at that start: 0 for draws from the prior.
+        Variance of the log evidence at that start; 0 for draws from the prior.
     n_resampled
-        How often samples have been drawn anew since then.
+        Number of resampling steps since then.
     strained
-        Whether, since then, no sample expected a reading, or the samples could not be moved: their evidence may
-        be wrong by more than the genealogy tells.
+        Whether, since then, no sample predicted some reading, or the samples could not be moved: the evidence may be
+        wrong by more than the genealogy indicates.
     hurried
-        Whether, since then, a reading was taken in by many degrees: few samples stood where it led, and the product of
-        mean weights is then nearly always too small.
+        Whether, since then, a reading needed many temperatures: then few samples were near the new posterior, and the
+        product of mean weights is nearly always too small.
     """
 
     weighted: Weighted
@@ -91,7 +88,7 @@ class Particles:
     def log_z_error(self) -> float:
         """Standard error of the log evidence by the genealogy (Lee & Whiteley 2018), or the stated one if that is more.
 
-        The stated error takes the samples for independent at every step, which moves alone do not make them.
+        The stated error assumes independent samples at every step, which moves do not guarantee.
         """
         if self.log_z == -math.inf:
             return math.inf
@@ -102,7 +99,7 @@ class Particles:
 
 
 def prior_particles(prior: Prior, n_particles: int, *, rng: np.random.Generator) -> Particles:
-    """Draw equally weighted samples of the prior: the posterior of no readings, whose evidence is one."""
+    """Draw equally weighted samples of the prior, with evidence 1."""
     theta = prior.from_unit_cube(rng.random((n_particles, len(prior.names))))
     if not np.isfinite(prior.log_prob(theta)).all():
         raise ParameterError(
@@ -123,27 +120,27 @@ def update(
     fall_back: Callable[[], NestedResult] | None = None,
     effort: Effort | None = None,
 ) -> Particles:
-    """Take in the last reading of a problem.
+    """Update the samples with the last reading of a problem.
 
     Parameters
     ----------
     previous
-        Posterior given the readings before.
+        Posterior given the earlier readings.
     problem
         Prior, sensor model, likelihood, and all readings.
     rng
         Source of randomness.
     fall_back
-        Runs the whole problem from scratch: where no sample expected the reading, or they cannot be moved. Without,
-        the samples go on as best they can, and are marked as strained.
+        Solves the whole problem from scratch, if no sample predicts the reading or they cannot be moved. Without it,
+        the samples continue and are marked as strained.
     effort
-        How much to spend where samples are moved; by default all that the evidence of what counts deserves.
+        Effort of moves; by default that for a probable kind of hypotheses.
 
     Returns
     -------
     Particles
-        As many samples as before; `run` is the run from scratch where one was needed. An evidence of zero says that
-        no sample could have given the reading: then they stay where they are.
+        As many samples as before; `run` is the run from scratch, if one was needed. If no sample could have given the
+        reading, the evidence is zero and the samples are unchanged.
     """
     before = previous.weighted
     n = len(before.theta)
@@ -200,9 +197,9 @@ def update(
 
 
 def resized(particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator) -> Particles:
-    """Go on with another number of samples, drawn by weight from those there are and moved apart.
+    """Resample to another number of samples, and move them apart.
 
-    `problem` is of the readings that they have taken in.
+    `problem` holds the readings included so far.
     """
     had = particles.weighted
     if n == len(had.theta) or had.log_z == -math.inf:
@@ -215,7 +212,7 @@ def resized(particles: Particles, n: int, problem: SensorProblem, *, rng: np.ran
 
 
 def sampled(found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator) -> Particles:
-    """Begin anew with `n` samples drawn by weight from a posterior and moved apart; its evidence counts from here."""
+    """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     bridge = _Bridge(problem)
     cloud = bridge.cloud(found.theta[resampled(found.weight, n, rng)])
     moved, moves = _move(cloud, 1.0, bridge, rng)
@@ -233,7 +230,7 @@ def _even(cloud: _Cloud, of: Weighted) -> Weighted:
 
 @dataclass(frozen=True, eq=False)
 class _Cloud:
-    """Samples with what decides about them: log prior, and log likelihood without and with the last reading."""
+    """Samples with their log prior, and log likelihood without and with the last reading."""
 
     theta: FloatArray
     log_prior: FloatArray
@@ -241,14 +238,14 @@ class _Cloud:
     after: FloatArray
 
     def at(self, share: float) -> FloatArray:
-        """Log likelihood with that share of the last reading's."""
+        """Return the log likelihood with the last reading's raised to a power `share`."""
         return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
 
     def take(self, rows: IntArray) -> _Cloud:
         return _Cloud(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
 
     def put(self, rows: BoolArray, other: _Cloud) -> _Cloud:
-        """Replace rows by those of another."""
+        """Replace rows by those of another cloud."""
         return _Cloud(
             np.where(rows[:, None], other.theta, self.theta),
             np.where(rows, other.log_prior, self.log_prior),
@@ -264,7 +261,7 @@ class _Bridge:
     problem: SensorProblem
 
     def missed(self, predicted: FloatArray) -> float:
-        """How much less likely the last reading is by the best prediction than by one that expects it, nats."""
+        """Return the loss in nats of the best prediction of the last reading against a perfect one."""
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0
@@ -273,20 +270,20 @@ class _Bridge:
         return float(self.problem.likelihood.log_prob(reading, reading[None])[0] - best)
 
     def weigh(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Log likelihood without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
+        """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
         usable = self.problem.recording.usable
         earlier = usable.copy()
         earlier[-1] = False
         return self._score(predicted, earlier), self._score(predicted, usable)
 
     def _score(self, predicted: FloatArray, rows: BoolArray) -> FloatArray:
-        """Log likelihood of these readings alone; of none it is zero."""
+        """Return the log likelihood of these readings; zero for none."""
         if not rows.any():
             return np.zeros(len(predicted))
         return scores(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
 
     def cloud(self, theta: FloatArray) -> _Cloud:
-        """Evaluate samples; the model is not asked where the prior has none."""
+        """Evaluate samples; the model is not evaluated outside the prior."""
         problem = self.problem
         log_prior = problem.prior.log_prob(theta)
         before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
@@ -311,17 +308,14 @@ def _move(
     parts: Sequence[IntArray] | None = None,
     effort: Effort | None = None,
 ) -> tuple[_Cloud, _Moves]:
-    """Move equally weighted samples by Metropolis-Hastings steps that leave their density as it is.
+    """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
-    A round is a proposal from kernels fitted to samples, then one along the difference of two of
-    them (ter Braak 2006): the first follows bent shells of few parameters, the second needs no
-    density and so goes on working for many.
-
-    Kernels about the very samples that are moved find them denser than they are, and the samples drift
-    apart: of `parts`, rows of the samples, each is moved by kernels fitted to the part before it.
+    A round is a proposal from kernels fitted to samples, then one along the difference of two of them (ter Braak 2006):
+    the first follows curved shells in few dimensions, the second works in many. Kernels fitted to the moved samples
+    themselves would be biased: each of `parts`, rows of the samples, is moved by kernels fitted to the previous part.
     """
     n, n_params = start.theta.shape
-    if len(np.unique(start.theta[:, 0])) <= 2 * n_params:  # copies of so few say nothing of where the others are
+    if len(np.unique(start.theta[:, 0])) <= 2 * n_params:  # too few distinct samples to fit kernels
         return start, _Moves(0.0, 0)
     parts = [np.arange(n)] if parts is None else parts
     effort = THOROUGH if effort is None else effort
@@ -344,7 +338,7 @@ def _move(
 
 
 def _from_kernels(theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Propose by the kernels alone, wherever a sample stands; also the log of the ratio of densities."""
+    """Propose from the kernels, independent of the current samples; also return the log ratio of densities."""
     proposed = kernels.draw(len(theta), rng=rng)
     return proposed, kernels.log_density(theta) - kernels.log_density(proposed)
 
@@ -352,7 +346,7 @@ def _from_kernels(theta: FloatArray, kernels: LocalKernels, rng: np.random.Gener
 def _along_differences(
     theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Step along the difference of two other samples, shortened by a factor spread over two orders of magnitude."""
+    """Propose steps along the difference of two other samples, scaled by a factor over two orders of magnitude."""
     n, n_params = theta.shape
     one, other = rng.integers(n, size=(2, n))
     length = 2.38 / math.sqrt(2 * n_params) * 10.0 ** rng.uniform(-2.0, 0.0, (n, 1))
@@ -360,13 +354,13 @@ def _along_differences(
 
 
 def _parted(rows: IntArray) -> list[IntArray]:
-    """Part samples drawn anew from `rows`, copies of one together; where a part would have hardly any, all are one."""
+    """Partition resampled `rows` with copies of a sample together; one part if others would be too small."""
     parts = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
 def _next_share(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float) -> float:
-    """Largest share of the last reading that leaves enough samples that count, by bisection."""
+    """Return the largest power of the last reading's likelihood with enough effective samples, by bisection."""
     low, high, enough = share, 1.0, KEEP * len(base)
     for _ in range(30):
         middle = 0.5 * (low + high)
@@ -377,7 +371,7 @@ def _next_share(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: fl
 
 
 def _reweighed(log_weight: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray:
-    """Weigh by what likelihoods have become; a sample that has been ruled out stays so."""
+    """Return weights updated for new likelihoods; excluded samples remain excluded."""
     alive = np.isfinite(log_weight)
     return np.asarray(np.where(alive, log_weight + after - np.where(alive, before, 0.0), -np.inf))
 
@@ -389,7 +383,7 @@ def _from_scratch(
     n_calls: int,
     rng: np.random.Generator,
 ) -> Particles:
-    """Draw as many samples as before from a run, and move them apart."""
+    """Resample as many samples as before from a run, and move them apart."""
     found = bridge.cloud(run.samples(n, rng=rng))
     moved, moves = _move(found, 1.0, bridge, rng)
     even = np.full(n, -math.log(n))

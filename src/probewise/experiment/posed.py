@@ -1,4 +1,4 @@
-"""Pose an experiment by the names that a command line gives: of the method, the sensor model, the utility."""
+"""Build an experiment from names, as on the command line: method, sensor model, utility."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ def pose_experiment(
     heights_mm: tuple[float, ...] = (),
     cards: tuple[Card, ...] = (),
 ) -> Experiment:
-    """Pose an experiment; what is None is as usual with the method.
+    """Build an experiment; None means the method's default.
 
     Parameters
     ----------
     method
         "particles": `experiment_for`, sequential Monte Carlo; "paper": `paper_experiment`, which has its own utility,
-        takes its sensor for complete, and chooses one reading at a time.
+        assumes a complete sensor model, and chooses one reading at a time.
     utility
-        What a reading is worth: a name (see `inquiry.utility_named`) or a utility.
+        Utility, or its name (see `inquiry.utility_named`).
     nested_stop, naive
-        For the method "paper" alone; see `paper_experiment`.
+        Only for the method "paper"; see `paper_experiment`.
     sensor, shape, field, model, learn_sensor, batch, trust, orientations_rad, repeats, heights_mm, cards
         See `experiment_for`.
 

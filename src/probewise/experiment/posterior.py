@@ -1,10 +1,9 @@
-"""The posterior of a run: a mixture of kinds of hypotheses, each with its own samples, its own evidence, its own error.
+"""The posterior of a run: a mixture of kinds of hypotheses, each with its own samples, evidence and error.
 
-A kind is probable as its prior times its evidence. It is never lost for being improbable: its samples go
-on with every reading, fewer of them, so that later readings can bring it back. Carried evidences
-grow uncertain; where that could change what is believed of the kinds, the evidence is taken anew
-from all readings: by a bridge between the samples and kernels about them, and where the samples could not
-follow the readings, by nested sampling of that kind alone.
+The probability of a kind is proportional to its prior times its evidence. Improbable kinds are kept with fewer samples,
+so that later readings can revive them. Sequential evidences accumulate errors; if these could change the probabilities
+of the kinds, the evidence is re-estimated from all readings: by bridge sampling or, if the samples could not follow the
+readings, by nested sampling of that kind.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ _STRAINED = 6.0  # nats, where samples could not follow
 _TOLD_APART = 1.5  # nats between an evidence carried and one taken anew, from which on the samples are in doubt
 _HOPELESS = 60.0  # nats behind the best kind, from which on no evidence is taken anew
 _DRAWS = 1000
-_LOST = 0.01  # probability of a kind that must not be overlooked
+_LOST = 0.01  # probability of a kind that must not be missed
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ class Posterior:
 
     @property
     def log_odds(self) -> FloatArray:
-        """Log of prior times evidence, (n_kinds,)."""
+        """Log of prior times evidence of each kind, (n_kinds,)."""
         return np.array([k.log_prior + p.log_z for k, p in zip(self.kinds, self.particles, strict=True)])
 
     @property
@@ -67,7 +66,7 @@ class Posterior:
 
     @property
     def left_out(self) -> dict[str, float]:
-        """Probability of each thing that the sensor may leave out, whatever lies there; "" is nothing."""
+        """Probability of each effect that the sensor may leave out, marginalised over shapes; "" is none."""
         shares: dict[str, float] = {}
         for kind, p in zip(self.kinds, self.probability.tolist(), strict=True):
             shares[kind.left_out] = shares.get(kind.left_out, 0.0) + p
@@ -75,17 +74,17 @@ class Posterior:
 
     @property
     def leader(self) -> int:
-        """Number of the most probable kind."""
+        """Index of the most probable kind."""
         return int(self.log_odds.argmax())
 
     def doubting(self, times: float) -> Posterior:
-        """Believe that something is left out `times` as readily as it was believed."""
+        """Return the posterior with the odds of an incomplete sensor model multiplied by `times`."""
         more = math.log(times)
         kinds = tuple(replace(k, log_prior=k.log_prior + more) if k.left_out else k for k in self.kinds)
         return replace(self, kinds=kinds)
 
     def joined(self, *, rng: np.random.Generator) -> Weighted:
-        """Write the samples of all kinds as those of one posterior; of one kind they are that."""
+        """Combine the samples of all kinds to one weighted posterior."""
         if len(self.kinds) == 1:
             return self.particles[0].weighted
         probability = self.probability
@@ -111,7 +110,7 @@ class Posterior:
 
 
 def prior_posterior(kinds: Sequence[Kind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
-    """Draw samples of every kind's prior: the posterior of no readings."""
+    """Draw samples of every kind's prior."""
     shares = [math.exp(kind.log_prior) for kind in kinds]
     sizes = [_size(kind, p, n_particles) for kind, p in zip(kinds, shares, strict=True)]
     drawn = (prior_particles(kind.prior, n, rng=rng) for kind, n in zip(kinds, sizes, strict=True))
@@ -126,20 +125,20 @@ def updated(
     rng: np.random.Generator,
     from_scratch: FromScratch,
 ) -> Posterior:
-    """Take in the last reading of a recording.
+    """Update the posterior with the last reading of a recording.
 
     Parameters
     ----------
     previous
-        Posterior given the readings before.
+        Posterior given the earlier readings.
     recording
         All readings.
     n_particles
-        Samples of a kind that counts.
+        Samples of a probable kind.
     rng
         Source of randomness.
     from_scratch
-        Runs a kind's whole problem by nested sampling.
+        Solves a kind's whole problem by nested sampling.
 
     Raises
     ------
@@ -211,7 +210,7 @@ def _surprise(now: Particles, before: Particles, problem: SensorProblem) -> floa
 
 
 def _size(kind: Kind, probability: float, n_particles: int) -> int:
-    """Count the samples that a kind is worth; what speaks for a rival is first heard by few."""
+    """Return the number of samples of a kind by its probability; improbable rivals have few."""
     if kind.left_out:
         return max(n_particles // next(part for least, part in _SUSPECTED if probability >= least), 100)
     return n_particles if probability >= _IMPROBABLE else n_particles // _FEWER
@@ -223,7 +222,7 @@ def _shares(log_odds: FloatArray) -> FloatArray:
 
 
 def _most_doubtful(now: Posterior, settled: set[int]) -> int | None:
-    """Find the kind whose probability its doubtful evidence may make most wrong; None where none matters."""
+    """Return the kind whose evidence error has the largest effect on its probability; None if all are negligible."""
     log_odds = now.log_odds
     off = np.zeros(len(log_odds))
     for k, particles in enumerate(now.particles):
@@ -248,7 +247,7 @@ def _share(odds: float) -> float:
 def _renewed(
     particles: Particles, problem: SensorProblem, n: int, from_scratch: FromScratch, rng: np.random.Generator
 ) -> Particles:
-    """Take a kind's evidence anew from all readings; its samples too, where they may have lost something."""
+    """Re-estimate a kind's evidence from all readings, and its samples too if they may be incomplete."""
     had = particles.weighted
     if not particles.strained:
         found = bridged(had, problem, rng=rng, n_draws=n)
@@ -256,7 +255,7 @@ def _renewed(
             return _from_here(particles, found)
     try:
         run = from_scratch(problem)
-    except NotConvergedError:  # nothing of this kind could have given the readings, nor ever will
+    except NotConvergedError:  # no hypothesis of this kind could have given the readings
         return replace(particles, weighted=replace(had, log_z=-math.inf, log_z_error=math.inf), strained=False)
     points = run.samples(n // 2, rng=rng)
     if particles.log_z > -math.inf:
@@ -268,7 +267,7 @@ def _renewed(
 
 
 def _weighed_again(particles: Particles, problem: SensorProblem, rng: np.random.Generator) -> Particles:
-    """Take the evidence of samples that had to hurry anew, by the bridge; the samples are good once they have moved."""
+    """Re-estimate the evidence of hurried samples by bridge sampling; the moved samples themselves are valid."""
     found = bridged(particles.weighted, problem, rng=rng, n_draws=min(2 * len(particles.ancestor), _DRAWS))
     return (
         replace(_from_here(particles, found), strained=particles.strained) if math.isfinite(found.log_z) else particles
@@ -276,7 +275,7 @@ def _weighed_again(particles: Particles, problem: SensorProblem, rng: np.random.
 
 
 def _from_here(particles: Particles, found: Bridged) -> Particles:
-    """Go on with the samples and an evidence taken anew."""
+    """Return the samples with a new evidence as an independent start."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
     return Particles(weighted, np.arange(len(had.theta)), found.error**2)

@@ -1,4 +1,4 @@
-"""What the sensor model may leave out: the effects that could act in a run, each a rival of the sensor as calibrated.
+"""Effects that the sensor model may leave out in a run, as rivals of the calibrated sensor.
 
 The effects and their typical sizes are those of the diagnosis. A run is no recording, though: before its first reading
 nothing is known of places and times. Effects of the pose and of the footprint take their scales from a scan of
@@ -55,17 +55,17 @@ ON_FIELD = {
     "edge_shadow": False,
     "halo": False,
 }
-"""Effects on the mean of the readings that one shape on a field can show, and whether their scale is the field's."""
+"""Effects on the mean that are detectable over a shape on a field, and whether their scale is the field's."""
 
 WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
-"""Those that amount to another shape, unless a card lies there whose place is known."""
+"""Effects that are aliased with another shape, unless there is a card at a known place."""
 
 _IN_TIME = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name, Lag.name})
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """One thing that the sensor model may leave out: an effect on the mean, or another law of the noise."""
+    """One alternative to the sensor model: an effect on the mean, or another noise model."""
 
     name: str
     effect: Told | None = None
@@ -73,7 +73,7 @@ class Rival:
 
 
 def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float, float]) -> tuple[Rival, ...]:
-    """List the rivals of a sensor model.
+    """Return the rivals of a sensor model.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     Raises
     ------
     ParameterError
-        If the model or the likelihood is of another kind, which has no such effects.
+        If the model or the likelihood is of another kind, which does not support effects.
     """
     if not isinstance(model, Chain) or not isinstance(model.levels, FixedLevels):
         raise ParameterError(
@@ -121,20 +121,20 @@ def _ways(effect: NamedEffect[FloatArray]) -> list[Told]:
 
 @dataclass(frozen=True)
 class GainLoss(GainDrift):
-    """A lamp that begins as calibrated and changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
+    """A lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
 
     @classmethod
     def like(cls, drift: GainDrift) -> Self:
-        """Take over the scales of a drift that ends as calibrated."""
+        """Build with the scales of a drift that ends as calibrated."""
         return cls(drift.typical, drift.shortest_s, drift.longest_s)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal, (n_samples, n_points), never the dark level."""
+        """Scale the signal, (n_samples, n_points), but not the dark level."""
         gone = -np.expm1(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
         return np.asarray(value * np.maximum(1 + theta[:, :1] * gone, 0.0))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how many percent the signal changes, and how fast."""
+        """Describe the change of the signal in percent, and its speed."""
         way = "rises" if mean[0] > 0 else "falls"
         return (
             f"the signal {way} by {100 * abs(mean[0]):.2g} % in the end, {100 * abs(mean[0]) / mean[1] * 60:.2g} % in "

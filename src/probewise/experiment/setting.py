@@ -1,4 +1,4 @@
-"""What decides a run: the hypotheses, the sensor, what may be measured, what it is worth, when to stop."""
+"""The configuration of a run: hypotheses, sensor, designs, utility, stopping rule."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ __all__ = ["Experiment", "OneScan", "widest_mm"]
 
 
 MOST_LIFTED = 10.0
-"""How many times higher, or lower, than where it was calibrated a sensor may be asked to read."""
+"""Largest factor between reading height and calibrated height, either way."""
 
 MOST_OFF = 0.01
-"""Probability of a length that is far off, below which a run that doubts its sensor may end."""
+"""Probability of a wrong length below which a run with doubt in its sensor may end."""
 
 
 @dataclass(frozen=True)
 class OneScan:
-    """Score a growing number of readings that share one unknown sd: Student-t, one data set (paper, SSF likelihood).
+    """Likelihood of a growing number of readings with one unknown sd: Student-t, one data set (paper, SSF likelihood).
 
     `sd_floor` and `sd_ceiling` bound the sd, in the sensor's unit; its prior is 1/sigma between them.
     """
@@ -76,56 +76,55 @@ class OneScan:
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
-    """Everything that decides the course of a run but the arm and the seed.
+    """The configuration of a run, except arm and seed.
 
     Parameters
     ----------
     shape
-        What may lie on the field; its prior is what is believed before the first reading.
+        The possible shape on the field, with its prior.
     model
         The sensor over a scene of that shape.
     likelihood
-        How readings are weighed against predictions: any with any model.
+        Likelihood of readings given predictions; any likelihood works with any model.
     noise_sd
-        Sd of the noise of one reading in the sensor's unit, for the check of fit and for utilities that weigh noise.
+        Sd of the noise of one reading in the sensor's unit, for the goodness of fit and for utilities.
     grid
-        Places that may be looked at.
+        Possible places of readings.
     utility
-        What a reading is worth; by default its expected information about all parameters and, near the end,
-        the probability that it ends the run.
+        The utility; by default the expected information about all parameters and, near the end, the probability that
+        the reading ends the run.
     sensor_prior
-        Prior of the parameters that the model has before the shape's, where the sensor is to be learnt
-        along with the shape; None: the sensor is known.
+        Prior of the sensor's parameters, which precede the shape's, if the sensor is inferred too; None: it is known.
     step, reading_range
-        What readings are whole multiples of (None: they are not rounded), and the least and greatest there are.
+        Rounding step of the readings (None: not rounded), and their smallest and largest possible values.
     orientations_rad, repeats
-        How the sensor may be turned, and how many readings may be taken on the spot.
+        Possible orientations of the sensor, and numbers of repeated readings.
     heights_mm, calibrated_height_mm
-        How high above the surface it may read, where that may be chosen, and the height at which it was calibrated:
-        another scales its footprint and dims its signal (see `sensor.commanded`).
+        Possible heights above the surface, if selectable, and the height of the calibration; other heights scale the
+        footprint and dim the signal (see `sensor.commanded`).
     batch
-        Readings that are chosen together, for their joint information; greater than 1 only with the default
-        utility or `InformationGain`.
+        Readings chosen together for their joint information; above 1 only with the default utility or
+        `InformationGain`.
     stop_sd_mm
         The run ends when the posterior sd of every parameter of the shape in mm is below it: 4 mm, half
         the spacing of LEGO holes, in the paper. For a set of shapes: every parameter that the
         most probable shape has.
     stop_probability
-        For a set of shapes, how probable that shape must be too.
+        For a set of shapes, the required probability of that shape.
     trust
-        Probability, before the first reading, that the sensor model leaves nothing out. Below 1 the run weighs what
-        it may leave out (`experiment.rivals`) along with the shape, and ends only when the lengths are known under all.
+        Prior probability that the sensor model is complete. Below 1, the run also infers effects that it may leave out
+        (`experiment.rivals`), and ends only when the lengths are known under the mixture.
     doubt_p
-        Probability of readings as far from the best hypothesis as these, below which the run says that
-        none explains them, and trusts its own certainty no longer; 0 for a model that is known to be coarse.
+        p-value of the best hypothesis below which the run reports that none explains the readings and does not trust
+        its posterior; 0 for a model that is known to be coarse.
     n_particles
-        Weighted samples of the posterior that are carried from reading to reading.
+        Number of weighted posterior samples.
     n_samples
-        Hypotheses that are shown, and asked by the paper's utility; the paper has 50.
+        Number of hypotheses in figures and for the paper's utility; 50 in the paper.
     n_live
-        Live points of nested sampling, which takes over where a reading surprises.
+        Live points of nested sampling, which takes over if no sample predicts a reading.
     method
-        How a reading changes what is believed; None: `SequentialMonteCarlo` with `n_particles` and `n_live`.
+        Method of inference; None: `SequentialMonteCarlo` with `n_particles` and `n_live`.
     """
 
     shape: Shape
@@ -192,26 +191,26 @@ class Experiment:
             raise ParameterError("shape", self.names, "a shape with a parameter in mm, which the run can stop on")
         if self.trust < 1:
             rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
-        _ = self.readout, self.designs  # check what they are made of
+        _ = self.readout, self.designs  # their constructors check the values
 
     @cached_property
     def learning(self) -> Method:
-        """How a reading changes what is believed."""
+        """Method of inference."""
         return SequentialMonteCarlo(self.n_particles, self.n_live) if self.method is None else self.method
 
     @cached_property
     def prior(self) -> Prior:
-        """What is believed before the first reading."""
+        """Prior of all parameters."""
         return self.shape.prior if self.sensor_prior is None else Joint((self.sensor_prior, self.shape.prior))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Parameter names, one a column of theta: the sensor's that are not known, then the shape's."""
+        """Parameter names, one per column of theta: unknown ones of the sensor, then the shape's."""
         return self.prior.names
 
     @property
     def cards(self) -> tuple[Card, ...]:
-        """Cards of known place and albedo that lie on the field."""
+        """Cards of known place and albedo on the field."""
         return cards_of(self.model)
 
     @cached_property
@@ -227,18 +226,18 @@ class Experiment:
 
     @cached_property
     def designs(self) -> Designs:
-        """The readings that may be taken."""
+        """The possible readings."""
         settings = (("height_mm", self.heights_mm),) if self.heights_mm else ()
         return Designs(self.grid, self.orientations_rad, self.repeats, settings)
 
     @cached_property
     def instrumentation(self) -> Instrumentation:
-        """What a plan of this sensor says of it."""
+        """Instrumentation of this sensor for plans."""
         return Instrumentation(height_mm=self.calibrated_height_mm)
 
     @cached_property
     def goal(self) -> Goal | None:
-        """The sds that the run ends on; of a set of shapes it is not known yet whose."""
+        """The stopping rule on sds; None for a set of shapes, whose parameters are not known in advance."""
         if isinstance(self.shape, AnyOf):
             return None
         names = zip(self.shape_columns.tolist(), self.shape.prior.names, strict=True)
@@ -246,13 +245,13 @@ class Experiment:
 
     @cached_property
     def forecast(self) -> Forecast:
-        """What predicts for many hypotheses at once, made when first asked for."""
+        """Predictions for many hypotheses at once, cached."""
         if self.calibrated_height_mm is None:
             return forecast_of(self.model)
         return forecast_of(self.model, highest=max(self.heights_mm) / self.calibrated_height_mm)
 
     def problem(self, readings: Sequence[Reading]) -> SensorProblem:
-        """Set up the inference from these readings."""
+        """Return the inference problem for these readings."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
         if self.trust < 1:
             recording = Pace.of(readings).on_recording(recording)
@@ -260,7 +259,7 @@ class Experiment:
 
     @cached_property
     def kinds(self) -> tuple[Kind, ...]:
-        """The kinds of hypotheses that are weighed against each other."""
+        """The competing kinds of hypotheses."""
         rivals: tuple[Rival, ...] = ()
         if self.trust < 1:
             rivals = rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
@@ -270,22 +269,22 @@ class Experiment:
         )
 
     def is_known(self, sd: FloatArray, shapes: Mapping[str, float], chance_off: float = 0.0) -> bool:
-        """Tell whether the stopping rule is met.
+        """Return whether the stopping rule is met.
 
         Parameters
         ----------
         sd, shapes
             Posterior sds of the shape's parameters, and the shapes' probabilities.
         chance_off
-            Probability that a length is off by three times the sd that is asked for (`judging.chance_off`); it
-            counts where the sensor is doubted, for then the posterior has tails that its sds do not show.
+            Probability that a length is off by three times the target sd (`judging.chance_off`); it is used if the
+            sensor is doubted, since the posterior then has tails that sds do not show.
         """
         likely = max(shapes.values(), default=1.0)
         sure = self.trust == 1 or chance_off < MOST_OFF
         return widest_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability and sure
 
     def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
-        """Say what decides a run: a journal's first line."""
+        """Return the settings for a journal's first line."""
         method = {} if self.method is None else {"method": repr(self.method)}
         return {
             "version": __version__,
@@ -326,10 +325,10 @@ class Experiment:
 
 
 def widest_mm(names: tuple[str, ...], sd: FloatArray) -> float:
-    """Take the largest sd among the parameters in mm, whose names end so; NaN (no such parameter here) is left out."""
+    """Return the largest sd among the parameters in mm (by name); NaN is ignored."""
     return float(np.nanmax([value for name, value in zip(names, sd, strict=True) if name.endswith("_mm")]))
 
 
 def seed_text(seed: np.random.SeedSequence) -> str:
-    """Write the seed's number as text: it may be longer than a JSON number."""
+    """Return the seed as text, since it may exceed a JSON number."""
     return str(seed.entropy) if isinstance(seed.entropy, int) else ",".join(str(word) for word in seed.entropy or ())

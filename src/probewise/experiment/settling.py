@@ -1,9 +1,9 @@
-"""Value a reading by what it tells of the shape and of what the sensor leaves out, and by whether it ends the run.
+"""Utility of a reading for shape and sensor faults jointly, and near the end for ending the run.
 
-Several kinds of hypotheses may agree on every reading so far and differ in the shape. A reading is worth the bits
-that it is expected to tell about all of them together. Where some reading may well be the last one, what
-counts is how probable that is: every length known under the mixture, and hardly any chance that one is far off. What
-cannot be told apart and does not matter for the shape then need not be told apart.
+Several kinds of hypotheses may explain all readings and differ in the shape. The utility is the expected information
+about all of them together. If some reading may be the last, it is the probability of that: every length known under the
+mixture, with little chance that one is wrong. Kinds that are aliased but agree on the shape then need not be
+distinguished.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from probewise.scene.regions import EllipseRegion, PolygonRegion
 
 __all__ = ["settling"]
 
-_NEAR = 15.0  # times the sd that is asked for: farther off than that, bits about everything serve as well
+_NEAR = 15.0  # times the target sd: beyond it, the ordinary information is used
 _HYPOTHESES = 800
-_FAIRNESS = 0.75  # power of its probability by which a kind is asked
+_FAIRNESS = 0.75  # power of a kind's probability in its share of the drawn hypotheses
 _LEAST_EACH = 6
-_COUNTS = 1e-5  # probability of a kind that is asked
-_BEST = 60  # places, by the information about everything
+_COUNTS = 1e-5  # least probability of a kind to be included
+_BEST = 60  # places with the largest information about all parameters
 _AT_EDGES = 40
 _ANYWHERE = 20
-_LEAST_CHANCE = 0.25  # of ending the run, from which on that is all that counts
-_ENDING = 60  # places, by the bits, that may end it
+_LEAST_CHANCE = 0.25  # probability of ending the run from which only that counts
+_ENDING = 60  # most informative places, tested for ending the run
 _LABEL = "expected information about the shape and what the sensor leaves out (bits)"
 _ENDS = "probability that a reading there ends the run, whatever the sensor leaves out"
 
@@ -49,10 +49,10 @@ def settling(
     *,
     rng: np.random.Generator,
 ) -> UtilityMap:
-    """Value designs by what they tell about all kinds, or by whether they end the run; at first, the map as it is.
+    """Return the map of the utility over designs for all kinds; far from the end, the given map.
 
-    Asked are the designs that are best by the information about everything, those at edges and in the middle of
-    shapes that are believed, places that were read before, and some anywhere.
+    Candidates are the designs with the largest information, those at edges and centres of probable shapes, earlier
+    places, and some random ones.
     """
     if experiment.goal is None:
         return outlook
@@ -80,9 +80,9 @@ def settling(
 def _drawn(
     experiment: Experiment, posterior: Posterior, rng: np.random.Generator
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
-    """Draw hypotheses: those of each kind, and of all of them the lengths, (n, n_lengths), and the weights, (n,).
+    """Draw hypotheses of each kind, with the lengths, (n, n_lengths), and weights, (n,), of all.
 
-    Improbable kinds are asked more often than they are probable: they may be those that differ in the shape.
+    Improbable kinds are over-represented, since they may differ in the shape.
     """
     probability = posterior.probability
     asked = np.where(probability > _COUNTS, probability**_FAIRNESS, 0.0)
@@ -107,12 +107,12 @@ def _candidates(
     readings: tuple[Reading, ...],
     rng: np.random.Generator,
 ) -> IntArray:
-    """Choose which of the designs that can be taken are asked, (n,)."""
+    """Choose candidates among the available designs, (n,)."""
     worth = outlook.values[prospect.rows]
     n_shape = len(experiment.shape.prior.names)
     start = int(experiment.shape_columns[0])
     shapes = np.concatenate([own[:, start : start + n_shape] for own in theta if len(own)])
-    some = shapes[rng.choice(len(shapes), _AT_EDGES)]  # each as often, however probable
+    some = shapes[rng.choice(len(shapes), _AT_EDGES)]  # equally often, regardless of probability
     places = [np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings])]
     places += [card.telling_mm for card in experiment.cards]
     region = experiment.shape.region(some)
@@ -128,7 +128,7 @@ def _candidates(
 
 
 def _plan(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
-    """Lay out each candidate as a scan of its own that begins where the arm stands: direction and time are its own."""
+    """Return a plan with each candidate as a scan from the arm's current place, with its own direction and time."""
     n = len(rows)
     at = prospect.rows[rows]
     taken = prospect.plan.take(np.repeat(at, 2))
@@ -140,7 +140,7 @@ def _plan(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
 
 
 def _bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatArray:
-    """Bits expected about all hypotheses, (n,), of their predictions, (n, n_designs): (n_designs,)."""
+    """Return the expected information in bits from predictions (n, n_designs) of hypotheses (n,): (n_designs,)."""
     given = GivenReading(answers, weight, prospect.readout)
     middle = np.array([0.5 * float(answers.min() + answers.max())])
     of_noise = float(entropy_bits(prospect.readout.probability(middle, fine=1.0))[0])
@@ -150,7 +150,7 @@ def _bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatA
 def _ends(
     lengths: FloatArray, weight: FloatArray, answers: FloatArray, prospect: Prospect, stop_sd_mm: float
 ) -> FloatArray:
-    """Probability of a reading after which every length is known and hardly any far off, (n_designs,)."""
+    """Return the probability that a reading at each design meets the stopping rule, (n_designs,)."""
     away = lengths - weight @ lengths
     given = GivenReading(answers, weight, prospect.readout)
     out = np.empty(answers.shape[1])

@@ -1,4 +1,4 @@
-"""Pose the experiment that a fitted sensor makes, and put a simulated arm over a simulated field."""
+"""Build the experiment of a fitted sensor, and a simulated arm over a simulated field."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ __all__ = [
 
 Model: TypeAlias = Literal["ssf", "naive"]
 
-_CELLS_PER_SD = 8.0  # of a reading that is not rounded
-_USUAL_HEIGHT_MM = 14.0  # of the paper's sensor above the surface
-_PAINTED_VERTICES = 512  # of a curved outline that is no ellipse: within 0.01 mm of a circle of 150 mm
+_CELLS_PER_SD = 8.0  # cells per noise sd for unrounded readings
+_USUAL_HEIGHT_MM = 14.0  # height of the paper's sensor above the surface
+_PAINTED_VERTICES = 512  # vertices of a curved outline that is not an ellipse: within 0.01 mm of a circle of 150 mm
 
 
 class Streams(NamedTuple):
-    """The independent randomness of one simulated run: of the robot, of what is hidden, of a shadow run, of the noise.
+    """Independent random streams of one simulated run: robot, hidden shape, shadow run, noise.
 
     `noise` is a number, from which each reading's generator is made; see `arm_over`. `levels` is that of readings over
     black and white before the run, see `levels_in`. `arm` draws errors of a real arm's geometry, see `with_arm_error`.
@@ -91,7 +91,7 @@ class Streams(NamedTuple):
 
 
 def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
-    """Say for a journal which sensor a run is made with: the fingerprint of what it says, and its file if any."""
+    """Return a journal's entry for the sensor: its fingerprint, and its file if any."""
     require_sensor(sensor)
     named = {} if path is None else {"sensor_file": os.fspath(path)}
     return {**named, "sensor_sha256": hashlib.sha256(sensor.to_json().encode()).hexdigest()}
@@ -108,7 +108,7 @@ def shape_named(names: Sequence[str], field: Field) -> Shape:
     Raises
     ------
     ParameterError
-        If a name is none of `SHAPES`.
+        If a name is not in `SHAPES`.
     """
     for name in names:
         if name not in SHAPES:
@@ -122,12 +122,12 @@ def shape_named(names: Sequence[str], field: Field) -> Shape:
 
 
 def shape_of(shape: str | Sequence[str] | Shape, field: Field) -> Shape:
-    """Take a shape as it is, or build it from a name or several.
+    """Return a shape, or build it from one or several names.
 
     Raises
     ------
     ParameterError
-        If it is neither a shape nor a name of `SHAPES`.
+        If it is neither a shape nor a name in `SHAPES`.
     """
     if isinstance(shape, str):
         return shape_named((shape,), field)
@@ -153,42 +153,41 @@ def experiment_for(
     trust: float = 1.0,
     cards: tuple[Card, ...] = (),
 ) -> Experiment:
-    """Pose the experiment: a fitted sensor over a shape that is not known, read on the sensor's own scale.
+    """Build the experiment of a fitted sensor over an unknown shape, with readings on the sensor's scale.
 
     Parameters
     ----------
     sensor
-        As calibrated; of what a diagnosis has left open, the most probable. The SSF model takes the mixture with the
-        mean and covariance of its mean field, so that closed forms stand in for the sum over pixels, and its effects
-        at their posterior means; the naive model takes its two levels.
+        The fitted sensor; if it averages several hypotheses, the most probable one is used. The SSF model takes the
+        mixture with the mean and covariance of its mean field, for closed forms instead of sums over pixels, and
+        effects at their posterior means; the naive model takes its two levels.
     shape
-        What may lie on the field.
+        The possible shape on the field.
     field
-        Where to look: 131 x 65 places, as in the paper.
+        Grid of places: 131 x 65, as in the paper.
     model
         "ssf" or "naive".
     n_live
-        Live points of nested sampling, where a reading surprises.
+        Live points of nested sampling, if no sample predicts a reading.
     utility
-        What a reading is worth; by default its expected information and, near the end, whether it ends the run.
+        The utility; by default the expected information and, near the end, the probability of ending the run.
     learn_sensor
-        Infer the SSF's size and place and the two levels along with the shape, from a prior about the
-        calibration (see `sensor_prior`); for the SSF model.
+        Infer the SSF's size and place and the two levels jointly with the shape, with a prior from the calibration (see
+        `sensor_prior`); for the SSF model.
     batch
-        Readings that are chosen together.
+        Readings chosen together.
     orientations_rad, repeats, heights_mm
-        How the sensor may be turned, how often it may read on the spot and how high it may stand, for an arm that
-        can do so; heights for the SSF model of a sensor whose description says at which it was calibrated.
+        Possible orientations, numbers of repeated readings and heights, for an arm that supports them; heights only for
+        the SSF model of a sensor with a known height of calibration.
     trust
-        Probability that the sensor model leaves nothing out, before the first reading; below 1 for the SSF model of
-        a sensor that is known.
+        Prior probability that the sensor model is complete; below 1 only for the SSF model of a known sensor.
     cards
-        Cards of known place and albedo that lie on the field; for the SSF model.
+        Cards of known place and albedo on the field; for the SSF model.
     """
     require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
-    sensor = sensor.leading()  # a mean over rivals is true of none of them
+    sensor = sensor.leading()  # a mean over several hypotheses describes none of them
     levels, noise_sd, scale = levels_of(sensor), float(sensor.noise_sd.mean()), scale_of(sensor.instrumentation)
     scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
     pose = partial(
@@ -204,10 +203,10 @@ def experiment_for(
         if learn_sensor:
             raise ParameterError("learn_sensor", learn_sensor, 'False with the model "naive", which has no SSF')
         sd = math.hypot(noise_sd, (scale.step or 0.0) / math.sqrt(12))
-        # A reading on the edge never fits two levels, and the naive model knows no edge.
+        # A reading on the edge fits neither level, and the naive model has no partial coverage.
         return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
     chain = chain_of(sensor, scene)
-    # Without steps cells are taken as fine as the noise asks for: at the ends a reading stands for all beyond.
+    # Unrounded readings get cells scaled to the noise; the end cells are open.
     likelihood = Rounded(noise_sd, scale.step or noise_sd / _CELLS_PER_SD, scale.low, scale.high)
     if learn_sensor:
         free = replace(chain, ssf=AdjustedMixture(sensor.mixture()), levels=FreeLevels())
@@ -225,7 +224,7 @@ def posing(
     repeats: tuple[int, ...],
     heights_mm: tuple[float, ...],
 ) -> partial[Experiment]:
-    """Pose what every method of inference shares: the shape on the field, the sensor's scale, what can be chosen."""
+    """Build the part of an experiment that all methods share: shape, field, scale of readings, designs."""
     scale = scale_of(sensor.instrumentation)
     return partial(
         Experiment,
@@ -242,37 +241,37 @@ def posing(
 
 
 def levels_of(sensor: FittedSensor) -> FixedLevels:
-    """Take the mean levels of a fitted sensor."""
+    """Return the posterior mean levels of a fitted sensor."""
     means = sensor.mean()
     return FixedLevels(means["I_min"], means["I_max"])
 
 
 def chain_of(sensor: FittedSensor, scene: HypothesisScene) -> Chain:
-    """Put a fitted sensor over a scene: its mean field's mixture, its mean levels, its effects at their means."""
+    """Return the chain of a fitted sensor over a scene: mean field's mixture, mean levels, effects at their means."""
     means = sensor.mean()
     effects = tuple(
         Known(effect, tuple(means[f"{effect.name}.{name}"] for name in effect.prior.names))
         for effect in sensor.carried_effects
-        if effect.stage is not Stage.NOISE  # readings far apart in place and time share no noise
+        if effect.stage is not Stage.NOISE  # noise of readings far apart in place and time is independent
     )
     return Chain(sensor.mixture(), levels_of(sensor), scene, effects, n_nodes=FAST_NODES)
 
 
 TRUST = 0.9
-"""Probability that a sensor model leaves nothing out, where nobody says otherwise."""
+"""Default prior probability that a sensor model is complete."""
 
 
 def usual_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
-    """Trust a sensor as one does where nobody says otherwise.
+    """Return the default trust in a sensor.
 
-    Wholly where doubt has no model, with several shapes, or where a reading is to be worth something of one's own.
+    It is 1 if no rivals are available, for several shapes, or with a user's own utility.
     """
     plain = model == "naive" or learn_sensor or isinstance(shape, AnyOf) or utility != Finishing()
     return 1.0 if plain else TRUST
 
 
 def calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:
-    """Take the height of the calibration: what the sensor sees at another follows from it."""
+    """Return the height of the calibration, which determines the footprint at other heights."""
     height_mm = sensor.instrumentation.height_mm
     if model == "naive":
         raise ParameterError("heights_mm", heights_mm, 'none with the model "naive", which knows no height')
@@ -283,7 +282,7 @@ def calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[floa
 
 
 def scale_of(instrumentation: Instrumentation) -> LegoScale:
-    """Take the scale that readings come in: the LEGO brick's for its unit, else step and range as they are declared."""
+    """Return the scale of readings: the LEGO brick's for its unit, otherwise the declared step and range."""
     if instrumentation.unit == "LEGO":
         return LegoScale()
     low, high = instrumentation.min, instrumentation.max
@@ -291,11 +290,11 @@ def scale_of(instrumentation: Instrumentation) -> LegoScale:
 
 
 def world_like(sensor: FittedSensor) -> World:
-    """Build the world that a sensor.json describes: its mean field as the spot, its levels, noise and height."""
+    """Build the world of a sensor.json: its mean field as the footprint, its levels, noise and height."""
     require_sensor(sensor)
     field, means = sensor.field, sensor.mean()
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
-    # A fitted field of free form may dip below zero; what light there is never does.
+    # A fitted free-form field may be slightly negative; a physical footprint is not.
     spot = Spot(np.maximum(field.values, 0.0), field.pixel_mm, corner)
     height_mm = sensor.instrumentation.height_mm or _USUAL_HEIGHT_MM
     noise_sd = float(sensor.noise_sd.mean())
@@ -303,12 +302,12 @@ def world_like(sensor: FittedSensor) -> World:
 
 
 def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
-    """Paint the shape for the world: geometry alone crosses over."""
+    """Return the world's surface of a shape; only geometry is shared with the models."""
     return surface_under(SHAPES[name](field).region(theta[None, :]), name)
 
 
 def surface_under(region: Region, name: str) -> Surface:
-    """Paint the region of one hypothesis for the world.
+    """Return the world's surface of the region of one hypothesis.
 
     Raises
     ------
@@ -327,7 +326,7 @@ def surface_under(region: Region, name: str) -> Surface:
 
 
 def with_cards(surface: Surface, cards: Sequence[Card]) -> Surface:
-    """Lay cards on a surface of the world: geometry and albedo alone cross over."""
+    """Add cards to a surface of the world; only geometry and albedo are shared."""
     if not cards or isinstance(surface, Covered):
         return surface
     laid = [Polygon(tuple((float(x), float(y)) for x, y in card.corners_mm), inside=card.albedo) for card in cards]
@@ -344,21 +343,21 @@ def arm_over(
     workspace: Workspace | None = None,
     scale: LegoScale | None = None,
 ) -> SimulatedArm:
-    """Stand the simulated arm over a surface.
+    """Return a simulated arm over a surface.
 
     Parameters
     ----------
     world, surface, field
-        What it reads, and how large the field is.
+        World and surface that it reads, and the field.
     seed
-        Of the noise. Each reading has a generator of its own, so that a run that was stopped goes on
-        with the noise it would have had.
+        Seed of the noise. Each reading has its own generator, so that a resumed run has the same noise as an
+        uninterrupted one.
     taken
-        Readings that the run took before it was stopped: the arm stands, and its clock, where the last one left them.
+        Readings of the run before it was interrupted: the arm starts at the pose and time of the last one.
     workspace
-        Where the arm can go and how its sensor then stands; by default nearly everywhere, and never turned.
+        Reach of the arm and orientations of its sensor; by default nearly everywhere, unturned.
     scale
-        What readings are rounded to and kept within; by default the LEGO brick's.
+        Rounding and range of readings; by default the LEGO brick's.
     """
     number = itertools.count(len(taken))
 

@@ -1,4 +1,4 @@
-"""Begin at a place that is given: two robots that begin with the same reading differ in what they know, not in luck."""
+"""Runs from a given first place, so that two robots with the same first reading can be compared."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ __all__ = ["run_from"]
 def run_from(
     first: Pose, instrument: Instrument, experiment: Experiment, *, rng: np.random.Generator, max_readings: int = 100
 ) -> Exploration:
-    """Run the loop of `explore` with a first place that is given; every other place is chosen by the experiment.
+    """Run the loop of `explore` from a given first place.
 
     Parameters
     ----------
     first
-        Where the first reading is taken.
+        Pose of the first reading.
     instrument, experiment
         As for `explore`.
     rng
-        Source of randomness of the whole run.
+        Random generator of the whole run.
     max_readings
-        End here if the lengths are not known by then.
+        Largest number of readings.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What comes of a run: its state, its steps, the whole."""
+"""Values of a run: state, step, and the whole exploration."""
 
 from __future__ import annotations
 
@@ -24,15 +24,14 @@ from probewise.recordings.plan import Instrumentation, Recording
 __all__ = ["PAPER_BITS", "ArmError", "Exploration", "State", "Step"]
 
 PAPER_BITS = 25.0
-"""Bits that the paper counts for a circle known to 4 mm: one for each reading of the naive model."""
+"""Bits in the paper's count for a circle known to 4 mm: one per reading of the naive model."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where a run stands.
+    """The current state of a run.
 
-    `readings` so far, the `posterior` given them, kind by kind, where the next is to be taken, and the poses of those
-    `planned` after it, where several are chosen at a time.
+    `readings` so far, the `posterior` given them, the next pose, and the poses `planned` after it in a batch.
     """
 
     readings: tuple[Reading, ...]
@@ -43,46 +42,45 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Step(ShowsItself):
-    """What one reading taught.
+    """The result of one reading.
 
     Attributes
     ----------
     number, reading
-        Count of readings from 1, and the reading that this step is about.
+        Number of the reading from 1, and the reading.
     names, mean, sd
-        The shape's parameters, their posterior means and sds, each (n_params,). For a set of shapes: given
-        the most probable one, and NaN for parameters that it does not have.
+        The shape's parameters, their posterior means and sds, each (n_params,). For a set of shapes: given the most
+        probable one, with NaN for parameters that it does not have.
     shapes
-        Probability of each shape of a set, by its label; empty where there is one shape only.
+        Probability of each shape of a set, by label; empty for a single shape.
     samples
         Shapes drawn from the posterior, (n_samples, n_params).
     map
-        What each reading that may be taken would be worth now.
+        Utility of each possible next reading.
     next_pose
-        Where the next reading is to be taken; None when the run is over.
+        Next pose; None when the run is over.
     bits
         Prior minus posterior differential entropy of the parameters so far.
     p_value
-        How probable readings as far from the best hypothesis as these are, were it true:
-        upper tail of chi-square with one degree of freedom a reading, so that it errs towards fitting.
+        p-value of the best hypothesis: upper tail of chi-square with one degree of freedom per reading (conservative).
     posterior
-        The weighted posterior of all parameters, with the evidence and its error.
+        Weighted posterior of all parameters, with the evidence and its error.
     sensor
-        Posterior mean and sd of the sensor's parameters by name, where they are learnt too.
+        Posterior mean and sd of the sensor's parameters by name, if they are inferred too.
     left_out
-        Probability of each thing that the sensor model may leave out, by name; "" is nothing.
+        Probability of each effect that the sensor model may leave out, by name; "" is none.
     kinds
-        The posterior kind by kind.
+        The posterior of every kind of hypotheses.
     chance_off
-        Probability that a length is off by three times the sd that the run ends on.
+        Probability that a length is off by three times the sd of the stopping rule.
     stop_reason
-        Why the run ends here, or None.
+        Reason why the run ends here, or None.
     notes
-        Why this step should not be trusted blindly.
+        Warnings on this step.
     replayed
         Whether the reading comes from a journal.
     pace
-        Of the run so far.
+        Pace of the run so far.
     """
 
     number: int
@@ -113,24 +111,24 @@ class Step(ShowsItself):
 
     @property
     def widest_mm(self) -> float:
-        """The largest posterior sd among the parameters in mm."""
+        """Largest posterior sd among the parameters in mm."""
         return widest_mm(self.names, self.sd)
 
     @property
     def likely_shape(self) -> str:
-        """Label of the most probable shape of a set; empty where there is one shape only."""
+        """Label of the most probable shape of a set; empty for a single shape."""
         return max(self.shapes, key=self.shapes.__getitem__, default="")
 
     @property
     def stance(self) -> str:
-        """How the sensor stood, as far as that was chosen, to be read after the place; empty where nothing was."""
+        """Orientation and height of the sensor, as far as they were chosen, as text after the place."""
         pose, designs = self.reading.pose, self.map.designs
         turned = f", turned {math.degrees(pose.orientation_rad):.0f}°" if len(designs.orientations_rad) > 1 else ""
         raised = "" if pose.height_mm is None else f", {pose.height_mm:g} mm up"
         return turned + raised
 
     def summary(self) -> str:
-        """Say in one line what was read and what is now believed."""
+        """Return a one-line summary of the reading and the posterior."""
         believed = ", ".join(
             f"{name} {mean:.{_decimals(name)}f} ± {sd:.{_decimals(name)}f}"
             for name, mean, sd in zip(self.names, self.mean, self.sd, strict=True)
@@ -192,7 +190,7 @@ class Exploration(ShowsItself):
 
     @property
     def readings(self) -> tuple[Reading, ...]:
-        """The readings in the order they were taken."""
+        """The readings in order of time."""
         return tuple(step.reading for step in self.steps)
 
     @property
@@ -221,18 +219,18 @@ class Exploration(ShowsItself):
 
     @property
     def reached(self) -> bool:
-        """Whether shape and lengths are known well enough, by readings that some hypothesis explains."""
+        """Whether the target precision was reached, with a hypothesis that explains the readings."""
         trusted = self.last.p_value >= self.experiment.doubt_p
         return trusted and self.experiment.is_known(self.last.sd, self.last.shapes, self.last.chance_off)
 
     @property
     def seconds(self) -> float:
-        """Seconds of arm time up to the last reading."""
+        """Arm time up to the last reading, in seconds."""
         return self.last.reading.time_s
 
     @property
     def bits_per_reading(self) -> float:
-        """Bits gained a reading, from differential entropies."""
+        """Bits gained per reading, from differential entropies."""
         return self.last.bits / len(self.steps)
 
     @property
@@ -242,11 +240,11 @@ class Exploration(ShowsItself):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Doubts about the last step: why the result should not be trusted blindly."""
+        """Warnings on the last step."""
         return self.last.notes
 
     def recording(self, *, instrumentation: Instrumentation | None = None) -> Recording:
-        """Turn the readings into a recording over the pattern "field"; of a sensor with its `instrumentation`."""
+        """Convert the readings to a recording over the pattern "field", with a sensor's `instrumentation`."""
         return recording_of(self.readings, instrumentation=instrumentation)
 
     def summary(self) -> str:
@@ -282,7 +280,7 @@ class Exploration(ShowsItself):
 
 
 def _decimals(name: str) -> int:
-    """Decimals of a parameter by its unit, so that an angle of a milliradian shows as a tenth of a millimetre does."""
+    """Return the number of decimals of a parameter by its unit: as many for 1 mrad as for 0.1 mm."""
     return 3 if name.endswith("_rad") else 1
 
 

@@ -131,10 +131,14 @@ def _clean(done: list[Result]) -> list[Row]:
 def _detection(done: list[Result]) -> list[Row]:
     targets = {5.0: 0.8, 6.0: 0.93, 8.0: 0.995}
     rows = [
-        Row(f"detection, alpha .01, lambda {size:g}", alarms(_seen_as_physics(singles_of(done, size)), 0.01), least)
+        Row(
+            f"detection, alpha .01, lambda {size:g}",
+            alarms(_distinguishable_from_ssf(singles_of(done, size)), 0.01),
+            least,
+        )
         for size, least in targets.items()
     ]
-    each = [detected for detected, _ in by_effect(_seen_as_physics(done)).values()]
+    each = [detected for detected, _ in by_effect(_distinguishable_from_ssf(done)).values()]
     worst = min(each, key=lambda e: (e.value, e.high), default=share([]))
     return [*rows, Row("detection, lambda 8, least of all effects", worst, 0.9)]
 
@@ -321,7 +325,7 @@ def singles_of(done: Sequence[Result], size: float) -> list[Result]:
     return [r for r in done if r["kind"] == "single" and r["size"] == size]
 
 
-def _seen_as_physics(results: Sequence[Result]) -> list[Result]:
+def _distinguishable_from_ssf(results: Sequence[Result]) -> list[Result]:
     """Keep the cases that should raise an alarm: those that one more Gaussian in the SSF cannot absorb."""
     return [r for r in _on_mean(results) if is_physics(r)]
 

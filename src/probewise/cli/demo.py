@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis
     from probewise.experiment import Exploration, Model
     from probewise.progress import Progress
-    from probewise.report.demo import Search
+    from probewise.report.demo import RobotSearch
     from probewise.scene import Circle
 
 __all__ = ["VERB"]
@@ -129,18 +129,20 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
     )
 
 
-def as_searches(sensor: FittedSensor, runs: Iterable[Exploration], truth: tuple[float, ...]) -> list[Search]:
+def as_searches(sensor: FittedSensor, runs: Iterable[Exploration], truth: tuple[float, ...]) -> list[RobotSearch]:
     """Combine each model's run with the true circle."""
     import numpy as np
 
-    from probewise.report.demo import Search
+    from probewise.report.demo import RobotSearch
     from probewise.scene import outlines
 
     means, circle = sensor.mean(), hypothesis()
     known = dict(zip(circle.prior.names, truth, strict=True))
     outline_mm = outlines(circle.region(np.array([truth])))[0]
     levels = (means["I_min"], means["I_max"])
-    return [Search(MODEL_NAMES[model], run, known, outline_mm, levels) for model, run in zip(MODELS, runs, strict=True)]
+    return [
+        RobotSearch(MODEL_NAMES[model], run, known, outline_mm, levels) for model, run in zip(MODELS, runs, strict=True)
+    ]
 
 
 def hypothesis() -> Circle:
@@ -174,7 +176,7 @@ def _calibrate(seed: int, full: bool, pool: Executor) -> Calibration:
 
 
 def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> tuple[Exploration, list[bytes]]:
-    """Search for the circle from an empty field; return the run and a picture of each step."""
+    """RobotSearch for the circle from an empty field; return the run and a picture of each step."""
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run, surface_of
@@ -212,7 +214,7 @@ def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: 
 
 
 def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
-    """Search for the circle by the paper's rule, from a first reading on it that all models share."""
+    """RobotSearch for the circle by the paper's rule, from a first reading on it that all models share."""
     import numpy as np
 
     from probewise.arm import Pose

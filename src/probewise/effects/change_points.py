@@ -50,7 +50,7 @@ class ChangePointEffect(NamedEffect[V]):
         return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
 
     def gates(self, plan: Plan) -> Gates:
-        """Mask of each interval: the readings after its middle."""
+        """Mask of the readings after each candidate change point, taken at the middle of its interval."""
         always = self.bank()[0]
         always[:, -1] = -np.inf
         middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]

@@ -162,7 +162,7 @@ def update(
             if fall_back is not None:
                 return _from_scratch(fall_back(), n, bridge, n_calls, rng)
             return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
-        share = 1.0 if all_at_once >= KEEP * n else _next_share(log_weight, base, now, share)
+        share = 1.0 if all_at_once >= KEEP * n else _next_power(log_weight, base, now, share)
         weighed = _reweighed(log_weight, now.at(share), base)
         gained = float(logsumexp(weighed))
         log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
@@ -359,7 +359,7 @@ def _parted(rows: IntArray) -> list[IntArray]:
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
-def _next_share(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float) -> float:
+def _next_power(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float) -> float:
     """Return the largest power of the last reading's likelihood with enough effective samples, by bisection."""
     low, high, enough = share, 1.0, KEEP * len(base)
     for _ in range(30):

@@ -46,7 +46,7 @@ from probewise.report.slides import side_by_side
 from probewise.report.words import count, number, readable
 
 __all__ = [
-    "Search",
+    "RobotSearch",
     "answer",
     "answers",
     "comparison_lines",
@@ -77,7 +77,7 @@ _SENSOR = (
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class RobotSearch:
     """One robot's search: the name of its sensor model, its run, and the true shape."""
 
     model: str
@@ -108,7 +108,7 @@ class Search:
         return min(n, len(self.run.steps))
 
 
-def answer(searches: Sequence[Search]) -> str:
+def answer(searches: Sequence[RobotSearch]) -> str:
     """Summarise in one sentence how many readings the SSF model saves, after the same first reading."""
     naive, ssf = (len(s.run.steps) - 1 for s in searches)
     how = "" if all(s.run.reached for s in searches) else " (not every run reached that)"
@@ -118,7 +118,7 @@ def answer(searches: Sequence[Search]) -> str:
     )
 
 
-def equal_start(searches: Sequence[Search]) -> str:
+def equal_start(searches: Sequence[RobotSearch]) -> str:
     """Compare both robots after the number of readings that the SSF robot needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
@@ -130,7 +130,7 @@ def equal_start(searches: Sequence[Search]) -> str:
 
 
 def answers(
-    started_alike: Sequence[Search], diagnosis: Diagnosis, *, concealed: str, seed: int
+    started_alike: Sequence[RobotSearch], diagnosis: Diagnosis, *, concealed: str, seed: int
 ) -> dict[str, str | int]:
     """Return the page's main findings, for other pages to quote."""
     return {
@@ -145,7 +145,7 @@ def answers(
     }
 
 
-def comparison_rows(searches: Sequence[Search]) -> list[tuple[str, ...]]:
+def comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
     """Fill the comparison: readings, information, errors, one row per sensor model."""
     return [
         (
@@ -162,7 +162,7 @@ def comparison_rows(searches: Sequence[Search]) -> list[tuple[str, ...]]:
     ]
 
 
-def comparison_table(searches: Sequence[Search], caption: str = "") -> Markup:
+def comparison_table(searches: Sequence[RobotSearch], caption: str = "") -> Markup:
     """Build the comparison table; the default caption explains its columns."""
     return table(
         HEADER,
@@ -181,8 +181,8 @@ def figures(
     recording: Recording,
     *,
     prediction: Prediction,
-    searches: Sequence[Search],
-    started_alike: Sequence[Search],
+    searches: Sequence[RobotSearch],
+    started_alike: Sequence[RobotSearch],
     geometry: Geometry,
 ) -> dict[str, bytes]:
     """Draw all figures but the diagnosis's: PNG by file name.
@@ -244,7 +244,7 @@ def _at_the_edge(outline_mm: FloatArray) -> tuple[float, float]:
     return float(x_mm), float(y_mm)
 
 
-def _views(searches: Sequence[Search], numbers: Sequence[int]) -> AxesGrid:
+def _views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
     """Draw the paper's view after each of these numbers of readings, one column per search."""
     window = window_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
@@ -266,8 +266,8 @@ def write_page(
     recording: Recording,
     *,
     prediction: Prediction,
-    searches: Sequence[Search],
-    started_alike: Sequence[Search],
+    searches: Sequence[RobotSearch],
+    started_alike: Sequence[RobotSearch],
     frames: Sequence[Sequence[bytes]],
     diagnosis: Diagnosis,
     drawn: Mapping[str, bytes],
@@ -363,8 +363,8 @@ def _sensor_section(
 
 
 def _search_section(
-    searches: Sequence[Search],
-    started_alike: Sequence[Search],
+    searches: Sequence[RobotSearch],
+    started_alike: Sequence[RobotSearch],
     frames: Sequence[Sequence[bytes]],
     drawn: Mapping[str, bytes],
 ) -> Section:
@@ -461,7 +461,7 @@ def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], conceal
     return Section("A mismatch, found and repaired", said, (explanations, Section("The repair", (*repair, more))))
 
 
-def comparison_lines(searches: Sequence[Search]) -> list[str]:
+def comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
     """Write the comparison as lines of text: a table of each search's cost, another of its errors."""
     rows = [HEADER, *comparison_rows(searches)]
     costs, errors = [row[:-2] for row in rows], [(row[0], *row[-2:]) for row in rows]

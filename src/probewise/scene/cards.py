@@ -50,7 +50,7 @@ class Card:
 
     @cached_property
     def region(self) -> PolygonRegion:
-        """Where it lies, as an albedo of 1 on 0."""
+        """The area of the card as a region with albedo 1 inside and 0 outside."""
         return PolygonRegion.simple(self.corners_mm[None])
 
     @property

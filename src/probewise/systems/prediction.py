@@ -144,7 +144,7 @@ def predict_system(
     lost = _lost(chain, theta, own)
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed = 0
-    between = _between_samples(chain, theta, own) if is_drawn else None
+    between = _kernel_width(chain, theta, own) if is_drawn else None
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = theta[first : first + per_block]
@@ -223,7 +223,7 @@ def _columns_read(effects: Sequence[str], table: RunTable) -> set[str]:
     return {part for name in effects for part in name.split(":")[1:] if part in table.columns}
 
 
-def _between_samples(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
+def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:
     """Return the kernel width for smoothing over samples in each row, (n_points,), by Silverman's rule.
 
     A parameter of a new run is drawn from its prior some thousand times. If the prior is wide, the predictions are

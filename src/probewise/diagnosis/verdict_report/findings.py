@@ -95,7 +95,7 @@ def effects_found(
             p += unknown * beside[name]
         if p <= _LEAST_PROBABILITY or not in_vocabulary((name,)) or out_of_vocabulary((name,)):
             continue
-        holder, noise = (best.fit, best.noise) if name in samples.effects else _holder(searched, name)
+        holder, noise = (best.fit, best.noise) if name in samples.effects else _candidate_with(searched, name)
         if holder is None:
             effect, values, size = _too_small(searched, effect, rng=rng)
         else:
@@ -118,7 +118,7 @@ def effects_found(
     return tuple(sorted(out, key=lambda e: -e.probability))
 
 
-def _holder(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
+def _candidate_with(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
     """Return the most probable refitted candidate that contains an effect."""
     ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
     for (mean, noise), p in ranked:

@@ -1,7 +1,7 @@
-"""Systems that conceal something: a world that shares no code with the library's systems, for a challenge of them.
+"""Simulated systems with concealed effects, for challenges; the code is independent of the library's systems.
 
-What a person would bring, a table and a short file, comes from here with a truth that nobody sees; how laws are solved,
-forms act and fits are made is written a second time.
+It produces what a user would provide (a table and a short file) with a separate truth; integration of laws, forms and
+fits are implemented a second time.
 """
 
 from probewise.world.systems.cases import KINDS, Drawn, SystemCase, SystemEffect, draw_system, draw_system_case

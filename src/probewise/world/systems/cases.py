@@ -1,4 +1,4 @@
-"""Draw a case: a system, what it conceals, a recording, and what is kept back to test the diagnosis on."""
+"""Draw a case: a system, its concealed effects, a recording, and held-out runs to test the diagnosis on."""
 
 from __future__ import annotations
 
@@ -36,21 +36,21 @@ KINDS: tuple[Kind, ...] = (*FORMULAS, *LAWS)
 """Every kind of system."""
 
 _ATTEMPTS = 16
-_APART = 0.5  # cosine of the two of a pair, less
-_TOLERANCE = 0.008  # of a size
-_RUN_AWAY = 1e3  # times the largest reading
+_APART = 0.5  # upper bound on the cosine of a pair
+_TOLERANCE = 0.008  # relative tolerance of a size
+_RUN_AWAY = 1e3  # times the largest reading: larger ones count as divergence
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A system that conceals nothing yet.
+    """A system with true parameters, without effects.
 
     Parameters
     ----------
     kind, rows
-        The system, and all its rows, those kept back too.
+        The system, and all its rows, including held-out ones.
     shared, by_run
-        True parameters; those of a run's own (n_runs,).
+        True parameters; those per run have shape (n_runs,).
     """
 
     kind: Kind
@@ -60,22 +60,22 @@ class Drawn:
 
     @cached_property
     def kept(self) -> IntArray:
-        """Rows that are not kept back."""
+        """Rows that are not held out."""
         return np.flatnonzero(self.rows.run < self.rows.n_runs - 2)
 
     @cached_property
     def seen(self) -> SystemRows:
-        """The rows that a diagnosis sees."""
+        """The rows given to the diagnosis."""
         return self.rows.take(self.kept)
 
     @cached_property
     def nominal(self) -> Model:
-        """The nominal model of them."""
+        """The nominal model of those rows."""
         return Model(self.kind, self.seen)
 
     @cached_property
     def at(self) -> FloatArray:
-        """Coordinates of the truth."""
+        """Coordinates of the true parameters."""
         return self.nominal.coordinates(self.shared, self.by_run)
 
     @cached_property
@@ -86,7 +86,7 @@ class Drawn:
 
     @cached_property
     def scene(self) -> Scene:
-        """Where forms are bound."""
+        """The context in which forms are bound."""
         parameters = self.nominal.parameters(self.at[None, :])
         trace = simulate(self.kind, self.seen, parameters)
         return Scene(
@@ -102,7 +102,7 @@ class Drawn:
         return np.asarray(trace.readings[0])
 
     def changed(self, effects: Sequence[Placed]) -> FloatArray:
-        """Noise-free readings at the rows that are seen, (n_points,)."""
+        """Return noise-free readings at the rows given to the diagnosis, (n_points,)."""
         with np.errstate(all="ignore"):
             readings: FloatArray = simulate(
                 self.kind, self.seen, self.nominal.parameters(self.at[None, :]), effects
@@ -112,13 +112,13 @@ class Drawn:
         return readings
 
     def size(self, effects: Sequence[Placed]) -> float:
-        """Return lambda: what the nominal model leaves, refitted in full, in sds."""
+        """Return lambda: the norm that a full refit of the nominal model leaves, in sds."""
         return math.sqrt(self.nominal.fit(self.changed(effects), self.at).squares)
 
 
 @dataclass(frozen=True, eq=False)
 class SystemEffect:
-    """An effect with its numbers, how large it is, and what else explains the same, by name in nats."""
+    """An effect with its parameters, its size, and its aliases by name, with the nats that they lose."""
 
     form: Form
     values: Mapping[str, float]
@@ -128,7 +128,7 @@ class SystemEffect:
 
     @property
     def name(self) -> str:
-        """Name in the vocabulary, or the stranger's."""
+        """Its name, in the vocabulary or outside."""
         return short_name(self.form)
 
     @property
@@ -138,12 +138,12 @@ class SystemEffect:
 
     @property
     def placed(self) -> Placed:
-        """The form with its numbers."""
+        """The form with its parameters."""
         return self.form, numbers_of(self.values)
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """Parameters as in the vocabulary; `values` of all runs, those kept back last."""
+        """Parameters as in the vocabulary; `values` of all runs, with the held-out ones last."""
         values = [v for name, v in self.values.items() if name.startswith("values[")]
         own = {name: v for name, v in self.values.items() if not name.startswith("values[")}
         return {**own, **({"values": values} if values else {}), **self.form.beside}
@@ -156,21 +156,21 @@ class SystemCase:
     Parameters
     ----------
     seed, number, stratum
-        Which case it is.
+        Identification of the case.
     drawn
         The system.
     effects
-        What it conceals.
+        Its concealed effects.
     noise
         Its noise.
     noise_text
-        What the owner's file says of the noise; empty for nothing.
+        The statement on noise in the owner's file; may be empty.
     labels
         Names of the runs.
     noise_free, readings
         At all rows, (n_points,).
     cosine
-        Of the surviving parts of a pair; None: no pair.
+        Cosine of a pair after the refit; None: no pair.
     """
 
     seed: int
@@ -199,7 +199,7 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
     Raises
     ------
     NotConvergedError
-        If nothing that was drawn for it can have the size wanted.
+        If no drawn effect can have the requested size.
     """
     stratum, before = system_stratum_of(number)
     drawing, noise = (
@@ -233,11 +233,11 @@ def _recorded(
     noise_free: FloatArray,
     rng: np.random.Generator,
 ) -> SystemCase:
-    """Add noise, round as printed, and choose what the owner knows of it."""
+    """Add noise, round as printed, and choose what the owner's file states of it."""
     kind = drawn.kind
     name = OTHER_NOISE[before % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
-        name = "correlated_noise"  # the table names no runs
+        name = "correlated_noise"  # the table has no column of runs
     noise = noise_of(name, 12.0, noise_free[drawn.kept], drawn.seen, kind.sd, rng=rng)
     readings = noise.draw(noise_free, drawn.rows, rng)
     knows = str(rng.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
@@ -272,7 +272,7 @@ def _recorded(
 def _conceal(
     stratum: Stratum, before: int, family: str, drawn: Drawn, rng: np.random.Generator
 ) -> tuple[tuple[SystemEffect, ...], float | None]:
-    """Draw once what a stratum wants to be concealed."""
+    """Draw the effects of a stratum once."""
     if stratum.kind == "clean":
         return (), None
     forms = forms_of(drawn.scene)
@@ -301,7 +301,7 @@ def _any_of(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
 
 
 def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) -> SystemEffect:
-    """Choose the amplitude at which a form has the size wanted."""
+    """Choose the amplitude at which a form has the requested size."""
     more = form.draw(rng)
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
@@ -326,7 +326,7 @@ def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) ->
 
 
 def _at_its_moment(form: Form, values: Mapping[str, float]) -> Form:
-    """Let a form that steps at a moment step at that of an effect too: between two rows no other moment is as good."""
+    """Set a step form's time to the effect's, since other times between the same rows are equivalent."""
     at = next((name for name in ("at_s", "at_row") if name in values and name in form.bank[0][0]), None)
     return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
 
@@ -339,7 +339,7 @@ def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
 def _with_rivals(
     effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]
 ) -> SystemEffect:
-    """Look for what explains the same, with the others named beside it."""
+    """Find the aliases of an effect, given the other effects."""
     target = drawn.changed([e.placed for e in (effect, *others)])
     beside = [Beside(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
     model = Model(drawn.kind, drawn.seen, beside)

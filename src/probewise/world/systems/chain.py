@@ -1,4 +1,4 @@
-"""From parameters to noise-free readings, with what is left out: input and clock, parameters, law, reading."""
+"""From parameters to noise-free readings, with effects: input and clock, parameters, law, reading."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def simulate(
     kind
         The system.
     rows
-        Where and when it is read.
+        The rows to simulate.
     parameters
         (n_samples or 1, 1 or n_points) each.
     effects
@@ -66,7 +66,7 @@ def simulate(
 
 
 def read(readings: FloatArray, rows: SystemRows, effects: Sequence[Placed]) -> FloatArray:
-    """Apply what acts on the readings alone, in its order."""
+    """Apply the effects on the readings, in order."""
     for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
         readings = form.act(readings, rows, numbers)
     return readings

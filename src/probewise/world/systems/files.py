@@ -1,4 +1,4 @@
-"""Write a case as its owner would bring it, with the truth beside it."""
+"""Write a case as a user would provide it, with the truth in a separate file."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
 
 
 def truth_of(case: SystemCase) -> dict[str, Any]:
-    """Say everything that the recording does not."""
+    """Return the truth of a case."""
     seen = case.drawn.kept
     later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
     pair = len(case.effects) == 2

@@ -1,4 +1,4 @@
-"""Least squares on the world's own simulation: what is left of an effect when the nominal model is refitted in full."""
+"""Least squares with the world's own simulation: residuals of an effect after a full refit of the nominal model."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ from probewise.world.systems.rows import SystemRows
 
 __all__ = ["Beside", "Fitted", "Model", "free_numbers", "left_over", "numbers_of"]
 
-_STEP = 1e-4  # of a coordinate, for derivatives
-_FORM_STEP = 0.1  # of a form's own
-_FAR = 1e9  # sds
+_STEP = 1e-4  # step of a coordinate for derivatives
+_FORM_STEP = 0.1  # of the form's own step
+_FAR = 1e9  # residual in sds where a law diverges
 
 
 def free_numbers(form: Form) -> tuple[str, ...]:
-    """Name the numbers that a fit may change: not the moment of a step, nor values of runs that are not there."""
+    """Return the parameters to fit: not the time of a step, nor values of absent runs."""
     return tuple(name for name, step in form.steps.items() if step > 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """A form in a model: where its numbers start, and which of them are fitted."""
+    """A form in a model: starting values, and names of the fitted parameters."""
 
     form: Form
     start: Mapping[str, float]
@@ -39,7 +39,7 @@ class Beside:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), squares in sds."""
+    """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), chi-square."""
 
     at: FloatArray
     readings: FloatArray
@@ -49,10 +49,10 @@ class Fitted:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A nominal model with forms beside it, as a function of coordinates.
+    """A nominal model with additional forms, as a function of coordinates.
 
-    Coordinates are those of the shared parameters, of each `per_run` parameter in every run of the rows, and the free
-    numbers of the forms in units of their steps.
+    Coordinates are the shared parameters, each `per_run` parameter in every run, and the fitted parameters of the forms
+    in units of their steps.
     """
 
     kind: Kind
@@ -69,14 +69,14 @@ class Model:
         return len(self.kind.shared) + len(self.kind.per_run) * len(self._runs)
 
     def coordinates(self, shared: Mapping[str, float], by_run: Mapping[str, FloatArray]) -> FloatArray:
-        """Return coordinates of true parameters (n_runs of the case,), the forms' numbers as they start."""
+        """Return coordinates of true parameters (n_runs of the case,), with forms at their starting values."""
         own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared]
         each = [self.kind.priors[name].coordinate(by_run[name][self._runs]) for name in self.kind.per_run]
         numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.beside for name in b.free]
         return np.concatenate([np.ravel(own), *each, numbers])
 
     def parameters(self, x: FloatArray) -> dict[str, FloatArray]:
-        """Give parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points)."""
+        """Return parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points)."""
         out, n = {}, len(self.kind.shared)
         for k, name in enumerate(self.kind.shared):
             out[name] = self.kind.priors[name].value(x[:, k : k + 1])
@@ -87,7 +87,7 @@ class Model:
         return out
 
     def effects(self, x: FloatArray) -> list[Placed]:
-        """Forms with their numbers at coordinates."""
+        """Return forms with their parameters at coordinates."""
         out: list[Placed] = []
         n = self.n_nominal
         for b in self.beside:
@@ -99,13 +99,13 @@ class Model:
         return out
 
     def predict(self, x: FloatArray) -> FloatArray:
-        """Noise-free readings at coordinates (n_samples, n_coordinates): (n_samples, n_points)."""
+        """Return noise-free readings at coordinates (n_samples, n_coordinates): (n_samples, n_points)."""
         return simulate(self.kind, self.rows, self.parameters(x), self.effects(x)).readings
 
     def with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (n_points,) and their slopes (n_points, n_coordinates).
 
-        What is a run's own is changed in all runs at once.
+        Parameters per run are varied in all runs at once.
         """
         n_shared, n_runs = len(self.kind.shared), len(self._runs)
         moves = [np.eye(len(x))[k] for k in range(n_shared)]
@@ -129,7 +129,7 @@ class Model:
         return found[0], out
 
     def _or_far(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return readings with their slopes; where a law runs away, so far off that a fit turns back."""
+        """Return readings with their slopes; if a law diverges, values so large that the fit steps back."""
         try:
             readings, slopes = self.with_slopes(x)
         except NotConvergedError:
@@ -144,7 +144,7 @@ class Model:
         Raises
         ------
         NotConvergedError
-            If the fit leaves the finite numbers.
+            If the fit diverges.
         """
         last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
         sd = self.kind.sd
@@ -181,7 +181,7 @@ class Model:
 
 
 def left_over(change: FloatArray, slopes: FloatArray) -> FloatArray:
-    """Take out of changes (n_points, ...) what slopes (n_points, n) can take up."""
+    """Project slopes (n_points, n) out of changes (n_points, ...)."""
     scale = np.sqrt(np.sum(slopes**2, axis=0))
     basis, values, _ = np.linalg.svd(slopes / np.where(scale > 0, scale, 1.0), full_matrices=False)
     basis = basis[:, values > 1e-8 * values.max(initial=1e-300)]
@@ -189,5 +189,5 @@ def left_over(change: FloatArray, slopes: FloatArray) -> FloatArray:
 
 
 def numbers_of(values: Mapping[str, float]) -> Numbers:
-    """Make numbers of one setting."""
+    """Convert one setting to parameter arrays."""
     return {name: np.array([[value]]) for name, value in values.items()}

@@ -1,4 +1,4 @@
-"""Systems whose reading follows from the row alone."""
+"""Static systems, whose reading depends only on the row."""
 
 from __future__ import annotations
 

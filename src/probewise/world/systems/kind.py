@@ -1,4 +1,4 @@
-"""A kind of system: its owner's file, its law again in the world's own words, and how it is recorded."""
+"""A kind of system: its owner's file, an independent implementation of its law, and its experimental design."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Values: TypeAlias = Mapping[str, Any]
 Columns: TypeAlias = dict[str, FloatArray]
 
 Formula: TypeAlias = Callable[[Values, Values], Any]
-"""Parameters and columns to the reading, row by row."""
+"""Function of parameters and columns; returns the reading, row by row."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class Law:
     Parameters
     ----------
     start
-        State to the parameter, or the number, at which each run starts.
+        Initial value of each state: a parameter or a number.
     rates
-        States, parameters and columns to the rate of each state.
+        Function of states, parameters and columns; returns the rate of each state.
     read
-        States, parameters and columns to the reading.
+        Function of states, parameters and columns; returns the reading.
     linear
-        Whether what drives it moves on straight lines between rows; else it stays as in the row before.
+        Whether inputs are interpolated linearly between rows; otherwise they are held.
     """
 
     start: Mapping[str, str | float]
@@ -47,7 +47,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Prior:
-    """What the owner's file says of a parameter: "uniform" or "log" (low, high), or "normal" (mean, sd)."""
+    """Prior of a parameter in the owner's file: "uniform" or "log" (low, high), or "normal" (mean, sd)."""
 
     shape: str
     a: float
@@ -55,7 +55,7 @@ class Prior:
 
     @property
     def width(self) -> float:
-        """Unit of its coordinate: the range or the sd; of a logarithm 1."""
+        """Unit of its coordinate: the range or the sd, or 1 for a logarithm."""
         return {"uniform": self.b - self.a, "normal": self.b}.get(self.shape, 1.0)
 
     def coordinate(self, value: FloatArray) -> FloatArray:
@@ -78,9 +78,9 @@ class Prior:
 
 @dataclass(frozen=True)
 class Logged:
-    """A column that was logged because it could be: it wanders about a middle and jitters, printed to some decimals.
+    """An irrelevant logged column: a random walk about a middle with jitter, printed to some decimals.
 
-    `beyond` is how far its middle moves in a new regime.
+    `beyond` is the shift of its middle in a new regime.
     """
 
     name: str
@@ -98,39 +98,39 @@ class Kind:
     Parameters
     ----------
     name
-        What it is called in a truth.
+        Its name in a truth.
     reading, unit
-        The column that is predicted.
+        The predicted column, and its unit.
     text
-        The owner's file; `{noise}` stands for what it says of the noise.
+        The owner's file; `{noise}` is replaced by its statement on noise.
     priors
-        As in the file.
+        Priors as in the file.
     draw
-        Draws the true parameters that all runs share.
+        Draws the true shared parameters.
     draw_run
-        Draws a run's own.
+        Draws the true parameters of a run.
     lay
-        Lays a run out: (rng, n_rows, regime) to times from 0 and columns; the regime is 1, or larger beyond the others.
+        Designs a run: (rng, n_rows, regime) to times from 0 and columns; the regime is 1, or larger beyond the others.
     decimals
-        Decimals of the columns laid out, the time's too.
+        Decimals of the designed columns and of time.
     drives
-        Columns that the law asks for.
+        Columns that the law uses.
     sd
         Sd of a reading.
     formula, law
-        One of them: the nominal model.
+        The nominal model, one of the two.
     time, time_unit, run
-        Names of the columns; None where there is none.
+        Names of the columns; None if absent.
     time_anew
-        Whether time begins anew in each run.
+        Whether time restarts in each run.
     logged
-        Columns that do nothing.
+        Irrelevant columns.
     n_runs, per_run
-        Number of runs that are not kept back, and the parameters with a value in each.
+        Number of runs not held out, and the parameters with a value in each.
     reading_decimals
         Decimals of a reading.
     tells_states
-        Whether the owner's file gives a law's states and rates, or has a loop of its own.
+        Whether the owner's file defines states and rates, or integrates by itself.
     """
 
     name: str

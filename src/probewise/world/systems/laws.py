@@ -1,4 +1,4 @@
-"""Systems that move: a law in continuous time."""
+"""Dynamical systems, with a law in continuous time."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How runs are laid out: irregular sampling, sweeps, steps and swings, columns that do nothing."""
+"""Experimental designs of runs: irregular sampling, sweeps, steps and oscillations, irrelevant columns."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from probewise.world.systems.rows import SystemRows
 
 __all__ = ["blocks", "irregular", "lay_out", "swings", "there_and_back"]
 
-_PAUSE = 0.15  # between runs, of the first run's length
+_PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
 
 def irregular(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
@@ -19,7 +19,7 @@ def irregular(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
 
 
 def blocks(rng: np.random.Generator, n: int, levels: FloatArray, length: int) -> FloatArray:
-    """Levels that follow each other, each held for about `length` rows, no two alike in a row, (n,)."""
+    """Return random levels, each held for about `length` rows, without repetition, (n,)."""
     out: list[float] = []
     while len(out) < n:
         choices = [level for level in levels if not out or level != out[-1]]
@@ -28,21 +28,21 @@ def blocks(rng: np.random.Generator, n: int, levels: FloatArray, length: int) ->
 
 
 def swings(rng: np.random.Generator, t: FloatArray, size: float, fastest: float) -> FloatArray:
-    """Add up four sinusoids of random frequency up to `fastest`, rms `size`, (n,)."""
+    """Return the sum of four sinusoids of random frequency up to `fastest`, rms `size`, (n,)."""
     hz = fastest * rng.uniform(0.1, 1.0, 4)
     waves = np.sin(2 * np.pi * hz[:, None] * t + rng.uniform(0, 2 * np.pi, 4)[:, None])
     return np.asarray(size * waves.sum(axis=0) / np.sqrt(2.0))
 
 
 def there_and_back(rng: np.random.Generator, n: int, low: float, high: float) -> FloatArray:
-    """Go up from low to high in uneven steps and down again, (n,)."""
+    """Return a sweep from low to high in uneven steps and back, (n,)."""
     up = n // 2
     first, second = np.sort(rng.uniform(0, 1, up)), np.sort(rng.uniform(0, 1, n - up))[::-1]
     return np.asarray(low + (high - low) * np.concatenate([first, second]))
 
 
 def lay_out(kind: Kind, *, rng: np.random.Generator) -> SystemRows:
-    """Lay out all runs of a case; the last two are kept back, the last one in a new regime."""
+    """Design all runs of a case; the last two are held out, the last one in a new regime."""
     n_runs = kind.n_runs + 2
     each = int(np.clip(rng.integers(150, 420) // kind.n_runs, 24, 120))
     columns: dict[str, list[FloatArray]] = {}

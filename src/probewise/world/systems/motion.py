@@ -1,7 +1,7 @@
-"""A law in continuous time, solved between the rows of every run by SciPy's integrator of eighth order.
+"""Integrate a law between the rows of every run by SciPy's eighth-order method.
 
-All samples and all runs go along together. Dry friction and bounds change the law at moments of their own: where one
-falls between two rows, that way is gone again, one sample and one run at a time, to the moment itself.
+All samples and runs are integrated together. Dry friction and bounds change the law at events; a gap that contains one
+is integrated again, for one sample and run at a time, with event location.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from probewise.world.systems.rows import SystemRows
 __all__ = ["travel"]
 
 _RTOL, _ATOL = 1e-8, 1e-10
-_LOOKS = np.array([0.25, 0.5, 0.75, 1.0])  # of the way between two rows: has something come to rest, or broken loose?
-_REST = 1e-9  # of a state that friction acts on: below it is at rest
-_MOST_CALLS = 600  # of a law between two rows: twelve are a step
-_MOST_EVENTS = 200  # between two rows
-_CLOSE = 1e-7  # of the way between two rows
+_LOOKS = np.array([0.25, 0.5, 0.75, 1.0])  # shares of a gap at which events are checked
+_REST = 1e-9  # share of a state's scale below which it is at rest
+_MOST_CALLS = 600  # limit of evaluations between two rows; a step has twelve
+_MOST_EVENTS = 200  # limit of events between two rows
+_CLOSE = 1e-7  # share of a gap: closer events are merged
 
 
 def travel(
@@ -49,7 +49,7 @@ def travel(
     parameters
         (n_samples or 1, 1 or n_points).
     columns
-        As the system feels them, (n_samples or 1, n_points), the time among them.
+        Effective inputs, (n_samples or 1, n_points), including time.
     effects
         Forms on parameters and rates, and those that delay a column.
     """
@@ -66,7 +66,7 @@ class _Trip:
 
     @cached_property
     def places(self) -> IntArray:
-        """Row at each place of each run, (n_places, n_runs); a short run waits at its end."""
+        """Row at each position of each run, (n_places, n_runs); short runs repeat their last row."""
         longest = max(len(own) for own in self.rows.by_run)
         filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.rows.by_run]
         return np.stack(filled, axis=1)
@@ -104,7 +104,7 @@ class _Trip:
         return values if values.shape[1] == 1 else values[:, self.places[0]]
 
     def moment(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Now]]:
-        """Give parameters and columns at a share of the way from place k to the next."""
+        """Return a function of the share of the gap from position k to the next, giving parameters and columns."""
         here, there = self.places[k, runs], self.places[k + 1, runs]
         first = self.places[0, runs]
         law, time = self.kind.law, self.rows.time
@@ -137,7 +137,7 @@ class _Trip:
         return at
 
     def _earlier(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
-        """Look a column up at earlier moments, (n_samples, n_runs): held, or on the straight line; its first before."""
+        """Interpolate a column at earlier times, (n_samples, n_runs): held or linear; constant before the start."""
         law = self.kind.law
         assert law is not None
         out = np.empty(t.shape)
@@ -160,7 +160,7 @@ class _Trip:
         return out
 
     def breaks(self, k: int) -> list[float]:
-        """Shares of the way from place k to the next at which something jumps, with 0 and 1."""
+        """Return the shares of the gap from position k to the next with discontinuities, with 0 and 1."""
         here, there = self.places[k], self.places[k + 1]
         begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
         moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
@@ -187,7 +187,7 @@ class _Trip:
         return self._at_rows(names, kept)
 
     def _through_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
-        """Go from place k of all runs to the next, (n_states, n_samples, n_runs), by the modes at its start."""
+        """Integrate from position k of all runs to the next, (n_states, n_samples, n_runs), with the initial modes."""
         time = self.rows.time
         assert time is not None
         t = self.columns[time]
@@ -200,7 +200,7 @@ class _Trip:
         edges, begun = self.breaks(k), s
         again = np.zeros(s.shape[1:], dtype=bool)
         for low, high in _apart(edges):
-            # A hair inside: what jumps at an end belongs to the other side of it.
+            # Slightly inside: a discontinuity at an end belongs to the other side.
             hair = 1e-8 if len(edges) > 2 else 0.0
             begin, end = low + hair, high - hair
             at_begin = free(begin, s) if hard else {}
@@ -272,7 +272,7 @@ class _Trip:
         )
 
     def bounded(self, s: FloatArray, names: list[str]) -> FloatArray:
-        """Begin no state beyond its bound."""
+        """Clip initial states to their bounds."""
         for form, size in self.hard:
             if form.stops:
                 k = names.index(form.target)
@@ -280,7 +280,7 @@ class _Trip:
         return s
 
     def one_gap(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
-        """Go from place k of run j to the next with one sample, by friction and bounds as they are at each moment."""
+        """Integrate from position k of run j to the next for one sample, with events of friction and bounds."""
         time = self.rows.time
         assert time is not None
         t = self.columns[time]
@@ -336,32 +336,32 @@ class _Trip:
 
 
 def _apart(edges: Sequence[float]) -> Iterator[tuple[float, float]]:
-    """Pair neighbours, but for those so close that nothing happens between them."""
+    """Yield successive pairs of edges, except those that are too close."""
     return ((low, high) for low, high in pairwise(edges) if high - low > _CLOSE)
 
 
 def _mode(form: Form, size: Any, value: Any, rate: Any) -> Any:
-    """Of friction the way a state is moving, 0 at rest; of a bound 1 while free, 0 while held."""
+    """Return the mode: for friction, the direction of motion, 0 at rest; for a bound, 1 if free, 0 if held."""
     if form.sticks:
         return np.where(value != 0, np.sign(value), np.where(np.abs(rate) > size, np.sign(rate), 0.0))
     return np.where((value >= size) & (rate > 0), 0, 1)
 
 
 def _ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
-    """Tell whether a mode has come to its end."""
+    """Return whether a mode has ended."""
     if form.sticks:
         return np.where(mode == 0, np.abs(rate) > size, value * mode < 0)
     return np.where(mode == 0, rate < 0, value > size)
 
 
 def _event(form: Form, size: float, mode: int, names: list[str], free: Any) -> Any:
-    """Look for the end of a mode: it comes to rest, breaks loose, reaches the bound, or leaves it."""
+    """Return the event function for the end of a mode: coming to rest, breaking loose, reaching or leaving a bound."""
     i = names.index(form.target)
     if form.sticks:
         if mode == 0:
             found, direction = (lambda x, y: abs(free(x, y)[form.target]) - size), 1.0
         else:
-            found, direction = (lambda x, y: y[i] + mode * _REST), -float(mode)  # it may set out from 0
+            found, direction = (lambda x, y: y[i] + mode * _REST), -float(mode)  # it may start from 0
     elif mode == 0:
         found, direction = (lambda x, y: free(x, y)[form.target]), -1.0
     else:

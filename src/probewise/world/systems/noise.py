@@ -1,4 +1,4 @@
-"""Noise of other kinds, as plain to see as is wanted."""
+"""Other kinds of noise, with a requested detectability."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ OTHER_NOISE = (
     "noise_per_run",
     "dropouts",
 )
-"""Kinds of noise that a clean recording may have beside white noise; "t4" and "quantised" are no names."""
+"""Kinds of noise of a clean recording, besides white; "t4" and "quantised" are not in the vocabulary."""
 
 
 @dataclass(frozen=True, eq=False)
 class SystemNoise:
-    """Noise.
+    """A noise model of a case.
 
     Parameters
     ----------
@@ -41,9 +41,9 @@ class SystemNoise:
     parameters
         As in the vocabulary.
     size_lambda
-        Root of twice the log likelihood that it gains over white noise, on average; 0 where that is not asked.
+        Square root of twice the expected gain in log likelihood over white noise; 0 if not requested.
     step
-        What the readings are rounded to, where it is this noise's doing.
+        Rounding step, if this noise is rounding.
     """
 
     name: str
@@ -56,7 +56,7 @@ class SystemNoise:
 def noise_of(
     name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
-    """Choose the strength of a noise such that it is as plain as an effect of size `wanted`."""
+    """Choose the strength of a noise so that it is as detectable as an effect of size `wanted`."""
     whole = rows.n_runs
     match name:
         case "white":
@@ -108,7 +108,7 @@ def noise_of(
                 lambda y, rows, rng: np.where(rng.random(len(y)) < 0.02, 0.0, y + sd * rng.standard_normal(len(y))),
                 {"share": 0.02, "value": 0.0},
             )
-        case "t4":  # its scale is the sd of the normal that its middle looks like
+        case "t4":  # its scale is the sd of the normal that matches its centre
             return SystemNoise(name, lambda y, rows, rng: y + sd * rng.standard_t(4.0, len(y)), {"freedom": 4.0})
         case _:
             step = _round_number(2.0 * sd)
@@ -130,7 +130,7 @@ def _outlying(n: int, share: float, size: float, rng: np.random.Generator) -> Fl
 
 
 def _spectrum_of_walk(n: int) -> FloatArray:
-    """Variances of a walk of unit steps along its own axes, a constant left out, (n - 1,)."""
+    """Return the eigenvalues of a unit-step random walk's covariance, without the constant, (n - 1,)."""
     count = np.arange(1.0, n + 1)
     walk = np.minimum(count[:, None], count)
     centered = walk - walk.mean(axis=0) - walk.mean(axis=1)[:, None] + walk.mean()
@@ -138,13 +138,13 @@ def _spectrum_of_walk(n: int) -> FloatArray:
 
 
 def _of_variances(variances: FloatArray) -> float:
-    """Lambda of unequal variances against their mean."""
+    """Return lambda of unequal variances against their mean."""
     n = len(variances)
     return math.sqrt(max(n * math.log(variances.mean()) - float(np.log(variances).sum()), 0.0))
 
 
 def _solved(size: Callable[[float], float], wanted: float, low: float, high: float) -> float:
-    """Find the strength at which a size is as wanted; the largest, if it stays below."""
+    """Return the strength at which a size has the requested value, or the largest if it stays below."""
     if size(high) <= wanted:
         return high
     return float(np.exp(brentq(lambda a: size(math.exp(a)) - wanted, math.log(low), math.log(high), xtol=1e-4)))

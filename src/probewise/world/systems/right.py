@@ -1,4 +1,4 @@
-"""The model with just what is concealed, fitted to the same readings: nobody could have named better."""
+"""The model with exactly the concealed effects, fitted to the same readings: the best possible identification."""
 
 from __future__ import annotations
 
@@ -11,18 +11,19 @@ from probewise.world.systems.fit import Beside, Model, free_numbers
 
 __all__ = ["right_predictions"]
 
-_MOMENTS = 8  # of a dead time that samples take: the integration stops at each of them in each gap, whatever the sample
+_MOMENTS = 8  # distinct values of a dead time over samples, since the integration stops at each of them in every gap
 
 
 def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
-    """Predict the rows kept back by posterior samples of the right model, (n_samples, n_rows).
+    """Predict the held-out rows by posterior samples of the right model, (n_samples, n_rows).
 
-    Samples are of the Gaussian about the least-squares fit; what is a run's own is drawn from its prior.
+    Samples are from the Gaussian approximation about the least-squares fit; parameters per run are drawn from the
+    prior.
 
     Raises
     ------
     NotConvergedError
-        If the fit leaves the finite numbers.
+        If the fit diverges.
     """
     drawn, kind = case.drawn, case.drawn.kind
     beside = [Beside(e.form, e.values, free_numbers(e.form)) for e in case.effects]
@@ -46,7 +47,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     ]
     parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
     there = np.concatenate(parts, axis=1)
-    # A run that was not seen is taken as the others' middle.
+    # Effects per run are at the mean of the others for a held-out run.
     effects = [
         (form, {k: np.zeros((1, 1)) if k.startswith("values[") and k not in b.free else v for k, v in numbers.items()})
         for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
@@ -56,6 +57,6 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
 
 
 def _to_quantiles(values: FloatArray) -> FloatArray:
-    """Put each value (n_samples,) at the nearest of a few quantiles."""
+    """Round each value (n_samples,) to the nearest of a few quantiles."""
     few = np.quantile(values, (np.arange(_MOMENTS) + 0.5) / _MOMENTS)
     return np.asarray(few[np.searchsorted(0.5 * (few[1:] + few[:-1]), values)])

@@ -1,6 +1,6 @@
-"""What else would explain the same: forms that, fitted together with the system, come within a few nats of it.
+"""Aliases of an effect: forms that, fitted together with the system, come within a few nats of it.
 
-First on straight lines, for every form at once; then by a fit in full of those that come near.
+First linearised, for every form at once; then by full fits of the closest ones.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from probewise.world.systems.forms.scene import Scene
 __all__ = ["TELLING_NATS", "rivals_of", "short_name", "templates_of"]
 
 TELLING_NATS = 3.0
-"""Below it nobody could tell two explanations apart."""
+"""Evidence below which two explanations cannot be distinguished."""
 
-_NEAR = 12.0  # nats on straight lines from which a fit in full is worth while
+_NEAR = 12.0  # linearised nats within which a full fit is made
 _COSINE = 0.9
 _MOST_FITS = 6
-_CHUNK = 160  # settings that are simulated together
+_CHUNK = 160  # settings simulated together
 _NEUTRAL = {"level": np.inf, "period": 1.0}
 
 
 def short_name(form: Form) -> str:
-    """Name in the vocabulary."""
+    """Return the name in the vocabulary."""
     return form.name.removesuffix(" (floor)")
 
 
@@ -48,24 +48,24 @@ class _Candidate:
 def rivals_of(
     scene: Scene, forms: Sequence[Form], target: FloatArray, fitted: Fitted, model: Model, without: frozenset[str]
 ) -> dict[str, float]:
-    """Find what explains noise-free readings as well.
+    """Find the forms that explain noise-free readings as well.
 
     Parameters
     ----------
     scene
         The system.
     forms
-        Those to try.
+        Forms to try.
     target
         Noise-free readings with the effect, (n_points,).
     fitted, model
-        The fit to them of all but the effect: the nominal model, with what else is there beside it.
+        The fit without the effect: the nominal model with the other effects.
     without
         Names not to try.
 
     Returns
     -------
-    Nats that the readings would lose, by name, those below TELLING_NATS, the best first.
+    Loss of log likelihood in nats by name, for those below TELLING_NATS, the best first.
     """
     left = left_over((target - fitted.readings) / scene.sd, fitted.slopes)
     near = _screened(scene, [f for f in forms if short_name(f) not in without], left, fitted, model)
@@ -73,7 +73,7 @@ def rivals_of(
     hard = any(_is_hard(b.form) for b in model.beside)
     for candidate in near:
         name = short_name(candidate.form)
-        if hard:  # fits beside dry friction or a bound take minutes: straight lines have to do
+        if hard:  # fits with dry friction or a bound take minutes: the linearised result is used
             found[name] = min(candidate.nats, found.get(name, np.inf))
             continue
         wider = Model(
@@ -97,7 +97,7 @@ def rivals_of(
 
 
 def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model) -> list[_Candidate]:
-    """List what comes near on straight lines, at most a few fits' worth, a form's best two starts."""
+    """Return the best candidates by linearisation, with each form's best two starts."""
     size = float(left @ left)
     out = []
     for form, changes in templates_of(scene, forms, fitted, model).items():
@@ -121,7 +121,7 @@ def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fit
 
 
 def templates_of(scene: Scene, forms: Sequence[Form], fitted: Fitted, model: Model) -> dict[Form, FloatArray]:
-    """Change of the readings by every setting of every form's bank about a fit, (n_settings, n_points)."""
+    """Return the change of the readings by every setting of every form's bank about a fit, (n_settings, n_points)."""
     settings = {form: [each for group in form.bank for each in group] for form in forms}
     x = fitted.at[None, :]
     parameters, beside = model.parameters(x), model.effects(x)
@@ -162,7 +162,7 @@ def _chunks(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]])
 def _at_once(
     scene: Scene, forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]], fitted: Fitted, model: Model
 ) -> dict[Form, FloatArray]:
-    """Simulate many forms in one go, each neutral but in samples of its own."""
+    """Simulate many forms at once, each with its null setting except in its own samples."""
     ends = np.cumsum([len(settings[form]) for form in forms])
     total, x = int(ends[-1]), fitted.at[None, :]
     placed = []
@@ -173,16 +173,16 @@ def _at_once(
             whole = np.full((total, 1), _NEUTRAL.get(name, 0.0))
             whole[end - len(values) : end] = values
             numbers[name] = whole
-        # To look for it, a column that comes late may be read off between rows: a fit in full will see to its jumps.
+        # For screening, a delayed column may be interpolated; a full fit treats its jumps exactly.
         placed.append((replace(form, late=""), numbers))
     found = _simulated(scene, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
-    if len(forms) > 1 and not np.isfinite(found).all():  # one of them runs away, and takes the others with it
+    if len(forms) > 1 and not np.isfinite(found).all():  # one of them diverges, which stops the integration of all
         return {form: each for own in forms for form, each in _at_once(scene, [own], settings, fitted, model).items()}
     return {form: found[end - len(settings[form]) : end] for form, end in zip(forms, ends, strict=True)}
 
 
 def _simulated(scene: Scene, parameters: Mapping[str, FloatArray], effects: Sequence[Placed], n: int) -> FloatArray:
-    """Simulate; NaN where a law runs away."""
+    """Simulate; NaN if a law diverges."""
     try:
         return simulate(scene.kind, scene.rows, parameters, effects).readings
     except NotConvergedError:

@@ -1,4 +1,4 @@
-"""The rows of a recording of a system: columns, time and runs, as they are printed."""
+"""The rows of a recording of a system: columns, time and runs, as recorded."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ __all__ = ["SystemRows"]
 
 @dataclass(frozen=True, eq=False)
 class SystemRows:
-    """Rows in the order in which they were taken; every array is (n_points,).
+    """Rows in order of time; every array is (n_points,).
 
     Parameters
     ----------
     columns
-        Columns of numbers by name, the time among them.
+        Numeric columns by name, including time.
     run
-        Number of each row's run, counted over all runs of a case, also those kept back.
+        Number of each row's run, among all runs of a case including held-out ones.
     time
-        Name of the column of time; None where none was recorded.
+        Name of the time column; None if none was recorded.
     n_runs
         Number of runs of the case.
     """
@@ -39,7 +39,7 @@ class SystemRows:
 
     @cached_property
     def t(self) -> FloatArray:
-        """Time as printed, or the row's number where none was recorded."""
+        """Recorded time, or the row's number if there is none."""
         return np.arange(float(len(self))) if self.time is None else self.columns[self.time]
 
     @cached_property
@@ -58,12 +58,12 @@ class SystemRows:
 
     @cached_property
     def gap(self) -> float:
-        """Time from a row to the next of its run, the median."""
+        """Median time from a row to the next of its run."""
         return float(np.median(np.concatenate([np.diff(self.t[rows]) for rows in self.by_run])))
 
     @property
     def duration(self) -> float:
-        """Time from the earliest row to the latest."""
+        """Time from the first row to the last."""
         return float(np.ptp(self.t))
 
     def take(self, kept: FloatArray | IntArray) -> SystemRows:

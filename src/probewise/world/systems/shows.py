@@ -1,4 +1,4 @@
-"""Along which covariates a residual shows as plainly as along any."""
+"""Covariates along which a residual is most visible."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from probewise.world.systems.forms.scene import Scene
 __all__ = ["covariates_of"]
 
 _BINS = 20
-_AS_PLAIN = 0.9  # of the plainest
-_PLAIN = 0.25  # of all squares: below it nothing shows
+_AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts as equal
+_PLAIN = 0.25  # least explained share of the sum of squares
 
 
 def covariates_of(form: Form, left: FloatArray, scene: Scene) -> tuple[str, ...]:
-    """Name the covariates that a right answer may put first: its form's own, and what shows it as well.
+    """Return the covariates that a right answer may rank first: the form's own, and equivalent ones.
 
     Parameters
     ----------
     form
-        What is concealed.
+        The concealed form.
     left
-        What the nominal model leaves of it, (n_points,).
+        Residuals after the refit of the nominal model, (n_points,).
     scene
         The system.
     """
@@ -54,7 +54,7 @@ def _binned(values: FloatArray) -> FloatArray:
 
 
 def _share(left: FloatArray, groups: FloatArray | IntArray) -> float:
-    """Share of the squares that means of groups explain, less what they would of noise."""
+    """Return the share of the sum of squares that group means explain, minus the share expected from noise."""
     total, explained, n_groups = float(left @ left), 0.0, 0
     for group in np.unique(groups):
         own = left[groups == group]

@@ -1,4 +1,4 @@
-"""How the cases of a campaign on systems are spread: half are clean."""
+"""The strata of a campaign on systems: half of the cases are clean."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ SYSTEMS_WHEEL: tuple[Stratum, ...] = (
     *[Stratum("pair", 12.0)] * 2,
     *[Stratum("outside", 20.0)] * 2,
 )
-"""Twenty turns of it are 400 cases."""
+"""Twenty cycles are 400 cases."""
 
-_STRIDE = 7  # has no divisor in common with the wheel: cases in a row are of different kinds
+_STRIDE = 7  # coprime to the length of the cycle, so that successive cases differ in kind
 
 
 def system_stratum_of(number: int) -> tuple[Stratum, int]:
-    """Return the stratum of a case, and how many of its kind and noise, of whatever size, come before it."""
+    """Return the stratum of a case, and the number of earlier cases of its kind and noise, of any size."""
     order = [SYSTEMS_WHEEL[k * _STRIDE % len(SYSTEMS_WHEEL)] for k in range(len(SYSTEMS_WHEEL))]
 
     def alike(a: Stratum, b: Stratum) -> bool:

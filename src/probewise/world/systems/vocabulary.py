@@ -47,10 +47,10 @@ FAMILIES = (
     "coupling",
     "limit",
 )
-"""Names before their targets."""
+"""Names of forms without targets."""
 
 
 def forms_of(scene: Scene) -> list[Form]:
-    """List every form of the vocabulary that this system has a target for; a floor is a saturation too."""
+    """Return every form of the vocabulary for which this system has a target; a floor counts as a saturation."""
     of_rates = forms_of_rates(scene) if scene.kind.tells_states else ()
     return [*forms_of_readings(scene), *forms_of_inputs(scene), *forms_of_parameters(scene), *of_rates]

@@ -1,1 +1,1 @@
-"""Every form of the vocabulary, and strangers to it, in the world's own words."""
+"""Every form of the vocabulary, and others outside it, implemented independently for the world."""

@@ -1,4 +1,4 @@
-"""What may be left out of a system: a form, bound to a target, and a form with its numbers."""
+"""Forms of effects on a system, bound to a target."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ Numbers: TypeAlias = Mapping[str, Any]
 """A form's parameters by name: (n_samples, 1), or floats."""
 
 Bank: TypeAlias = Sequence[Sequence[dict[str, float]]]
-"""Settings to look for a form with: groups of those that may add up."""
+"""Template bank of a form: groups of settings that may be combined linearly."""
 
 
 @dataclass(frozen=True, eq=False)
 class Now:
-    """Moments of runs, all of one shape or one that broadcasts: at rows, or between them.
+    """Times in runs, at rows or between them; arrays broadcast.
 
-    `t` is the time as printed, `since` the time since the start of the run, `u` the columns, `run` the number of the
-    run, `row` the number of the row, which is counted at rows alone.
+    `t` is the recorded time, `since` the time since the start of the run, `u` the columns, `run` the number of the run,
+    `row` the number of the row.
     """
 
     t: FloatArray
@@ -38,53 +38,53 @@ class Now:
 
     @classmethod
     def at_rows(cls, rows: SystemRows) -> Self:
-        """Give the moments of all rows."""
+        """Return the times of all rows."""
         return cls(rows.t[None, :], rows.since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
 
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """A form of the vocabulary, or a stranger to it, bound to its target.
+    """A form, in the vocabulary or outside, bound to its target.
 
     Parameters
     ----------
     name
         `name` or `name:target`.
     side
-        Where it acts.
+        Side of the system on which it acts.
     act
-        What it does, by side: input (columns, rows, numbers) to columns; parameter (now, numbers) to what is added;
-        rate (states, now, numbers) to what is added; reading (readings, rows, numbers) to readings.
+        Its function, by side: input (columns, rows, parameters) to columns; parameter (now, parameters) to a term to
+        add; rate (states, now, parameters) to a term to add; reading (readings, rows, parameters) to readings.
     sized
-        Amplitude and what was drawn to the form's numbers.
+        Converts the amplitude and the drawn values to the form's parameters.
     draw
-        Draws all but the amplitude and its sign.
+        Draws all parameters except the amplitude and its sign.
     bank
-        Where to look for it.
+        Its template bank.
     join
-        Turns a group of the bank and the amounts of its members into numbers to start a fit from.
+        Converts a group of the bank and the amounts of its members to starting values of a fit.
     steps
-        By how much to change each number for a derivative.
+        Step of each parameter for derivatives.
     first, limit
-        Amplitude to begin with, and the largest.
+        First amplitude tried, and the largest.
     signed
         Whether the amplitude may be negative.
     target
-        Parameter or state, where it acts on one.
+        Parameter or state on which it acts, if any.
     order
-        Among the forms of the readings.
+        Order among the forms of the readings.
     uses
-        Columns that it asks for.
+        Columns that it uses.
     covariates
-        Along which it shows.
+        Covariates along which its residual is visible.
     breaks
-        Numbers to moments at which something jumps.
+        Function of the parameters that returns times of discontinuities.
     late
-        The column that it delays.
+        Column that it delays.
     sticks, stops
         Whether it is dry friction, or a bound, of the target.
     shape
-        A formula in words, where it is no form of the vocabulary.
+        Its formula in words, if it is outside the vocabulary.
     """
 
     name: str
@@ -111,9 +111,9 @@ class Form:
 
 
 Placed: TypeAlias = tuple[Form, Numbers]
-"""A form with its numbers."""
+"""A form with its parameters."""
 
 
 def as_numbers(settings: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
-    """Stack settings into numbers, (n_settings, 1) each."""
+    """Stack settings to parameter arrays, (n_settings, 1) each."""
     return {name: np.array([[each[name]] for each in settings]) for name in settings[0]}

@@ -1,4 +1,4 @@
-"""What may be wrong with what drives a system: offset, gain, ceiling, dead zone, play, waves, delay; its clock."""
+"""Forms on the inputs of a system (offset, gain, ceiling, dead zone, play, waves, delay), and on its clock."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ Change = Callable[[FloatArray, SystemRows, Numbers], Any]
 
 
 def forms_of_inputs(scene: Scene) -> Iterator[Form]:
-    """List what may be wrong with each column that drives the system, and with the clock."""
+    """Yield the forms on each column that drives the system, and on the clock."""
     for column in scene.kind.drives:
         yield from _of_column(scene, column)
     time = scene.rows.time
-    # A clock that runs wrong is seen where the law, or the formula, asks for the time.
+    # A clock error is detectable only if the law or the formula uses time.
     if time is not None and (scene.kind.law is not None or scene.kind.time_anew):
         yield _linear("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
 
@@ -147,7 +147,7 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
 
 
 def play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-    """Follow a column with play: nothing moves until it is taken up; a run came the way it goes on."""
+    """Apply play to a column: no motion until it is taken up; a run starts with the direction of its first motion."""
     half = 0.5 * np.maximum(v["width"][:, 0], 0.0)
     out = np.empty((max(len(c), len(half)), c.shape[1]))
     for own in rows.by_run:

@@ -1,4 +1,4 @@
-"""What may be wrong inside: parameters that are no constants, and what is missing from the rates of a law."""
+"""Forms inside a system: parameters that vary, and terms missing from the rates of a law."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _N_WAVES = 20
 
 
 def forms_of_parameters(scene: Scene) -> Iterator[Form]:
-    """List how each parameter may vary."""
+    """Yield the ways in which each parameter may vary."""
     over = {"steps": modulations.step(scene)}
     if scene.rows.time is not None:
         over["drifts"] = modulations.along_time(scene)
@@ -27,7 +27,7 @@ def forms_of_parameters(scene: Scene) -> Iterator[Form]:
         if name not in scene.kind.per_run and scene.kind.run is not None and len(scene.rows.by_run) > 1:
             own["differs"] = modulations.by_run(scene)
         if name in scene.kind.per_run and scene.kind.law is not None:
-            own = {}  # where a run starts has no later
+            own = {}  # initial values do not vary within a run
         for kind, how in own.items():
             yield varying(scene, f"{kind}:{name}", name, how)
         if not (name in scene.kind.per_run and scene.kind.law is not None):
@@ -68,7 +68,7 @@ def pushing(
     shape: str = "",
     signed: bool = True,
 ) -> Form:
-    """Bind a term a push(states, now, numbers) to the rate of a state; `size` is how large the push is."""
+    """Bind a term a push(states, now, parameters) to the rate of a state; `size` is the scale of the push."""
     first = 0.01 * scene.speed(state) / size
     return Form(
         name,
@@ -90,7 +90,7 @@ def pushing(
 
 
 def forms_of_rates(scene: Scene) -> Iterator[Form]:
-    """List what may be missing from the rate of each state."""
+    """Yield the terms that may be missing from the rate of each state."""
     if scene.kind.law is None:
         return
     for state, values in scene.states.items():
@@ -112,7 +112,7 @@ def forms_of_rates(scene: Scene) -> Iterator[Form]:
 
 
 def _of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
-    """Make a push of a term in one state."""
+    """Return a push from a term in one state."""
     return lambda s, now, v: term(s[state])
 
 

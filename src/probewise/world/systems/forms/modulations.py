@@ -1,4 +1,4 @@
-"""How something varies: along time, at a moment, from run to run, with a column, as a wave, as it settles."""
+"""Variations: drift, step, per run, with a column, wave, settling."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Modulation:
-    """A function of the moment, in proportion to an amplitude; names as in `Form`."""
+    """A variation in proportion to an amplitude; attributes as in `Form`."""
 
     over: Callable[[Now, Numbers], Any]
     sized: Callable[[float, dict[str, float]], dict[str, float]]
@@ -48,7 +48,7 @@ def _nothing(rng: np.random.Generator) -> dict[str, float]:
 
 
 def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Scale the amplitude of the one member of a group."""
+    """Scale the amplitude of a group's only member."""
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
@@ -69,19 +69,19 @@ def _plain(
 
 
 def along_time(scene: Scene) -> Modulation:
-    """In proportion to time as printed."""
+    """Linear drift in recorded time."""
     names = ("time",) if scene.rows.time in (None, "time") else ("time", str(scene.rows.time))
     return _plain(lambda now, v: v["a"] * now.t, names, float(np.abs(scene.rows.t).max()))
 
 
 def with_column(scene: Scene, column: str) -> Modulation:
-    """In proportion to a column, from its mean over the recording."""
+    """Variation in proportion to a column, about its mean over the recording."""
     middle = scene.middle(column)
     return _plain(lambda now, v: v["a"] * (now.u[column] - middle), (column,), scene.spread(column), (column,))
 
 
 def step(scene: Scene) -> Modulation:
-    """Step at a moment; at a row where there is no time."""
+    """Step at a time, or at a row if there is no time."""
     at, timed = ("at_s", True) if scene.rows.time is not None else ("at_row", False)
     moments = np.quantile(np.unique(scene.rows.t), np.linspace(0.02, 0.98, 40))
 
@@ -102,7 +102,7 @@ def step(scene: Scene) -> Modulation:
 
 
 def by_run(scene: Scene) -> Modulation:
-    """From run to run; the amplitude scales values drawn at random, those of the runs kept back too."""
+    """Random value per run, including held-out runs, scaled by the amplitude."""
     n = scene.rows.n_runs
     names = [f"values[{k}]" for k in range(n)]
     present = [int(scene.rows.run[own[0]]) for own in scene.rows.by_run]
@@ -132,13 +132,13 @@ def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
 
 
 def wave_joined(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Join the amounts of sine and cosine into amplitude and phase."""
+    """Convert the amounts of sine and cosine to amplitude and phase."""
     sine, cosine = amounts * group[0]["a"]
     return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
 
 
 def waves(scene: Scene, n: int) -> Modulation:
-    """One sinusoid in time, up to one in four rows; n rates are looked at."""
+    """One sinusoid in time, up to one period in four rows; the bank has n frequencies."""
     rows = scene.rows
     slowest, fastest = 1.5 / rows.duration, 0.25 / rows.gap
     return Modulation(
@@ -155,7 +155,7 @@ def waves(scene: Scene, n: int) -> Modulation:
 
 
 def settling(scene: Scene) -> Modulation:
-    """Let something die away after the start of each run."""
+    """Exponential settling after the start of each run."""
     longest = float(scene.rows.since_start.max())
     taus = np.geomspace(scene.rows.gap, longest, 12)
     return Modulation(

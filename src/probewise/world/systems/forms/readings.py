@@ -1,4 +1,4 @@
-"""What may be wrong with the reading: offset, gain, bend, ceiling, hysteresis, lag, dead time."""
+"""Forms on the reading: offset, gain, bend, ceiling, hysteresis, lag, dead time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _N_WAVES = 240
 
 
 def forms_of_readings(scene: Scene) -> Iterator[Form]:
-    """List every form of the reading."""
+    """Yield every form of the reading."""
     yield from _varying(scene)
     yield from _bent(scene)
     yield from _behind(scene)
@@ -71,7 +71,7 @@ def _varying(scene: Scene) -> Iterator[Form]:
 
 
 def way_of(y: FloatArray, rows: SystemRows) -> FloatArray:
-    """Sign of the way readings (n_samples, n_points) are moving; a rest keeps the last way, the first row the next."""
+    """Return the sign of change of readings (n_samples, n_points); rests keep the last sign, the first row the next."""
     out = np.zeros_like(y)
     for own in rows.by_run:
         for i in range(len(y)):
@@ -144,18 +144,18 @@ def _bent(scene: Scene) -> Iterator[Form]:
 
 
 def _ends(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatArray]:
-    """End at a level."""
+    """Return a function that clips at a level."""
     bound = np.minimum if upper else np.maximum
     return lambda y, rows, v: np.asarray(bound(y, v["level"]))
 
 
 def _level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
-    """Cut off so much."""
+    """Return the level that clips by an amplitude."""
     return lambda a, drawn: {"level": end + sign * a}
 
 
 def earlier(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray:
-    """Take values (n or 1, n_points) as they were earlier by tau (n or 1, 1), on straight lines within runs."""
+    """Interpolate values (n or 1, n_points) linearly at times earlier by tau (n or 1, 1), within runs."""
     n = max(len(values), len(tau))
     values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
     out = np.empty(values.shape)

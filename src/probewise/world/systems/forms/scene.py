@@ -1,4 +1,4 @@
-"""Where forms are bound: a system about its true parameters, and the rows that are not kept back."""
+"""The context in which forms are bound: a system at its true parameters, over the rows not held out."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["Scene", "log_uniform"]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A system about its true parameters.
+    """A system at its true parameters.
 
     Parameters
     ----------
     kind, rows
-        The system, and the rows that a diagnosis sees.
+        The system, and the rows given to the diagnosis.
     parameters
-        True ones, (1, 1) or (1, n_points).
+        True parameters, (1, 1) or (1, n_points).
     readings, states
         Noise-free and without any effect, (n_points,).
     """
@@ -43,7 +43,7 @@ class Scene:
 
     @property
     def logged(self) -> tuple[str, ...]:
-        """Columns that something may depend on: all that vary, but the time."""
+        """Columns that vary, except time."""
         return tuple(name for name, v in self.rows.columns.items() if name != self.rows.time and np.ptp(v) > 0)
 
     def middle(self, column: str) -> float:

@@ -1,4 +1,4 @@
-"""Effects that are on no list: products, leaks, switches, one-sided springs, memories."""
+"""Effects outside the vocabulary: products, leaks, switches, one-sided springs, memories."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ STRANGE = (
     "chirp",
     "fading_bend",
 )
-"""What strangers are called before their targets."""
+"""Names of these effects, without targets."""
 
 
 def strangers(scene: Scene, rng: np.random.Generator) -> Iterator[Form]:
-    """Bind every stranger to columns and states drawn for it."""
+    """Bind every effect outside the vocabulary to randomly drawn columns and states."""
     columns = [str(name) for name in rng.permutation(scene.logged)]
     first, second = columns[0], columns[1]
     yield _product(scene, first, second)
@@ -103,7 +103,7 @@ def _switch(scene: Scene, column: str, share: float) -> Form:
 
 
 def _memory(scene: Scene, column: str) -> Form:
-    """Remember what has been summed up since the start of the run, soft-limited."""
+    """Add the sum of a column since the start of the run, soft-limited."""
     middle, spread = scene.middle(column), scene.spread(column)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:

@@ -118,7 +118,7 @@ REFUSED = {
     "no wrist": (("--orientations", "0,45", "--arm", "nxt:/dev/null"), "no joint of which turns its sensor"),
     "one height": (("--heights", "10,14", "--arm", "nxt:/dev/null"), "which reads 14 mm above the surface"),
     "a point sees no height": (("--heights", "10", "--model", "naive"), "which knows no height"),
-    "nor beside": (("--heights", "10", "--both-models"), "the naive model knows no height"),
+    "nor beside": (("--heights", "10", "--both-models"), "the naive model has no height"),
     "into the table": (("--heights", "0,10"), "finite, greater than 0"),
     "no angle": (("--orientations", "0,north"), "no list of numbers"),
     "no end": (("--orientations", "inf"), "no list of numbers"),

@@ -18,7 +18,7 @@ from probewise.priors import Product, Uniform
 from probewise.recordings import read_recording, shipped
 from probewise.report import plots
 from probewise.sensor import SSFField
-from probewise.study import Estimate
+from probewise.study import ConcealedRow, Estimate
 
 X, Y = np.linspace(4, 1044, 66), np.linspace(4, 516, 33)
 
@@ -69,6 +69,11 @@ def row(mean):
 
 
 ROWS = {"inside, naive": row(16.0), "inside, SSF, believed 30% too narrow, learning it": row(9.0)}
+CONCEALED = [
+    ConcealedRow(name, size, trust, 30, 11.0, 12.0, *[Estimate(0.5, 0.3, 0.7)] * 5, 2.0, 0.5, 1.0)
+    for name, size in (("nothing", None), ("hysteresis", 4.0), ("quantisation", 5.0))
+    for trust in (0.9, 1.0)
+]
 RUNS = {name: [np.geomspace(300, 3, 10 + k) for k in range(4)] for name in ("inside, SSF", "anywhere, naive", "more")}
 DOUBT = [{"clean": 0.9, "lag": 0.1}, {"clean": 0.2, "lag": 0.7, "halo": 0.1}]
 WIDTHS = {"naive model": np.geomspace(300, 3, 26), "SSF model": np.geomspace(300, 3, 16)}
@@ -99,6 +104,7 @@ FIGURES = {
     ),
     "readings_needed": lambda s: plots.readings_needed(ROWS),
     "readings_needed, one row": lambda s: plots.readings_needed({"inside, naive": row(16.0)}),
+    "doubt_beside_trust": lambda s: plots.doubt_beside_trust(CONCEALED),
     "widths_of_runs": lambda s: plots.widths_of_runs(RUNS),
     "widths_of_runs, one": lambda s: plots.widths_of_runs({"inside, SSF": RUNS["inside, SSF"]}),
     "hypothesis_probabilities": lambda s: plots.hypothesis_probabilities(EFFECTS[:3], [0.5, 0.3, 0.2]),

@@ -6,10 +6,10 @@ import io
 import numpy as np
 import pytest
 
-from probewise.experiment import least_readings
-from probewise.report import plots
+from probewise.experiment import CLEAN, least_readings
+from probewise.report import concealed, plots
 from probewise.report import study as report
-from probewise.study import REFERENCE, Row, Study, experiment_of
+from probewise.study import REFERENCE, ConcealedTrial, Row, Study, concealed_rows, experiment_of
 
 ROWS = [REFERENCE, Row(model="naive")]
 
@@ -97,3 +97,34 @@ def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
     assert "<tbody></tbody>" not in page
     assert max(head.count("<th ") for head in page.split("<thead>")[1:]) <= 7
     assert report.table_of_bounds(one) is None
+
+
+def concealed_runs():
+    good = {"known": True, "readings": 11, "error_mm": 1.0, "held": [True] * 3, "noticed": True, "cpu_s": [0.5, 1.0]}
+    bad = {**good, "readings": 7, "error_mm": 30.0, "held": [False] * 3, "noticed": False}
+    return {
+        ConcealedTrial(effect, size, circle, trust): {
+            **(bad if effect and trust == 1 else good),
+            "credible": [effect or CLEAN] if trust < 1 else [CLEAN],
+        }
+        for effect, size in (("", 0), ("backlash", 1))
+        for circle in range(3)
+        for trust in (0.9, 1.0)
+    }
+
+
+def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
+    rows = concealed_rows(concealed_runs())
+    assert concealed.answer(rows).startswith(
+        "Sure and wrong: 3 of 6 runs where the robot trusts its sensor, 0 of 6 runs where it doubts it"
+    )
+    page = concealed.write_page(rows, command="probewise study --concealed")
+    assert "backlash (play) of the arm, 6" in page
+    assert "0.00 | 1.00" in page
+
+
+def test_doubt_and_trust_stand_beside_each_other_in_every_row():
+    axes = plots.doubt_beside_trust(concealed_rows(concealed_runs()))
+    assert [label.get_text() for label in axes[0, 0].get_yticklabels()] == ["nothing", "backlash (play) of the arm, 6"]
+    (line, *_), *_ = axes[0, 2].containers
+    assert line.get_xdata().tolist() == [11.0, 7.0]

@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--concealed",
         action="store_true",
         help="conceal an effect from the robot in every row, three sizes each, and look for the same circles with and "
-        "without doubt about the sensor (writes concealed.csv; no other row)",
+        "without doubt about the sensor (writes report.html and concealed.csv; no other row)",
     )
     parser.add_argument(
         "--seed", type=int, metavar="S", help="with --concealed: circles, noise and robot of another seed"
@@ -114,7 +114,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run what is left of the study of concealed effects and write its table."""
     from probewise.recordings import write_text_atomically
-    from probewise.study import concealed_table, run_concealed
+    from probewise.report import concealed as report
+    from probewise.study import concealed_rows, concealed_table, run_concealed
 
     others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
     if others:
@@ -137,12 +138,11 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(table)
-    write_text_atomically(out / "concealed.csv", text.getvalue())
-    for row in table:
-        said = (
-            f"{row['concealed']} {row['size']}, trust {row['trust']:g}: {row['readings']:g} readings, intervals hold "
-        )
-        say(f"{said}{row['intervals_hold']}, sure and wrong {row['sure_and_wrong']}", quiet=arguments.quiet)
+    rows = concealed_rows(found)
+    with staged(out) as stage:
+        write_text_atomically(stage / "concealed.csv", text.getvalue())
+        write_text_atomically(stage / "report.html", report.write_page(rows, command=_concealed_command(arguments)))
+    say(report.answer(rows), quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
 
@@ -173,6 +173,14 @@ def _command(arguments: argparse.Namespace) -> str:
         value = getattr(arguments, name)
         if value is not None:
             words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
+    return shlex.join([*words, "--max-readings", str(arguments.max_readings)])
+
+
+def _concealed_command(arguments: argparse.Namespace) -> str:
+    words = ["probewise", "study", "--concealed", "--circles", str(arguments.circles)]
+    for name in ("clean", "seed", "size"):
+        value = getattr(arguments, name)
+        words += [] if value is None else [f"--{name}", str(value)]
     return shlex.join([*words, "--max-readings", str(arguments.max_readings)])
 
 

@@ -5,7 +5,15 @@ from a reference row in one factor.
 """
 
 from probewise.study.circles import POPULATIONS, Population, noise_of
-from probewise.study.concealed import CONCEALED, ConcealedTrial, concealed_table, run_concealed, run_concealed_trial
+from probewise.study.concealed import (
+    CONCEALED,
+    ConcealedRow,
+    ConcealedTrial,
+    concealed_rows,
+    concealed_table,
+    run_concealed,
+    run_concealed_trial,
+)
 from probewise.study.rows import REFERENCE, Row, paper_rows, standard_rows
 from probewise.study.run import Study, read_study, run_study
 from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_within, summarise
@@ -16,6 +24,7 @@ __all__ = [
     "LEAST_FOR_MEDIAN",
     "POPULATIONS",
     "REFERENCE",
+    "ConcealedRow",
     "ConcealedTrial",
     "Estimate",
     "Population",
@@ -24,6 +33,7 @@ __all__ = [
     "Summary",
     "Trial",
     "arm_of",
+    "concealed_rows",
     "concealed_table",
     "experiment_of",
     "noise_of",

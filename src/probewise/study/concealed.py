@@ -25,7 +25,7 @@ from probewise.progress import Progress, silent
 from probewise.recordings import Disc
 from probewise.study.circles import FIELD, POPULATIONS
 from probewise.study.rows import REFERENCE
-from probewise.study.table import WRONG_MM, share_within
+from probewise.study.table import WRONG_MM, Estimate, share_within
 from probewise.study.trial import BRIGHT, DARK, SEED, experiment_of, judged, reached, spot_of, timed_steps
 from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
 from probewise.world.concealed import (
@@ -49,7 +49,15 @@ from probewise.world.concealed import (
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = ["CONCEALED", "ConcealedTrial", "concealed_table", "run_concealed", "run_concealed_trial"]
+__all__ = [
+    "CONCEALED",
+    "ConcealedRow",
+    "ConcealedTrial",
+    "concealed_rows",
+    "concealed_table",
+    "run_concealed",
+    "run_concealed_trial",
+]
 
 _EACH_S = 8.0  # seconds between readings, about
 _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
@@ -242,37 +250,67 @@ def run_concealed(
     return {trial: dict(results[trial.key]) for trial in trials}
 
 
-def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Summarise each row, (effect, size, trust): shares with Wilson's 95 % intervals as text."""
+@dataclass(frozen=True)
+class ConcealedRow:
+    """Summary of a row: shares with Wilson's 95 % intervals, the rest over the runs.
+
+    `size` is None where nothing is concealed. `sure_and_wrong`: ended by the robot's own rule with a length off by more
+    than 12 mm. `noticed`: something left out leads, or the fit is doubted. `names`: mean size of the credible set.
+    """
+
+    concealed: str
+    size: float | None
+    trust: float
+    runs: int
+    readings: float
+    mean_readings: float
+    reached: Estimate
+    intervals_hold: Estimate
+    sure_and_wrong: Estimate
+    noticed: Estimate
+    in_credible_set: Estimate
+    names: float
+    cpu_s_median: float
+    cpu_s_95: float
+
+
+def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
+    """Summarise each row: effect, size and trust."""
     rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
     for trial, result in results.items():
         rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.name, result))
     return [_summed(key, runs) for key, runs in rows.items()]
 
 
-def _summed(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> dict[str, Any]:
+def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Summarise each row for a CSV file: shares with their intervals as text."""
+    return [{name: _cell(getattr(row, name)) for name in row.__dataclass_fields__} for row in concealed_rows(results)]
+
+
+def _summed(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> ConcealedRow:
     effect, size, trust = key
     found = [run for _, run in runs]
     held = [hit for run in found for hit in run["held"]]
-    wrong = sum(run["known"] and run["error_mm"] > WRONG_MM for run in found)
-    return {
-        "concealed": effect or "nothing",
-        "size": CONCEALED[effect][1][size] if effect else "",
-        "trust": trust,
-        "runs": len(found),
-        "readings": float(np.median([run["readings"] for run in found])),
-        "mean_readings": round(float(np.mean([run["readings"] for run in found])), 1),
-        "reached": _share(sum(run["known"] for run in found), len(found)),
-        "intervals_hold": _share(sum(held), len(held)),
-        "sure_and_wrong": _share(wrong, len(found)),
-        "noticed": _share(sum(run["noticed"] for run in found), len(found)),
-        "in_credible_set": _share(sum(name in run["credible"] for name, run in runs), len(found)),
-        "names": round(float(np.mean([len(run["credible"]) for run in found])), 1),
-        "cpu_s_median": round(float(np.median([run["cpu_s"][0] for run in found])), 2),
-        "cpu_s_95": round(float(np.median([run["cpu_s"][1] for run in found])), 2),
-    }
+    n = len(found)
+    return ConcealedRow(
+        concealed=effect or "nothing",
+        size=CONCEALED[effect][1][size] if effect else None,
+        trust=trust,
+        runs=n,
+        readings=float(np.median([run["readings"] for run in found])),
+        mean_readings=round(float(np.mean([run["readings"] for run in found])), 1),
+        reached=share_within(sum(run["known"] for run in found), n),
+        intervals_hold=share_within(sum(held), len(held)),
+        sure_and_wrong=share_within(sum(run["known"] and run["error_mm"] > WRONG_MM for run in found), n),
+        noticed=share_within(sum(run["noticed"] for run in found), n),
+        in_credible_set=share_within(sum(name in run["credible"] for name, run in runs), n),
+        names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
+        cpu_s_median=round(float(np.median([run["cpu_s"][0] for run in found])), 2),
+        cpu_s_95=round(float(np.median([run["cpu_s"][1] for run in found])), 2),
+    )
 
 
-def _share(k: int, n: int) -> str:
-    share = share_within(k, n)
-    return f"{share.value:.2f} ({share.low:.2f} to {share.high:.2f})"
+def _cell(value: object) -> object:
+    if isinstance(value, Estimate):
+        return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})"
+    return "" if value is None else value

@@ -14,6 +14,7 @@ from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
 from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_axes, png, stack_of_axes, svg
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
+from probewise.report.plots.concealed import doubt_beside_trust
 from probewise.report.plots.doubt import belief_in_the_sensor
 from probewise.report.plots.fit import predicted_and_recorded
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
@@ -54,6 +55,7 @@ __all__ = [
     "confusion_matrix",
     "corner_plot",
     "correlation_of_neighbours",
+    "doubt_beside_trust",
     "explain_field",
     "gain_by_scan",
     "grid_of_axes",

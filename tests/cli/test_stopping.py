@@ -238,9 +238,7 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
 def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, quick_frames, monkeypatch, capsys):
     import resource
 
-    from probewise.report import animation
-
-    monkeypatch.setattr(animation, "gif", lambda _: bytes(5_000_000))
+    monkeypatch.setattr("probewise.cli._explore_pictures.gif", lambda _: bytes(5_000_000))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
     out = tmp_path / "out"

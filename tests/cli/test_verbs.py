@@ -77,7 +77,7 @@ def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quic
     assert ['http-equiv="refresh"' in page for page in pages] == [True, False]
     assert (out / "live.html").read_text() == pages[-1]
     assert "all 2 readings that it may take are taken" in pages[-1]
-    assert all("Probabilities of the sensor's possible faults" in page for page in pages)
+    assert all("possible faults after each reading" in page for page in pages)
     assert opened == [(out / "live.html").as_uri()]
 
 

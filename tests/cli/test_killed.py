@@ -89,7 +89,9 @@ def test_kill_9_at_random_moments_changes_nothing_of_the_outcome(sensor_file, tm
     whole_s, whole = time.monotonic() - began_s, contents(tmp_path / "whole")
     chance = random.Random(int(os.environ.get("PROBEWISE_KILL_SEED", "1")))
     n_killed = 0
-    for k in range(3):
+    for k in range(9):
+        if k >= 3 and n_killed >= 3:  # a machine that has become faster ends more runs before they are killed
+            break
         out = tmp_path / str(k)
         for session in range(5):
             more = ["--resume"] if (out / "journal.jsonl").exists() else []

@@ -32,6 +32,7 @@ def test_a_signal_raises_and_gives_the_status_that_shells_expect(number):
         signal.raise_signal(number)
     assert stop.value.status == 128 + number
     assert [signal.getsignal(k) for k in ENDING] == before
+    require_going_on()  # answered: it does not interrupt what this process does next
 
 
 def test_a_signal_that_is_ignored_stays_ignored():

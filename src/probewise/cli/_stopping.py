@@ -65,6 +65,7 @@ def stoppable() -> Iterator[None]:
             raise
         raise asked from error
     finally:
+        _request.number = None  # answered: what the process does next is not interrupted by it
         for number, handler in before.items():
             signal.signal(number, handler)
 

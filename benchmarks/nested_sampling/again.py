@@ -10,7 +10,6 @@ evaluations come on top of the first's.
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -25,7 +24,7 @@ if __name__ == "__main__":
 import numpy as np
 
 from nested_sampling.problems import Known, problem
-from nested_sampling.seeds import limits
+from nested_sampling.seeds import document
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested import NestedResult, repartitioned, run
 
@@ -76,17 +75,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in arguments.problems:
         rows.append(measure(name, arguments.seeds, arguments.live))
         print(rows[-1], flush=True)
-    most, least_sd, most_sd = limits(arguments.seeds)
-    document = {
-        "date": records.today(),
-        "command": f"python -m nested_sampling.again {shlex.join(argv if argv is not None else sys.argv[1:])}",
-        "seeds": arguments.seeds,
-        "n_live": arguments.live,
-        "mean_limit": round(most, 2),
-        "sd_limits": [round(least_sd, 2), round(most_sd, 2)],
-        "problems": rows,
-    }
-    records.write_json(arguments.out, document)
+    written = document("again", argv, arguments.seeds, rows, n_live=arguments.live)
+    records.write_json(arguments.out, written)
     return 0
 
 

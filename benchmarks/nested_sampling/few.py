@@ -10,7 +10,6 @@ its ratio that to the best correct peer's.
 from __future__ import annotations
 
 import argparse
-import shlex
 import sys
 import warnings
 from collections.abc import Sequence
@@ -26,7 +25,7 @@ import numpy as np
 
 from nested_sampling.problems import problem
 from nested_sampling.samplers import Counted
-from nested_sampling.seeds import limits
+from nested_sampling.seeds import document
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested import refine, run
 
@@ -89,18 +88,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         seeds = range(arguments.first, arguments.first + arguments.seeds)
         rows.append(measure(name, seeds, arguments.live, arguments.draws))
         print(rows[-1], flush=True)
-    most, least_sd, most_sd = limits(arguments.seeds)
-    document = {
-        "date": records.today(),
-        "command": f"python -m nested_sampling.few {shlex.join(argv if argv is not None else sys.argv[1:])}",
-        "seeds": arguments.seeds,
-        "n_live": arguments.live,
-        "n_draws": arguments.draws,
-        "mean_limit": round(most, 2),
-        "sd_limits": [round(least_sd, 2), round(most_sd, 2)],
-        "problems": rows,
-    }
-    records.write_json(arguments.out, document)
+    written = document("few", argv, arguments.seeds, rows, n_live=arguments.live, n_draws=arguments.draws)
+    records.write_json(arguments.out, written)
     return 0
 
 

@@ -49,6 +49,22 @@ def limits(n: int) -> tuple[float, float, float]:
     return float(norm.isf(_CHANCE / 2) / math.sqrt(n)), float(spread[0]), float(spread[1])
 
 
+def document(
+    module: str, argv: Sequence[str] | None, n_seeds: int, rows: Sequence[dict[str, Any]], **settings: int
+) -> dict[str, Any]:
+    """Put the rows of a campaign together with what made them, and the limits that the mean and sd of z keep to."""
+    most, least_sd, most_sd = limits(n_seeds)
+    return {
+        "date": records.today(),
+        "command": f"python -m nested_sampling.{module} {shlex.join(argv if argv is not None else sys.argv[1:])}",
+        "seeds": n_seeds,
+        **settings,
+        "mean_limit": round(most, 2),
+        "sd_limits": [round(least_sd, 2), round(most_sd, 2)],
+        "problems": list(rows),
+    }
+
+
 @cache
 def _problem(name: str) -> Known:
     return problem(name)

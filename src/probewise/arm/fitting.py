@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, floats
 from probewise.arm.geometry import Accuracy, Geometry
@@ -110,7 +110,7 @@ def fit_geometry(
     before = values_of(geometry)
     values, total, jacobian = _solve(geometry, before, turned, marks, touch_mm)
     n = int(np.isfinite(marks).sum())
-    p_value = float(chi2.sf(total, n))
+    p_value = float(chdtrc(n, total))
     residuals = marks - places_of(geometry, values, turned)
     if p_value < LEAST_P:
         raise MarksDisagreeError(_disagreement(geometry, before, turned, marks, touch_mm, residuals))
@@ -158,7 +158,7 @@ def _disagreement(
     for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
         others = np.arange(len(marks)) != k
         values, total, _ = _solve(geometry, before, turned[others], marks[others], touch_mm)
-        if chi2.sf(total, int(np.isfinite(marks[others]).sum())) >= LEAST_P:
+        if chdtrc(int(np.isfinite(marks[others]).sum()), total) >= LEAST_P:
             away = float(np.sqrt(np.nansum((marks[k] - places_of(geometry, values, turned[[k]])[0]) ** 2)))
             return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"
     return (

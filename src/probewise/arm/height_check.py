@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
@@ -111,7 +111,7 @@ def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
     shared = basis / steep[:, None]
     own = np.array([look.error for look in others]) / read / steep
     joint = shared @ covariance @ shared.T + np.diag(own**2 + ROUNDING_MM**2)
-    p_value = float(chi2.sf(off @ np.linalg.solve(joint, off), len(off)))
+    p_value = float(chdtrc(len(off), off @ np.linalg.solve(joint, off)))
     return HeightCheck(float(-steepness(coefficients, height[[low]])[0]), off, np.sqrt(np.diagonal(joint)), p_value)
 
 

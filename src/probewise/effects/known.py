@@ -8,10 +8,11 @@ from typing import TypeVar
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.wrapped import Wrapped
 from probewise.errors import ParameterError
 from probewise.priors import Empty
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import Effect, Stage
+from probewise.sensor.stages import Effect
 
 __all__ = ["Known"]
 
@@ -19,7 +20,7 @@ V = TypeVar("V")
 
 
 @dataclass(frozen=True)
-class Known(Effect[V]):
+class Known(Wrapped[V]):
     """Fix an effect's parameters, so that the robot can use a repaired sensor like any other.
 
     `values` are in the order of `effect.prior.names`.
@@ -31,16 +32,6 @@ class Known(Effect[V]):
     def __post_init__(self) -> None:
         if len(self.values) != len(self.effect.prior.names):
             raise ParameterError("values", self.values, f"one number for each of {self.effect.prior.names}")
-
-    @property
-    def name(self) -> str:
-        """The effect's name."""
-        return self.effect.name
-
-    @property
-    def stage(self) -> Stage:
-        """The effect's stage."""
-        return self.effect.stage
 
     @property
     def prior(self) -> Empty:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
@@ -83,7 +83,7 @@ def fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> 
     sd = np.hypot(experiment.noise_sd, (experiment.step or 0.0) / np.sqrt(12.0))
     z = (recording.readings - problem.model.predict(best, recording.plan)[0]) / sd
     z = np.where(recording.usable, z, 0.0)
-    return float(chi2.sf(float(z @ z), max(int(recording.usable.sum()), 1))), int(np.argmax(np.abs(z)))
+    return float(chdtrc(max(int(recording.usable.sum()), 1), float(z @ z))), int(np.argmax(np.abs(z)))
 
 
 def doubt(p_value: float, worst: int, readings: Sequence[Reading]) -> str:

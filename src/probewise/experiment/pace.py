@@ -14,9 +14,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.priors import Prior
+from probewise.effects.wrapped import Wrapped
 from probewise.recordings.plan import Plan, Recording
-from probewise.sensor.stages import Effect, Stage
+from probewise.sensor.stages import Effect
 
 __all__ = ["EACH_S", "Pace", "Paced", "Told", "clocked"]
 
@@ -59,27 +59,12 @@ class Told(Effect[Any], Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Paced(Effect[FloatArray]):
-    """An effect in time, evaluated at the run's own time if the plan has it."""
+class Paced(Wrapped[FloatArray]):
+    """An effect in time, in the run's own time: its prior, and its formula if the plan has that time."""
 
     effect: Told
 
     powers: ClassVar[Mapping[str, int]] = {"at_s": 1, "tau_s": 1, "per_hour": -1}
-
-    @property
-    def name(self) -> str:
-        """The effect's name."""
-        return self.effect.name
-
-    @property
-    def stage(self) -> Stage:
-        """The effect's stage."""
-        return self.effect.stage
-
-    @property
-    def prior(self) -> Prior:
-        """Prior of the effect, in the run's own time."""
-        return self.effect.prior
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effect."""

@@ -14,10 +14,9 @@ from typing import Any, ClassVar
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailed, LogHeavyTailed, NamedEffect
+from probewise.effects.wrapped import Wrapped
 from probewise.experiment.pace import EACH_S
 from probewise.priors import LogUniform, Prior, Product
-from probewise.recordings.plan import Plan
-from probewise.sensor.stages import Effect, Stage
 
 __all__ = ["Shown"]
 
@@ -26,22 +25,12 @@ _SMALLEST = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Shown(Effect[Any]):
+class Shown(Wrapped[Any]):
     """An effect whose prior leaves out the sizes that a run cannot show."""
 
     effect: NamedEffect[Any]
 
     within_run: ClassVar[Mapping[str, LogUniform]] = {"at_s": LogUniform(0.5 * EACH_S, 100.0 * EACH_S)}
-
-    @property
-    def name(self) -> str:
-        """The effect's name."""
-        return self.effect.name
-
-    @property
-    def stage(self) -> Stage:
-        """The effect's stage."""
-        return self.effect.stage
 
     @cached_property
     def prior(self) -> Prior:
@@ -55,10 +44,6 @@ class Shown(Effect[Any]):
         if isinstance(marginal, HeavyTailed | LogHeavyTailed):
             return replace(marginal, smallest=_SMALLEST)
         return self.within_run.get(name, marginal)
-
-    def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
-        """Apply it."""
-        return self.effect.apply(value, theta, plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say what it does."""

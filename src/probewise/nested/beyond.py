@@ -17,6 +17,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.nested.evaluate import Evaluator, Points, Samplable
+from probewise.nested.repartition import principal_root
 from probewise.nested.result import NestedResult
 
 __all__ = ["NOTHING", "Beyond", "look_beyond"]
@@ -76,9 +77,7 @@ def look_beyond(first: NestedResult, problem: Samplable, *, max_calls: int, rng:
     if most < n_draws:
         return NOTHING
     u = evaluate.space.enter(first.theta[-first.n_live :])
-    variance, axes = np.linalg.eigh(np.atleast_2d(np.cov(u, rowvar=False)))
-    root = axes * np.sqrt(np.maximum(variance, 1e-12 * max(float(variance[-1]), 1e-300)))
-    centre, scale, log_z = u.mean(axis=0), 1.0, -math.inf
+    root, centre, scale, log_z = principal_root(u), u.mean(axis=0), 1.0, -math.inf
     lowest = float(first.log_likelihood[-first.n_live])
     for peak in range(_MOST_PEAKS):
         levels = _climb(

@@ -23,7 +23,7 @@ from probewise.nested.evaluate import Samplable
 from probewise.nested.space import Space, unbounded
 from probewise.priors import Prior
 
-__all__ = ["Repartitioned", "repartitioned"]
+__all__ = ["Repartitioned", "principal_root", "repartitioned"]
 
 _DEGREES_OF_FREEDOM = 5.0
 _FLATTEST = 1e-12  # least variance along an axis, relative to the greatest
@@ -147,9 +147,17 @@ def repartitioned(problem: Samplable, theta: FloatArray, *, widening: float = 1.
         raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
     space = unbounded(problem.prior)
     x = space.enter(theta)
+    return Repartitioned(problem, _Near(problem.prior, space, x.mean(axis=0), principal_root(x, widening)))
+
+
+def principal_root(x: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Return a root of the covariance of points (n, n_params): principal axes as columns, times sd and `scale`.
+
+    Axes along which the points do not vary keep a millionth of the greatest sd, so that the root can be inverted.
+    """
     variance, axes = np.linalg.eigh(np.atleast_2d(np.cov(x, rowvar=False)))
     sd = np.sqrt(np.maximum(variance, _FLATTEST * max(float(variance[-1]), 1e-300)))
-    return Repartitioned(problem, _Near(problem.prior, space, x.mean(axis=0), widening * axes * sd))
+    return np.asarray(scale * axes * sd)
 
 
 def _log_student(x: FloatArray) -> FloatArray:

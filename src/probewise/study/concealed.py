@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -274,6 +274,9 @@ class ConcealedRow:
     cpu_s_95: float
 
 
+_COLUMNS = tuple(column.name for column in fields(ConcealedRow))
+
+
 def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[ConcealedRow]:
     """Summarise each row: effect, size and trust."""
     rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
@@ -284,7 +287,7 @@ def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[
 
 def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Summarise each row for a CSV file: shares with their intervals as text."""
-    return [{name: _cell(getattr(row, name)) for name in row.__dataclass_fields__} for row in concealed_rows(results)]
+    return [{name: _cell(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
 
 
 def _summed(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> ConcealedRow:

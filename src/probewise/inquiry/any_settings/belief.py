@@ -9,8 +9,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import logsumexp, ndtri
-from scipy.stats import chi2
+from scipy.special import chdtrc, logsumexp, ndtri
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
@@ -143,7 +142,7 @@ class Readings:
         scale = self.model.scale(theta, predicted)
         below = self.model.noise.cdf(self.values, predicted[0, self.row], scale[0, self.row])
         z = np.abs(ndtri(np.clip(np.minimum(below, 1 - below), 1e-300, 0.5)))
-        return float(chi2.sf(float(z @ z), len(z))), int(np.argmax(z))
+        return float(chdtrc(len(z), float(z @ z))), int(np.argmax(z))
 
 
 def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:

@@ -1,0 +1,39 @@
+"""Base of effects that change one thing of another effect: its parameters, its prior, or its time."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+from probewise._arrays import FloatArray
+from probewise.priors import Prior
+from probewise.recordings.plan import Plan
+from probewise.sensor.stages import Effect, Stage
+
+__all__ = ["Wrapped"]
+
+V = TypeVar("V")
+
+
+class Wrapped(Effect[V]):
+    """An effect that is as the one in `effect` but for what a subclass overrides."""
+
+    effect: Effect[V]
+
+    @property
+    def name(self) -> str:
+        """The effect's name."""
+        return self.effect.name
+
+    @property
+    def stage(self) -> Stage:
+        """The effect's stage."""
+        return self.effect.stage
+
+    @property
+    def prior(self) -> Prior:
+        """The effect's prior."""
+        return self.effect.prior
+
+    def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
+        """Apply the effect."""
+        return self.effect.apply(value, theta, plan)

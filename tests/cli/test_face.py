@@ -95,6 +95,16 @@ def test_the_command_line_and_python_have_the_same_defaults(verb, parameter, opt
     assert own == (tuple(theirs) if parameter == "orders" else theirs[0] if parameter == "shape" else theirs)
 
 
+def test_the_command_line_offers_a_shape_as_soon_as_it_has_a_name(monkeypatch):
+    from probewise import scene
+
+    monkeypatch.setitem(scene.SHAPES, "dot", scene.SHAPES["circle"])
+    parser = argparse.ArgumentParser()
+    next(v for v in VERBS if v.name == "explore").add_arguments(parser)
+    assert parser.parse_args(["--sensor", "s.json", "--out", "o", "--shape", "dot"]).shape == ["dot"]
+    assert "dot" in parser.format_help()
+
+
 def test_a_verb_and_the_function_behind_it_have_the_same_defaults():
     from probewise import calibration, experiment
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Product, Uniform
 from probewise.recordings import patterns as kinds
+from probewise.scene import SHAPES as NAMED
 from probewise.scene import (
     AnyOf,
     Circle,
@@ -25,13 +26,10 @@ from probewise.scene import (
 )
 
 SHAPES = {
-    "circle": Circle(),
+    **{name: shape(Field()) for name, shape in NAMED.items()},
     "circle_inside": Circle(inside=True),
-    "ellipse": Ellipse(),
     "ellipse_inside": Ellipse(inside=True),
-    "rectangle": Rectangle(),
     "rectangle_inside": Rectangle(inside=True),
-    "triangle": RegularPolygon(3),
     "hexagon_inside": RegularPolygon(6, inside=True),
     "any": AnyOf({"circle": Circle(), "rectangle": Rectangle(), "hexagon": RegularPolygon(6)}, (0.5, 0.3, 0.2)),
     "any_inside": AnyOf({"circle": Circle(inside=True), "ellipse": Ellipse(inside=True)}),

@@ -23,7 +23,17 @@ if TYPE_CHECKING:
 
 __all__ = ["VERB"]
 
-SHAPE_NAMES = ("circle", "ellipse", "rectangle", "triangle", "hexagon")
+
+class _ShapeNames:
+    """Names of all shapes, looked up only when asked for: building the parser must not import numpy."""
+
+    def __iter__(self) -> Iterator[str]:
+        from probewise.scene import SHAPES
+
+        return iter(SHAPES)
+
+    def __contains__(self, name: object) -> bool:
+        return name in tuple(self)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,10 +65,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--shape",
         nargs="+",
-        choices=SHAPE_NAMES,
+        choices=_ShapeNames(),
         default=[SHAPE],
         metavar="SHAPE",
-        help=f"possible shapes on the field, one or several of {', '.join(SHAPE_NAMES)} (default {SHAPE})",
+        help=f"possible shapes on the field, one or several of %(choices)s (default {SHAPE})",
     )
     parser.add_argument(
         "--truth",

@@ -194,6 +194,8 @@ def integrate_states(
         start[state] = np.array(np.broadcast_to(at, (n_samples, rows.shape[1])))
     kept = {state: np.empty((n_samples, *rows.shape)) for state in start}
     steps = places.n_steps(max_step)
+    # A clock that runs fast or slow changes the time column, and with it the time that passes from row to row.
+    gaps = np.diff(_at(columns[str(places.table.time)], rows), axis=1)
     s = motion.settled({}, dict(start))
     with np.errstate(all="ignore"):
         given_there = _Given.of(motion, places, parameters, columns, start)
@@ -203,7 +205,7 @@ def integrate_states(
             if k == len(rows) - 1:
                 break
             n = int(steps[k])
-            between, gap = given_there.between(k), places.gaps[k]
+            between, gap = given_there.between(k), gaps[:, k]
             for i in range(n):
                 s = _stepped(motion, s, between, gap, i / n, 1 / n)
     place, run = places.place

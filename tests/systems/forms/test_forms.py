@@ -195,6 +195,19 @@ def test_a_state_stops_at_a_floor_as_well_as_at_a_ceiling():
     assert form.prior.log_prob(form.bank()[:, 0, :]).min() > -np.inf
 
 
+def test_a_clock_that_gains_hastens_a_law():
+    """Closed form: x' = 0.8 exp(-x / 2) from x = 0 is 2 ln(1 + 0.4 t), at the true time t (1 + a)."""
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"gain": (0.0, 2.0)},
+        law=Law({"x": 0.0}, lambda s, p, u: {"x": 0.8 * np.exp(-s["x"] / 2)},
+                lambda s, p, u: p["gain"] * s["x"], max_step_s=0.02),
+        time="t_s", run="run", noise=Noise(sd=SD),
+    )  # fmt: skip
+    about = _about(simulator)
+    found = _read("clock_drift", 0.03, about=about, forms=forms_of(about))
+    np.testing.assert_allclose(found, about.theta[0, 0] * 2 * np.log(1 + 0.4 * 1.03 * _T), atol=1e-6)
+
+
 def test_an_input_is_cut_off_below_as_well_as_above():
     """On u = drive and y = offset + gain u: what is cut off is the drive."""
     drive, form = TABLE.columns["drive"], FORMS["input_saturation:drive"]

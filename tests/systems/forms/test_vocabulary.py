@@ -1,0 +1,50 @@
+"""The vocabulary of forms is one: bound by the library, concealed by the independent world, worded by the report."""
+
+import numpy as np
+import pytest
+
+from probewise.effects import public_name
+from probewise.report.effect_words import FORMS_IN_WORDS, effect_in_words, is_in_words
+from probewise.systems import Law, Noise, RunTable, Simulator, System
+from probewise.systems.forms import About, forms_of
+from probewise.world.systems.vocabulary import FAMILIES
+
+_T = np.tile(np.arange(0.0, 6.0, 0.2), 2)
+TABLE = RunTable(
+    {
+        "t_s": _T,
+        "run": np.repeat([1.0, 2.0], len(_T) // 2),
+        "push": np.sin(_T) + 0.3 * np.sin(3.1 * _T),
+        "room_c": np.random.default_rng(1).normal(20, 2, len(_T)),
+        "y": np.zeros(len(_T)),
+    },
+    time="t_s",
+    run="run",
+)
+
+
+@pytest.fixture(scope="module", name="names")
+def _names():
+    """Every form of a mass on a spring that is pushed, in the file's own words."""
+    law = Law(
+        {"x": 0.5, "v": 0.0},
+        lambda s, p, u: {"x": s["v"], "v": u["push"] - p["k"] * s["x"] - 0.3 * s["v"]},
+        max_step_s=0.1,
+    )
+    simulator = Simulator("y", "m", {"k": (0.5, 2.0)}, law=law, time="t_s", run="run", noise=Noise(sd=0.01))
+    system = System.of(simulator, TABLE)
+    return {public_name(name) for name in forms_of(About(system, TABLE, np.zeros(system.n_params), 0.01))}
+
+
+def test_every_form_has_a_counterpart_in_the_world_that_conceals(names):
+    assert {name.split(":")[0] for name in names} == set(FAMILIES)
+
+
+def test_the_report_has_words_for_every_form(names):
+    assert [name for name in names if not is_in_words(name)] == []
+    assert {effect_in_words(name).count("{") for name in names} == {0}
+
+
+def test_the_report_has_words_for_nothing_else(names):
+    of_the_noise = {"random_walk", "noise_per_run"}
+    assert set(FORMS_IN_WORDS) <= {name.split(":")[0] for name in names} | of_the_noise

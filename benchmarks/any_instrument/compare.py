@@ -37,12 +37,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from any_instrument.problem import Engine, Problem
-from any_instrument.range_finder import WALL
-from any_instrument.resonance import RESONANCE
 from tqdm import tqdm
 
 import probewise
+from any_instrument.problem import Engine, Problem
+from any_instrument.range_finder import WALL
+from any_instrument.resonance import RESONANCE
 
 PROBLEMS = {"resonance": RESONANCE, "wall": WALL}
 WRONG_SDS = 5.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from any_instrument.problem import Found, Instrument, Problem, found_by_particles
 
 import probewise
+from any_instrument.problem import Found, Instrument, Problem, found_by_particles
 from probewise.inquiry import ReadingNoise
 from probewise.priors import Uniform
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from any_instrument.problem import Found, Instrument, Problem, found_by_particles
 
 import probewise
+from any_instrument.problem import Found, Instrument, Problem, found_by_particles
 from probewise.priors import Normal, Uniform
 
 GOAL = 0.01

@@ -7,6 +7,7 @@ The packages below offer the same with every option. Heavy imports happen inside
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
@@ -211,7 +212,8 @@ def explore(
         prior.
     arm
         The instrument, used as a context manager; by default the simulated arm. Your own needs only a method
-        `measure(pose)` that returns a number or a dict; see `probewise.arm.instrument_of`.
+        `measure(pose)` that returns a number or a dict; see `probewise.arm.instrument_of`. Of a `LegoArm` whose
+        geometry was fitted to marks, the arm's own error is part of the sds, and of the stopping rule.
     field
         Width and height of the field; by default those of the paper.
     model
@@ -292,7 +294,7 @@ def explore(
         require_whole,
     )
     from probewise._progress import progress_or_bar
-    from probewise.arm import instrument_of
+    from probewise.arm import LegoArm, instrument_of
     from probewise.calibration.sensor_file import require_sensor
     from probewise.errors import ParameterError
     from probewise.scene import Field
@@ -330,6 +332,9 @@ def explore(
         trust=None if trust is None else require_number("trust", trust, "a number greater than 0, up to 1"),
         cards=tuple(cards),
     )
+    if isinstance(arm, LegoArm) and arm.geometry.accuracy is not None:
+        means = sensor.mean()
+        asked = replace(asked, fitted_arm=posing.FittedArm(arm.geometry, (means["I_min"], means["I_max"])))
     path = None if journal is None else require_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
     about = {**posing.sensor_named(sensor), "arm": "simulated" if arm is None else type(arm).__name__}

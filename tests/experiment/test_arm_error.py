@@ -13,8 +13,8 @@ from probewise.arm.fitting import fit_geometry
 from probewise.arm.geometry import Accuracy
 from probewise.arm.marks import marks_of
 from probewise.arm.uncertainty import FITTED, RULER_SDS, places_of, slopes_mm, values_of
-from probewise.errors import ParameterError
-from probewise.experiment import found_shape, result_json, run, samples_csv, with_arm_error
+from probewise.errors import FileError, ParameterError
+from probewise.experiment import FittedArm, explore, found_shape, result_json, run, samples_csv, with_arm_error
 
 ARM = dataclasses.replace(read_geometry(shipped_geometry()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0))
 LEVELS = DARK, WHITE = 10.0, 60.0
@@ -115,6 +115,58 @@ def test_light_that_falls_less_with_the_height_moves_the_shape_less(found):
     claimed = [with_arm_error(found, each, levels=LEVELS, rng=np.random.default_rng(1)).arm.sd for each in (same, none)]
     np.testing.assert_allclose(claimed[0], square.arm.sd)
     assert (claimed[1] < square.arm.sd).all()
+
+
+@pytest.fixture(scope="module")
+def claimed_by(request):
+    """Run the same robot over the same field, with an arm that knows where its base stands to so many mm."""
+    small = request.getfixturevalue("small_for_all")
+
+    def claimed(sd_mm):
+        arm = None if sd_mm is None else FittedArm(only("base x", sd_mm), LEVELS)
+        experiment = small.experiment(n_particles=600, stop_sd_mm=1.0, fitted_arm=arm)
+        return run(small.arm(), experiment, rng=np.random.default_rng(4), max_readings=25)
+
+    return claimed
+
+
+def test_a_run_reads_on_until_the_lengths_are_known_arm_included(claimed_by):
+    alone, included = claimed_by(None), claimed_by(0.95)
+    assert len(included.readings) > len(alone.readings)
+    assert alone.readings == included.readings[: len(alone.readings)]  # until then the arm plays no part
+    np.testing.assert_allclose(included.arm.sd, [0.95, 0.0, 0.0], atol=0.08)
+    assert np.hypot(included.last.sd, included.arm.sd).max() < 1.0
+    assert np.hypot(included.steps[-2].sd, included.steps[-2].arm.sd).max() >= 1.0
+    assert included.stop_reason == "every length is known to better than 1 mm, the arm's own error included"
+    assert included.reached
+
+
+def test_a_run_whose_arm_alone_leaves_too_much_says_so_and_reads_no_further(claimed_by):
+    alone, beyond = claimed_by(None), claimed_by(1.5)
+    assert len(beyond.readings) == len(alone.readings) < 25
+    assert beyond.stop_reason.startswith("the readings know every length to better than 1 mm, but the arm's own error")
+    assert "leaves 1.5 mm, which no reading lowers" in beyond.stop_reason
+    assert not beyond.reached
+    assert beyond.sd.max() > 1.5
+
+
+def test_a_run_that_ends_too_early_claims_the_arms_part_too(small_for_all):
+    experiment = small_for_all.experiment(fitted_arm=FittedArm(only("base x", 3.0), LEVELS))
+    early = run(small_for_all.arm(), experiment, rng=np.random.default_rng(4), max_readings=2)
+    assert early.arm is not None
+    assert early.steps[0].arm is None
+    assert early.stop_reason.endswith("the arm's own error included")
+
+
+def test_a_journal_is_not_continued_with_an_arm_that_is_known_otherwise(small_for_all, tmp_path):
+    def steps(sd_mm):
+        experiment = small_for_all.experiment(fitted_arm=FittedArm(only("base x", sd_mm), LEVELS))
+        rng = np.random.default_rng(4)
+        return list(explore(small_for_all.arm(), experiment, rng=rng, max_readings=2, journal=tmp_path / "j.jsonl"))
+
+    steps(0.8)
+    with pytest.raises(FileError, match="fitted_arm"):
+        steps(0.9)
 
 
 def built_and_fitted(rng):

@@ -43,6 +43,7 @@ __all__ = [
     "questioner",
     "require_choices",
     "warn_of_clearance",
+    "warn_of_goal",
 ]
 
 ARMS = (
@@ -184,6 +185,17 @@ def warn_of_clearance(geometry: Geometry) -> None:
         f"the sensor may touch the table: it reads {geometry.read_height_mm:g} mm above it, and {known} "
         f"{doubt_mm:.0f} mm; fit the geometry (probewise arm fit-geometry), or look how it comes down "
         "(probewise arm jog X,Y --down --steps)"
+    )
+
+
+def warn_of_goal(geometry: Geometry, stop_sd_mm: float) -> None:
+    """Warn if the arm's place is known less well than the lengths of a shape are to be."""
+    accuracy = geometry.accuracy
+    if accuracy is None or accuracy.place_sd_mm < stop_sd_mm:
+        return
+    caution(
+        f"lengths will not be known to {stop_sd_mm:g} mm: the arm knows its place to {accuracy.place_sd_mm:.1f} mm, "
+        "which no reading lowers; `probewise arm fit-geometry` does, with more marks or with marks met more closely"
     )
 
 

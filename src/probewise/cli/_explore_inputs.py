@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 from dataclasses import dataclass
 from functools import partial
@@ -97,6 +98,10 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
         heights_mm=heights_mm,
         trust=arguments.trust,
     )
+    if chosen.is_apart and geometry is not None and geometry.accuracy is not None:
+        means = sensor.mean()
+        fitted = posing.FittedArm(geometry, (means["I_min"], means["I_max"]))
+        experiment = dataclasses.replace(experiment, fitted_arm=fitted)
     other, other_model = None, _other(arguments.model)
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)

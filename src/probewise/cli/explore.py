@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import ARMS, Telling, add_geometry, require_choices, warn_of_clearance
+from probewise.cli._arm import ARMS, Telling, add_geometry, require_choices, warn_of_clearance, warn_of_goal
 from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
@@ -161,6 +161,7 @@ def run(arguments: argparse.Namespace) -> int:
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     if inputs.geometry is not None and inputs.arm.is_apart:
         warn_of_clearance(inputs.geometry)
+        warn_of_goal(inputs.geometry, inputs.experiment.stop_sd_mm)
     pictures = Pictures(out, inputs, arguments.live, site.outline_mm)
     steps = pictures.steps
 
@@ -205,8 +206,6 @@ def run(arguments: argparse.Namespace) -> int:
         for step, shadow in pairs:
             pictures.add(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
-    if inputs.arm.is_apart and inputs.geometry is not None and inputs.geometry.accuracy is not None:
-        result = posing.with_arm_error(result, inputs.geometry, levels=inputs.levels, rng=inputs.streams.arm)
     drawing = progress_shown(quiet=arguments.quiet)
     with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")

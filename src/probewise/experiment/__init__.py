@@ -4,6 +4,7 @@ from probewise.experiment.arm_error import with_arm_error
 from probewise.experiment.asking import Field
 from probewise.experiment.beside import beside
 from probewise.experiment.digest import value_digest
+from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.found import OFF_MM, FoundParameter, FoundShape, found_shape, result_json, samples_csv
 from probewise.experiment.hidden import Hidden, Truth, members_of
 from probewise.experiment.journal import (
@@ -61,6 +62,7 @@ __all__ = [
     "Experiment",
     "Exploration",
     "Field",
+    "FittedArm",
     "FoundParameter",
     "FoundShape",
     "Hidden",

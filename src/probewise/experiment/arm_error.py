@@ -12,21 +12,27 @@ their covariance with the parameters is known, minus one each (Stein's identity)
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.geometry import Accuracy, Geometry
+from probewise.arm.instrument import Reading
 from probewise.arm.uncertainty import FITTED, slopes_mm
 from probewise.errors import ParameterError
+from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.kinds import Kind
+from probewise.experiment.posterior import Posterior
+from probewise.experiment.setting import Experiment
 from probewise.experiment.values import ArmError, Exploration
 from probewise.inference.problem import scores
+from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
 from probewise.scene.shapes import AnyOf
 
-__all__ = ["with_arm_error"]
+__all__ = ["arm_error", "moved_by_arm", "with_arm_error"]
 
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
 _STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are
@@ -41,20 +47,16 @@ def with_arm_error(
     calibrated_mm: tuple[float, float] | None = None,
     rng: np.random.Generator,
 ) -> Exploration:
-    """Add the error of the arm's geometry to what a run claims of its shape.
+    """Add the error of the arm's geometry to what a run that has ended claims of its shape.
+
+    A run whose experiment has a `fitted_arm` has it already, and its stopping rule counts it.
 
     Parameters
     ----------
     run
         The run, whose readings tell the places that the arm knows of.
-    geometry
-        The arm's, fitted to marks.
-    levels
-        What the sensor reads over black and over white: light above black falls with the height, as the geometry says
-        or, where it does not, with the square.
-    calibrated_mm
-        Where on the field this arm took the readings that the sensor was calibrated by: an error of the height there is
-        in the sensor's levels already. By default in the field's middle, as `arm record` does.
+    geometry, levels, calibrated_mm
+        See `FittedArm`.
     rng
         Draws the errors by which posterior samples are moved.
 
@@ -67,28 +69,79 @@ def with_arm_error(
     ParameterError
         If the geometry has no accuracy, or does not reach a place of a reading.
     """
-    if geometry.accuracy is None:
-        raise ParameterError("geometry", "one without [accuracy]", "one that was fitted to marks")
-    recording = run.experiment.problem(run.readings).recording
+    last, arm = run.last, FittedArm(geometry, levels, calibrated_mm)
+    found = arm_error(
+        run.experiment,
+        arm,
+        run.readings,
+        last.posterior,
+        last.kinds,
+        mean=last.mean,
+        sd=last.sd,
+        likely_shape=last.likely_shape,
+        rng=rng,
+    )
+    return replace(run, steps=(*run.steps[:-1], replace(last, arm=found)))
+
+
+def arm_error(
+    experiment: Experiment,
+    arm: FittedArm,
+    readings: Sequence[Reading],
+    posterior: Weighted,
+    kinds: Posterior,
+    *,
+    mean: FloatArray,
+    sd: FloatArray,
+    likely_shape: str,
+    rng: np.random.Generator,
+) -> ArmError:
+    """Tell what the error of the arm's geometry does to the shape.
+
+    Parameters
+    ----------
+    experiment, arm, readings
+        The experiment, the arm, the readings so far.
+    posterior, kinds
+        The posterior given them, joined and kind by kind.
+    mean, sd, likely_shape
+        Moments of the shape's parameters, (n_params,) each, and the label of the most probable shape, see `Step`.
+    rng
+        Draws the errors by which posterior samples are moved.
+
+    Raises
+    ------
+    ParameterError
+        If the arm does not reach a place of a reading.
+    """
+    geometry, accuracy = arm.geometry, arm.geometry.accuracy
+    assert accuracy is not None
+    recording = experiment.problem(readings).recording
     width_mm, height_mm = geometry.field_mm
-    middle = (width_mm / 2, height_mm / 2) if calibrated_mm is None else calibrated_mm
+    middle = (width_mm / 2, height_mm / 2) if arm.calibrated_mm is None else arm.calibrated_mm
     places = np.stack([recording.plan.x_mm, recording.plan.y_mm], axis=-1)
-    off = _off(geometry, np.concatenate([places, [middle]]), geometry.accuracy)
+    off = _off(geometry, np.concatenate([places, [middle]]), accuracy)
     off[:, 2] -= off[-1, 2]
     off = off[:-1]
-    dark, white = levels
+    dark, white = arm.levels
     falls = 2.0 / geometry.read_height_mm
     if geometry.light_per_mm is not None:
         falls = geometry.light_per_mm * white / (white - dark)
     # From here on what the light does stands for the height: the share by which light above black rises.
     off[:, 2] *= -falls
-    slopes = _moved_by(run, recording, off, dark)
-    theta = run.last.posterior.theta[:, run.experiment.shape_columns]
+    slopes = _moved_by(experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape)
+    theta = posterior.theta[:, experiment.shape_columns]
+    return ArmError(slopes, moved_by_arm(experiment, slopes, theta, likely_shape, rng=rng))
+
+
+def moved_by_arm(
+    experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
+) -> FloatArray:
+    """Draw an error of the arm for each sample of the shape, (n_samples, n_params): by how much it is moved."""
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
-    shape = run.experiment.shape
-    if isinstance(shape, AnyOf):
-        moved[shape.which(theta) != shape.labels.index(run.last.likely_shape)] = 0.0
-    return replace(run, arm=ArmError(slopes, moved))
+    if isinstance(experiment.shape, AnyOf):
+        moved[experiment.shape.which(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
+    return np.asarray(moved)
 
 
 def _off(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
@@ -109,31 +162,40 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _moved_by(run: Exploration, recording: Recording, off: FloatArray, dark: float) -> FloatArray:
+def _moved_by(
+    experiment: Experiment,
+    posterior: Posterior,
+    recording: Recording,
+    off: FloatArray,
+    dark: float,
+    *,
+    mean: FloatArray,
+    sd: FloatArray,
+    likely_shape: str,
+) -> FloatArray:
     """Tell by how much each independent error of one sd moves the posterior mean of the shape, (n_params, n_errors)."""
-    last, experiment = run.last, run.experiment
     shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
-    columns = np.arange(len(last.mean))
+    columns = np.arange(len(mean))
     if isinstance(shape, AnyOf):
-        columns = shape.prior.columns[shape.labels.index(last.likely_shape)]
+        columns = shape.prior.columns[shape.labels.index(likely_shape)]
     own = np.arange(n_sensor, n_sensor + len(columns))
     thetas, weights, by_error, by_shape = [], [], [], []
-    kinds = zip(last.kinds.kinds, last.kinds.particles, last.kinds.probability.tolist(), strict=True)
+    kinds = zip(posterior.kinds, posterior.particles, posterior.probability.tolist(), strict=True)
     for kind, particles, probability in kinds:
-        if probability < _LEAST or kind.shape not in ("", last.likely_shape):
+        if probability < _LEAST or kind.shape not in ("", likely_shape):
             continue
         some = particles.weighted.weight > 0
         theta = particles.weighted.theta[some]
         thetas.append(theta[:, own])
         weights.append(probability * particles.weighted.weight[some])
         by_error.append(_by_error(kind, theta, recording, off, dark))
-        by_shape.append(_by_shape(kind, theta, recording, own, _STEP_SD * last.sd[columns]))
+        by_shape.append(_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
     theta, slope, known = (_centred(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
     root = np.sqrt(weight)[:, None]
     coefficients = np.linalg.lstsq(root * known, root * slope, rcond=None)[0]
-    out = np.zeros((len(last.mean), off.shape[2]))
+    out = np.zeros((len(mean), off.shape[2]))
     out[columns] = (theta * weight[:, None]).T @ (slope - known @ coefficients) - coefficients
     return out
 

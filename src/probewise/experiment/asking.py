@@ -13,7 +13,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.journal import PATTERN
 from probewise.experiment.setting import Experiment
-from probewise.inquiry import Grid, Prospect, UtilityMap, choose, choose_several, reachable_rows, utility_map
+from probewise.inquiry import Goal, Grid, Prospect, UtilityMap, choose, choose_several, reachable_rows, utility_map
 from probewise.inquiry.forecast import thinned
 from probewise.nested.importance import Weighted
 
@@ -42,7 +42,13 @@ class Field:
 
 
 def inquire(
-    experiment: Experiment, posterior: Weighted, drawn: FloatArray, field: Field, *, at: Reading | None
+    experiment: Experiment,
+    posterior: Weighted,
+    drawn: FloatArray,
+    field: Field,
+    *,
+    at: Reading | None,
+    goal: Goal | None = None,
 ) -> tuple[Prospect, UtilityMap]:
     """Compute the utility of every available reading.
 
@@ -56,6 +62,8 @@ def inquire(
         Reach of the arm.
     at
         The last reading, at whose place the arm is; None before the first, when travel times do not count.
+    goal
+        What the readings have to reach; None: the experiment's own.
     """
     designs = experiment.designs
     rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.combinations))
@@ -86,7 +94,7 @@ def inquire(
         plan,
         rows,
         cost_s[rows],
-        experiment.goal,
+        experiment.goal if goal is None else goal,
     )
     return prospect, utility_map(prospect, experiment.utility)
 

@@ -103,16 +103,29 @@ def stop_reason(
     outlook: UtilityMap,
     n_readings: int,
     max_readings: int | None,
+    arm_sd: FloatArray | None = None,
 ) -> str | None:
-    """Return the reason why a run ends, or None if it continues."""
-    widest = widest_mm(experiment.shape.prior.names, sd)
+    """Return the reason why a run ends, or None if it continues.
+
+    `arm_sd` is the part of the shape's sds that comes from the arm, (n_params,), which no reading lowers; `sd` is that
+    of the readings alone.
+    """
+    names = experiment.shape.prior.names
+    included = "" if arm_sd is None else ", the arm's own error included"
+    widest = widest_mm(names, sd if arm_sd is None else np.hypot(sd, arm_sd))
     if known and p_value < experiment.doubt_p:
         return (
             f"no hypothesis explains the readings (p = {p_value:.1g}), so the posterior, narrow as it is "
             f"({widest:.1f} mm), is not to be trusted; a diagnosis of the readings asks what the model leaves out"
         )
     if known:
-        return f"every length is known to better than {experiment.stop_sd_mm:g} mm"
+        return f"every length is known to better than {experiment.stop_sd_mm:g} mm{included}"
+    if arm_sd is not None and widest_mm(names, arm_sd) >= experiment.stop_sd_mm > widest_mm(names, sd):
+        return (
+            f"the readings know every length to better than {experiment.stop_sd_mm:g} mm, but the arm's own error "
+            f"leaves {widest_mm(names, arm_sd):.1f} mm, which no reading lowers: `probewise arm fit-geometry` does, "
+            "with more marks or with marks met more closely"
+        )
     if outlook.flat:
         promise = (
             "every reading within reach promises the same"
@@ -121,8 +134,11 @@ def stop_reason(
         )
         return (
             f"{promise}, {outlook.highest:.2g}: none would tell the hypotheses apart that are left; "
-            f"the widest length is known to {widest:.1f} mm"
+            f"the widest length is known to {widest:.1f} mm{included}"
         )
     if max_readings is not None and n_readings >= max_readings:
-        return f"all {max_readings} readings that it may take are taken; the widest length is known to {widest:.1f} mm"
+        return (
+            f"all {max_readings} readings that it may take are taken; the widest length is known to {widest:.1f} mm"
+            f"{included}"
+        )
     return None

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import warnings
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
@@ -19,6 +20,7 @@ from probewise._kinds import require_callable, require_kind, require_path, requi
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
+from probewise.experiment.arm_error import arm_error, moved_by_arm
 from probewise.experiment.asking import Field, inquire, next_poses
 from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import (
@@ -31,10 +33,10 @@ from probewise.experiment.journal import (
 from probewise.experiment.judging import OFF_SDS, chance_off, doubt, fit, information, learnt, moments, stop_reason
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior, prior_posterior
-from probewise.experiment.setting import Experiment
+from probewise.experiment.setting import Experiment, widest_mm
 from probewise.experiment.settling import settling
-from probewise.experiment.values import Exploration, State, Step
-from probewise.inquiry import bits_gained, prior_entropy
+from probewise.experiment.values import ArmError, Exploration, State, Step
+from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
 __all__ = ["begin", "explore", "run", "step"]
@@ -121,7 +123,6 @@ def step(
     posterior = carried.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)
     wary, believed = (carried, posterior) if experiment.trust == 1 else _wary(carried, rng)
-    off = chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
     leader = carried.kinds[carried.leader]
     p_value, worst = fit(experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording))
     if leader.likelihood is not experiment.likelihood:
@@ -130,11 +131,25 @@ def step(
     if p_value < experiment.doubt_p:
         notes = (*notes, doubt(p_value, worst, readings))
     drawn = experiment.learning.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
-    prospect, outlook = inquire(experiment, believed, drawn, field, at=reading)
+    likely = max(shapes, key=shapes.__getitem__, default="")
+
+    def arms() -> ArmError | None:
+        if experiment.fitted_arm is None:
+            return None
+        of = (experiment, experiment.fitted_arm, readings, posterior, carried)
+        return arm_error(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
+
+    arm = arms() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
+    prospect, outlook = inquire(experiment, believed, drawn, field, at=reading, goal=_left(experiment, arm))
     if experiment.trust < 1:
         outlook = settling(experiment, wary, prospect, outlook, readings, rng=rng)
-    known = experiment.is_known(sd, shapes, off) and (believed is posterior or _is_known(experiment, believed))
-    reason = stop_reason(experiment, sd, known, p_value, outlook, len(readings), max_readings)
+    if arm is None and (outlook.flat or (max_readings is not None and len(readings) >= max_readings)):
+        arm = arms()
+    known, off = _is_known(experiment, posterior, arm, likely, rng)
+    if known and believed is not posterior:
+        known, _ = _is_known(experiment, believed, arm, likely, rng)
+    arm_sd = None if arm is None else arm.sd
+    reason = stop_reason(experiment, sd, known, p_value, outlook, len(readings), max_readings, arm_sd)
     pose, *planned = state.planned or next_poses(experiment, prospect, outlook, rng=rng)
     info = Step(
         number=len(readings),
@@ -156,6 +171,7 @@ def step(
         stop_reason=reason,
         notes=notes,
         pace=Pace.of(readings),
+        arm=arm,
     )
     return State(readings, carried, pose, tuple(planned)), info
 
@@ -166,10 +182,29 @@ def _wary(carried: Posterior, rng: np.random.Generator) -> tuple[Posterior, Weig
     return wary, wary.joined(rng=rng)
 
 
-def _is_known(experiment: Experiment, posterior: Weighted) -> bool:
-    """Return whether a posterior meets the stopping rule."""
+def _left(experiment: Experiment, arm: ArmError | None) -> Goal | None:
+    """Return the sd that the readings have to reach, beside the arm's own error; None: the experiment's own."""
+    goal = experiment.goal
+    if arm is None or goal is None:
+        return None
+    lengths = np.array(goal.columns) - experiment.shape_columns[0]
+    left = goal.sd**2 - float(arm.sd[lengths].max()) ** 2
+    return dataclasses.replace(goal, sd=math.sqrt(left)) if left > 0 else None
+
+
+def _is_known(
+    experiment: Experiment, posterior: Weighted, arm: ArmError | None, likely: str, rng: np.random.Generator
+) -> tuple[bool, float]:
+    """Return whether a posterior meets the stopping rule, arm included, and the chance that a length is off."""
     _, sd, shapes = moments(experiment, posterior)
-    return experiment.is_known(sd, shapes, chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm))
+    if arm is not None:
+        sd = np.hypot(sd, arm.sd)
+        theta = posterior.theta.copy()
+        own = theta[:, experiment.shape_columns]
+        theta[:, experiment.shape_columns] = own + moved_by_arm(experiment, arm.slopes, own, likely, rng=rng)
+        posterior = dataclasses.replace(posterior, theta=theta)
+    off = chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
+    return experiment.is_known(sd, shapes, off), off
 
 
 def explore(

@@ -16,6 +16,7 @@ from probewise._version import __version__
 from probewise.arm.instrument import Reading
 from probewise.errors import ParameterError
 from probewise.experiment.digest import value_digest
+from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import Kind, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
@@ -125,6 +126,9 @@ class Experiment:
         Live points of nested sampling, which takes over if no sample predicts a reading.
     method
         Method of inference; None: `SequentialMonteCarlo` with `n_particles` and `n_live`.
+    fitted_arm
+        The arm, where its own error is known: the run ends when the lengths are known with that error included, or when
+        that error alone leaves more than the target. None: it is not known, and no part of the sds.
     """
 
     shape: Shape
@@ -149,6 +153,7 @@ class Experiment:
     n_samples: int = 50
     n_live: int = 200
     method: Method | None = None
+    fitted_arm: FittedArm | None = None
 
     def __post_init__(self) -> None:
         require_shape(self.shape)
@@ -302,6 +307,7 @@ class Experiment:
             "likelihood_sha256": value_digest(self.likelihood),
             "utility": repr(self.utility),
             **method,
+            **({} if self.fitted_arm is None else {"fitted_arm": value_digest(self.fitted_arm)}),
             "seed": seed_text(seed),
             "spawn_key": list(seed.spawn_key),
             "options": {

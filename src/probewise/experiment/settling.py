@@ -54,7 +54,7 @@ def settling(
     Candidates are the designs with the largest information, those at edges and centres of probable shapes, earlier
     places, and some random ones.
     """
-    if experiment.goal is None:
+    if prospect.goal is None:
         return outlook
     theta, lengths, weight = _drawn(experiment, posterior, rng)
     spread = weight @ (lengths - weight @ lengths) ** 2
@@ -67,7 +67,7 @@ def settling(
     )
     worth, label = _bits(weight, answers, prospect), _LABEL
     best = np.argsort(-worth, kind="stable")[:_ENDING]
-    chance = _ends(lengths, weight, answers[:, best], prospect, experiment.stop_sd_mm)
+    chance = _ends(lengths, weight, answers[:, best], prospect, prospect.goal.sd, OFF_SDS * experiment.stop_sd_mm)
     if chance.max() >= _LEAST_CHANCE:
         worth, label = np.zeros(len(worth)), _ENDS
         worth[best] = chance
@@ -148,7 +148,7 @@ def _bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatA
 
 
 def _ends(
-    lengths: FloatArray, weight: FloatArray, answers: FloatArray, prospect: Prospect, stop_sd_mm: float
+    lengths: FloatArray, weight: FloatArray, answers: FloatArray, prospect: Prospect, goal_sd_mm: float, off_mm: float
 ) -> FloatArray:
     """Return the probability that a reading at each design meets the stopping rule, (n_designs,)."""
     away = lengths - weight @ lengths
@@ -159,8 +159,8 @@ def _ends(
         ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
         for length in away.T:
             mean = length @ joint / mass
-            ends &= length**2 @ joint / mass - mean**2 < stop_sd_mm**2
-            off |= np.abs(length[:, None] - mean) > OFF_SDS * stop_sd_mm
+            ends &= length**2 @ joint / mass - mean**2 < goal_sd_mm**2
+            off |= np.abs(length[:, None] - mean) > off_mm
         ends &= np.where(off, joint, 0.0).sum(axis=0) < MOST_OFF * mass
         out[design] = mass[ends].sum() / mass.sum()
     return out

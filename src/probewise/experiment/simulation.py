@@ -73,7 +73,7 @@ class Streams(NamedTuple):
     """Independent random streams of one simulated run: robot, hidden shape, shadow run, noise.
 
     `noise` is a number, from which each reading's generator is made; see `arm_over`. `levels` is that of readings over
-    black and white before the run, see `levels_in`. `arm` draws errors of a real arm's geometry, see `with_arm_error`.
+    black and white before the run, see `levels_in`.
     """
 
     run: np.random.Generator
@@ -81,13 +81,12 @@ class Streams(NamedTuple):
     shadow: np.random.Generator
     noise: int
     levels: np.random.Generator
-    arm: np.random.Generator
 
     @classmethod
     def of(cls, rng: np.random.Generator) -> Streams:
         """Spawn them from one generator, so that one seed gives the whole run."""
-        run, truth, shadow, noise, levels, arm = rng.spawn(6)
-        return cls(run, truth, shadow, int(noise.integers(2**63)), levels, arm)
+        run, truth, shadow, noise, levels = rng.spawn(5)
+        return cls(run, truth, shadow, int(noise.integers(2**63)), levels)
 
 
 def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:

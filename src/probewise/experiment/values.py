@@ -81,6 +81,8 @@ class Step(ShowsItself):
         Whether the reading comes from a journal.
     pace
         Pace of the run so far.
+    arm
+        What the arm's own error adds to the sds; None far from the end of a run, or where that error is not known.
     """
 
     number: int
@@ -103,6 +105,7 @@ class Step(ShowsItself):
     notes: tuple[str, ...]
     replayed: bool = False
     pace: Pace = field(default_factory=Pace)
+    arm: ArmError | None = None
 
     @property
     def log_z(self) -> float:
@@ -174,14 +177,16 @@ class Exploration(ShowsItself):
         What was asked, and what each reading taught.
     hidden
         What lay there, where that is known.
-    arm
-        What the arm's own error adds, where that is known (`with_arm_error`); the steps leave it out.
     """
 
     experiment: Experiment
     steps: tuple[Step, ...]
     hidden: Hidden | None = None
-    arm: ArmError | None = None
+
+    @property
+    def arm(self) -> ArmError | None:
+        """What the arm's own error adds in the end, where that is known."""
+        return self.last.arm
 
     @property
     def last(self) -> Step:
@@ -210,18 +215,18 @@ class Exploration(ShowsItself):
 
     @property
     def stop_reason(self) -> str:
-        """Why the run ended, judged by the readings alone; and what the arm's own error leaves, where that is known."""
+        """Why the run ended; and what the arm's own error leaves, where that is known and the run did not count it."""
         reason = self.last.stop_reason or "the caller ended it"
-        if self.arm is None:
+        if self.arm is None or self.experiment.fitted_arm is not None:
             return reason
         widest = widest_mm(self.last.names, self.sd)
         return f"{reason}; with the arm's own error the widest is known to {widest:.1f} mm"
 
     @property
     def reached(self) -> bool:
-        """Whether the target precision was reached, with a hypothesis that explains the readings."""
+        """Whether the target precision was reached, arm included, with a hypothesis that explains the readings."""
         trusted = self.last.p_value >= self.experiment.doubt_p
-        return trusted and self.experiment.is_known(self.last.sd, self.last.shapes, self.last.chance_off)
+        return trusted and self.experiment.is_known(self.sd, self.last.shapes, self.last.chance_off)
 
     @property
     def seconds(self) -> float:

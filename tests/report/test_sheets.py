@@ -1,5 +1,6 @@
 """Sheets at true scale, measured in the PDF's own drawing."""
 
+import dataclasses
 import re
 import zlib
 
@@ -19,6 +20,7 @@ from probewise.report.sheets import (
     OVERLAP_MM,
     Sheet,
     field_sheet,
+    jig_sheets,
     marks_sheet,
     plan_sheets,
     target_sheet,
@@ -163,6 +165,50 @@ def test_marks_and_targets_are_at_their_places_of_the_field():
     assert {tuple(mark) for mark in sheet.crosses_mm.tolist()} <= found
     cut = pages_of(sheets_pdf([target_sheet("circle", CIRCLE)], paper="a4", title="t"))[1:]
     assert any(np.ptp(points, axis=0) == pytest.approx([160, 160], abs=0.02) for _, points in cut[0][1])
+
+
+def crosses_in(pdf, sheet, first):
+    """Centres of the crosses of a sheet's pages, in the sheet's frame: lines of 30 mm that cross at their middles."""
+    found = []
+    for tile, page in zip(tiles_of(sheet, "a4"), pages_of(pdf)[first:], strict=False):
+        shift = np.array(tile.low_mm) - [LEFT_MM, BOTTOM_MM]
+        lines = [points for how, points in page[1] if how == "S" and len(points) == 2]
+        for across in (points for points in lines if np.ptp(points, axis=0) == pytest.approx([30, 0], abs=0.01)):
+            found.append(tuple(np.round(across.mean(axis=0) + shift, 2).tolist()))
+    return found
+
+
+@pytest.mark.parametrize("elbow_is_relative", [False, True])
+def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is_relative):
+    shipped = read_geometry(shipped_geometry())
+    elbow = dataclasses.replace(shipped.elbow, home_rad=np.radians(-120.0 if elbow_is_relative else -30.0))
+    arm = dataclasses.replace(
+        shipped, elbow=elbow, elbow_is_relative=elbow_is_relative, links_mm=(150.0, 120.0), shoulder_mm=(40.0, 60.0)
+    )
+    side, above = jig_sheets(arm)
+    pdf = sheets_pdf([side, above], paper="a4", title="t")
+    wrist = 40 + 120 * np.cos(np.radians(30)), 60 + 150 - 120 * np.sin(np.radians(30))
+    face = np.add(wrist, [arm.sensor_mm[0], -arm.sensor_mm[1]])
+    expected = [(40, 60), (40, 210), wrist, face]
+    assert set(crosses_in(pdf, side, 1)) == {tuple(np.round(place, 2)) for place in expected}
+    # The same place and height of the sensor by the arm's own forward kinematics.
+    x_mm, y_mm, height_mm = arm.position_mm(np.array([[joint.home_rad for joint in arm.joints]]))[0]
+    assert face == pytest.approx([np.hypot(x_mm - arm.axis_mm[0], y_mm - arm.axis_mm[1]), height_mm])
+    assert set(crosses_in(pdf, above, 1 + len(tiles_of(side, "a4")))) == {
+        arm.axis_mm,
+        (round(x_mm, 2), round(y_mm, 2)),
+    }
+    assert side.low_mm[1] == 0.0  # the cut stands on the table
+
+
+def test_the_jigs_beams_are_as_wide_as_lego_and_its_pages_have_a_ruler():
+    side, above = jig_sheets(read_geometry(shipped_geometry()))
+    pages = pages_of(sheets_pdf([side, above], paper="a4", title="t"))
+    assert len(pages) == 1 + len(tiles_of(side, "a4")) + len(tiles_of(above, "a4"))
+    beam = side.strokes_mm[0]
+    assert np.ptp(beam, axis=0) == pytest.approx([8.0, 358.0])
+    for _, paths in pages:
+        assert any(how == "S" and np.ptp(points, axis=0) == pytest.approx([100, 0], abs=0.01) for how, points in paths)
 
 
 def test_words_say_which_side_is_white():

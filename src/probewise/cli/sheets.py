@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["VERB"]
 
-FIELD, TARGET, MARKS = "field", "target", "marks"
+FIELD, TARGET, MARKS, JIG = "field", "target", "marks", "jig"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +25,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "what",
         metavar="WHAT",
         help="paper or two_way, the plans that ship; PLAN.csv, its JSON beside it, or such a JSON alone; field, the "
-        "black field; target, a white shape to cut out; marks, the crosses of `arm fit-geometry`",
+        "black field; target, a white shape to cut out; marks, the crosses of `arm fit-geometry`; jig, the "
+        "arm's links and base at their home angles, for `arm home --here`",
     )
     parser.add_argument("--out", type=a_path, required=True, metavar="SHEETS.pdf", help="where the pages go")
     parser.add_argument("--paper", type=str.lower, default="a4", metavar="PAPER", help="a4 (default) or letter")
@@ -63,13 +64,15 @@ def run(arguments: argparse.Namespace) -> int:
 def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     from probewise.cli._plans import plan_named
     from probewise.recordings.description import read_description
-    from probewise.report.sheets import field_sheet, marks_sheet, plan_sheets, target_sheet
+    from probewise.report.sheets import field_sheet, jig_sheets, marks_sheet, plan_sheets, target_sheet
 
     what = arguments.what
     if what not in (FIELD, TARGET) and arguments.target is not None:
         raise ParameterError("--target", arguments.target, f"none with {what}: it is for {FIELD} and {TARGET}")
     if what == MARKS:
         return (marks_sheet(geometry_of(arguments)),)
+    if what == JIG:
+        return jig_sheets(geometry_of(arguments))
     if what in (FIELD, TARGET):
         field_mm = geometry_of(arguments).field_mm
         if arguments.target is None and what == TARGET:
@@ -80,7 +83,9 @@ def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
         assert outline is not None
         return (target_sheet(arguments.target, outline),)
     if arguments.geometry is not None:
-        raise ParameterError("--geometry", str(arguments.geometry), f"none with a plan: it is for {FIELD} and {MARKS}")
+        raise ParameterError(
+            "--geometry", str(arguments.geometry), f"none with a plan: it is for {FIELD}, {MARKS} and {JIG}"
+        )
     path = Path(what)
     if path.suffix.lower() == ".json":
         beside = path.with_suffix(".csv")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +17,17 @@ from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polyg
 from probewise.recordings.plan import Plan
 from probewise.recordings.where_white import where_white
 
-__all__ = ["PAPERS_MM", "Sheet", "Tile", "field_sheet", "marks_sheet", "plan_sheets", "target_sheet", "tiles_of"]
+__all__ = [
+    "PAPERS_MM",
+    "Sheet",
+    "Tile",
+    "field_sheet",
+    "jig_sheets",
+    "marks_sheet",
+    "plan_sheets",
+    "target_sheet",
+    "tiles_of",
+]
 
 PAPERS_MM: Mapping[str, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 """Width and height of the papers, upright."""
@@ -28,8 +39,12 @@ OVERLAP_MM = 6.0
 """Width of the strip printed beyond the cut, on which the next page is glued."""
 
 AROUND_MM = 40.0  # margin beyond the outermost reading, which the sensor still sees
+BEAM_MM = 8.0
+"""Width of a LEGO beam."""
+
 _MOST_PAGES = 400
 _ROUND_MM = 5.0
+_JIG_MM, _JIG_BASE_MM = 20.0, 40.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +64,13 @@ class Sheet:
     outline_mm
         Line to cut along, (n, 2), or None.
     crosses_mm
-        Crosses to bring the sensor to, (n, 2).
+        Crosses to bring the sensor or a joint to, (n, 2).
+    cross_names
+        What stands beside each cross; empty: its number and place.
+    strokes_mm
+        Further lines, (n, 2) each.
+    words
+        Further texts, with the place of their left end.
     frame
         Origin of x and y, in words.
     orientations_rad
@@ -63,6 +84,9 @@ class Sheet:
     lines: tuple[str, ...] = ()
     outline_mm: FloatArray | None = None
     crosses_mm: FloatArray | None = None
+    cross_names: tuple[str, ...] = ()
+    strokes_mm: tuple[FloatArray, ...] = ()
+    words: tuple[tuple[float, float, str], ...] = ()
     frame: str = "the pattern's origin"
     orientations_rad: tuple[float, ...] = ()
 
@@ -198,6 +222,92 @@ def marks_sheet(geometry: Geometry) -> Sheet:
     )
     frame = "the field's lower left corner"
     return Sheet("marks", Uniform(1.0), (0.0, 0.0), geometry.field_mm, lines, crosses_mm=marks, frame=frame)
+
+
+def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
+    """Make the sheets that show an arm at its home angles: its links from the side, its base from above."""
+    base, shoulder, elbow = (joint.home_rad for joint in geometry.joints)
+    lower = shoulder + elbow if geometry.elbow_is_relative else elbow
+    joints = [np.array(geometry.shoulder_mm)]
+    for length, angle in zip(geometry.links_mm, (shoulder, lower), strict=True):
+        joints.append(joints[-1] + length * np.array([math.cos(angle), math.sin(angle)]))
+    face = joints[-1] + [geometry.sensor_mm[0], -geometry.sensor_mm[1]]
+    crosses = np.array([*joints, face])
+    beams = [_beam(a, b) for a, b in itertools.pairwise(joints)]
+    drawn = np.concatenate([crosses, *beams, [[0.0, 0.0]]])
+    low, high = _around(drawn, _JIG_MM)
+    if drawn[:, 1].min() >= 0:
+        low = low[0], 0.0  # cut there, the sheet stands on the table
+    middles = [(a + b) / 2 for a, b in itertools.pairwise(joints)]
+    of_links = zip(("upper", "lower"), geometry.links_mm, (shoulder, lower), middles, strict=True)
+    side = Sheet(
+        "jig, side",
+        Uniform(1.0),
+        low,
+        high,
+        (
+            "the links at home, from the side, outwards to the right",
+            "glue it on card, cut it at y = 0, stand it on the table beside the",
+            "links, the base's axis at x = 0; bring the joints' axles to the crosses",
+        ),
+        crosses_mm=crosses,
+        cross_names=("shoulder", "elbow", "wrist", f"sensor's face, {face[1]:.1f} mm up"),
+        strokes_mm=(
+            *beams,
+            *(np.array(pair) for pair in itertools.pairwise(joints)),
+            np.array([[0.0, max(low[1], 0.0)], [0.0, high[1]]]),
+            np.array([[low[0], 0.0], [high[0], 0.0]]),
+        ),
+        words=tuple(
+            (x + 8.0, y + 8.0, f"{name} link, {length:g} mm\n{math.degrees(angle):.4g} degrees from the horizontal")
+            for name, length, angle, (x, y) in of_links
+        ),
+        frame="where the base's axis meets the table; y is the height",
+    )
+    axis, out = np.array(geometry.axis_mm), float(face[0])
+    along = np.array([math.cos(base), math.sin(base)])
+    rest = axis + out * along
+    low, high = _around(np.array([axis, rest]), _JIG_BASE_MM)
+    x_low, y_low, x_high, y_high = *low, *high
+    width, height = geometry.field_mm
+    edges = [np.array([[max(x_low, 0.0), y], [min(x_high, width), y]]) for y in (0.0, height) if y_low < y < y_high]
+    edges += [np.array([[x, max(y_low, 0.0)], [x, min(y_high, height)]]) for x in (0.0, width) if x_low < x < x_high]
+    from_above = Sheet(
+        "jig, base",
+        Uniform(1.0),
+        low,
+        high,
+        (
+            f"the base at home, from above: {math.degrees(base):.4g} degrees from the x axis",
+            "lay its cross below the base's axis and its line on the field's edge",
+            "(cut out what the base covers); turn the base until the links are",
+            "above the line",
+        ),
+        crosses_mm=np.array([axis, rest]),
+        cross_names=("the base's axis", "sensor"),
+        strokes_mm=(np.array([axis, rest]), *edges),
+        words=tuple((max(edge[0, 0], x_low) + 4.0, edge[0, 1] + 3.0, "edge of the field") for edge in edges),
+        frame="the field's lower left corner",
+    )
+    return side, from_above
+
+
+def _beam(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
+    """Outline a beam with round ends between the centres of its outer holes, (n, 2), closed."""
+    turn = math.atan2(*(end_mm - start_mm)[::-1].tolist())
+    half = np.linspace(math.pi / 2, 3 * math.pi / 2, 37)
+    ends = [
+        centre + BEAM_MM / 2 * np.stack([np.cos(half + turn + way), np.sin(half + turn + way)], axis=-1)
+        for centre, way in ((start_mm, 0.0), (end_mm, math.pi))
+    ]
+    return np.concatenate([*ends, ends[0][:1]])
+
+
+def _around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Corners of a sheet that shows these points, (n, 2)."""
+    low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
+    high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
+    return _pair(low), _pair(high)
 
 
 def _counts(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:

@@ -228,9 +228,17 @@ def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: 
             half.set_clip_path(clip)
         x, y = place((mark + 10.0)[None])[0].tolist()
         if (low_mm[0] <= mark[0] < high_mm[0]) and (low_mm[1] <= mark[1] < high_mm[1]):
-            told = ax.text(
-                x, y, f"{k + 1}: ({mark[0]:g}, {mark[1]:g})" if named else f"{k + 1}", fontsize=_SMALL, zorder=2
-            )
+            name = sheet.cross_names[k] if sheet.cross_names else f"{k + 1}: ({mark[0]:g}, {mark[1]:g})"
+            if not named:
+                name = "" if sheet.cross_names else f"{k + 1}"
+            told = ax.text(x, y, name, fontsize=_SMALL, zorder=2)
+            told.set_clip_path(clip)
+    for stroke in sheet.strokes_mm:
+        (line,) = ax.plot(*place(stroke).T, color=BLACK, lw=0.5, solid_capstyle="butt", zorder=2)
+        line.set_clip_path(clip)
+    for x, y, words in sheet.words if named else ():
+        if (low_mm[0] <= x < high_mm[0]) and (low_mm[1] <= y < high_mm[1]):
+            told = ax.text(*place(np.array([[x, y]]))[0], words, fontsize=_SMALL, zorder=2, clip_on=True)
             told.set_clip_path(clip)
 
 

@@ -234,11 +234,12 @@ def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: 
             told = ax.text(x, y, name, fontsize=_SMALL, zorder=2)
             told.set_clip_path(clip)
     for stroke in sheet.strokes_mm:
-        (line,) = ax.plot(*place(stroke).T, color=BLACK, lw=0.5, solid_capstyle="butt", zorder=2)
-        line.set_clip_path(clip)
+        (drawn,) = ax.plot(*place(stroke).T, color=BLACK, lw=0.5, solid_capstyle="butt", zorder=2)
+        drawn.set_clip_path(clip)
     for x, y, words in sheet.words if named else ():
         if (low_mm[0] <= x < high_mm[0]) and (low_mm[1] <= y < high_mm[1]):
-            told = ax.text(*place(np.array([[x, y]]))[0], words, fontsize=_SMALL, zorder=2, clip_on=True)
+            at_x, at_y = place(np.array([[x, y]]))[0].tolist()
+            told = ax.text(at_x, at_y, words, fontsize=_SMALL, zorder=2, clip_on=True)
             told.set_clip_path(clip)
 
 

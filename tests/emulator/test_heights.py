@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 
 from probewise.arm import read_geometry, shipped_geometry
 from probewise.cli import main
@@ -51,6 +52,9 @@ def test_an_arm_that_is_as_its_file_says_is_not_contradicted(capsys):
     said = capsys.readouterr()
     assert "agree with the counters" in said.out
     assert said.err == ""
+    # The LED's half goes with h exp(-h / 8 mm), the room's half with nothing.
+    fall = (1 / 8 - 1 / 14) / 2
+    assert float(re.search(r"light_per_mm = ([\d.]+)", said.out)[1]) == pytest.approx(fall, rel=0.2)
 
 
 def test_one_place_is_too_few_and_another_arm_has_no_light_to_ask(capsys):

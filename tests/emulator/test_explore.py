@@ -11,6 +11,7 @@ from arm_faults import (
     FAULTS,
     GEOMETRY,
     MAX_READINGS,
+    SENSOR,
     TRUTH,
     WORLD,
     Answer,
@@ -28,8 +29,11 @@ from arm_faults import (
     wrong,
 )
 
-from probewise.arm import Pose, Reading
-from probewise.emulator import Faults, Stand, VirtualClock
+import probewise
+from probewise.arm import LegoArm, Pose, Reading
+from probewise.arm.geometry import Accuracy
+from probewise.arm.nxt import Brick, BrickMachine, Link
+from probewise.emulator import Faults, Stand, VirtualClock, VirtualLine
 from probewise.experiment import Experiment, arm_over
 from probewise.experiment import run as run_experiment
 from probewise.recordings import Disc
@@ -129,3 +133,17 @@ def test_a_reading_lost_or_doubled_anywhere_is_counted() -> None:
     assert lost(ended(GOOD, journal=(READ,), n_read=2)) == 1
     assert twice(ended(GOOD, replace(GOOD, reading=again), journal=(READ, again))) == 1
     assert twice(ended(GOOD, journal=(READ, READ))) == 1
+
+
+def test_from_python_too_a_fitted_arm_counts_its_own_error() -> None:
+    clock = VirtualClock()
+    bench, _ = bench_with(Faults(), clock, seed=SEED)
+    rows = np.diag([0.0] * 5 + [9.0] + [0.0] * 3).tolist()  # the base's x is known to 3 mm
+    fitted = replace(GEOMETRY, accuracy=Accuracy(8, 1.0, 3.0, 0.001, tuple(map(tuple, rows))))
+    machine = BrickMachine(Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock), fitted)
+    lego = LegoArm(machine, fitted, clock=clock)
+    run = probewise.explore(
+        SENSOR, arm=lego, trust=1.0, max_readings=1, rng=np.random.default_rng(SEED), progress=False
+    )
+    assert run.arm is not None
+    assert run.stop_reason.endswith("the arm's own error included")

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from probewise.arm import LegoArm, Rehearsal, Request, read_geometry, shipped_geometry
+from probewise.arm.geometry import Accuracy
 from probewise.cli import main
+from probewise.cli._arm import warn_of_goal
 from probewise.cli._hands import Hands
 from probewise.cli._marks import _moved, bring
 from probewise.cli._sheet_watch import SheetWatch, shades
@@ -69,6 +71,18 @@ def test_an_arm_that_is_built_otherwise_is_fitted_and_records_without_touching_t
     ]
     assert main(again) == 0
     assert (tmp_path / "again.toml").read_text() == out.read_text()
+
+
+def test_an_arm_that_is_known_less_well_than_a_shape_is_to_be_says_so_before_it_moves(capsys):
+    shipped = read_geometry(shipped_geometry())
+    for place_sd_mm, warned in ((4.5, True), (0.6, False)):
+        rows = tuple((0.0,) * 9 for _ in range(9))
+        warn_of_goal(dataclasses.replace(shipped, accuracy=Accuracy(8, place_sd_mm, 1.0, 0.01, rows)), 4.0)
+        assert (
+            "lengths will not be known to 4 mm: the arm knows its place to 4.5 mm" in capsys.readouterr().err
+        ) == warned
+    warn_of_goal(shipped, 4.0)
+    assert capsys.readouterr().err == ""
 
 
 def test_fitting_needs_an_arm_or_marks_and_keeps_what_stands_there(tmp_path, capsys):

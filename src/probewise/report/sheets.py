@@ -258,9 +258,13 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
             np.array([[0.0, max(low[1], 0.0)], [0.0, high[1]]]),
             np.array([[low[0], 0.0], [high[0], 0.0]]),
         ),
-        words=tuple(
-            (x + 8.0, y + 8.0, f"{name} link, {length:g} mm\n{math.degrees(angle):.4g} degrees from the horizontal")
-            for name, length, angle, (x, y) in of_links
+        words=(
+            (3.0, 40.0, "the base's axis"),
+            (4.0, 4.0, "the table"),
+            *(
+                (x + 8.0, y + 8.0, f"{name} link, {length:g} mm\n{math.degrees(angle):.4g} degrees from the horizontal")
+                for name, length, angle, (x, y) in of_links
+            ),
         ),
         frame="where the base's axis meets the table; y is the height",
     )

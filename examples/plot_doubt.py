@@ -2,8 +2,8 @@
 A robot that doubts its sensor
 ==============================
 
-The sensor saturates, and its model does not know it. A robot that trusts the model finds a circle in the wrong place and is
-sure of it; one that carries the rival explanations along finds out what is left out, and where the circle is.
+The sensor saturates, and its model leaves that out. A robot that trusts the model finds a circle in the wrong place and
+is sure of it; one that doubts the model finds out what it leaves out, and where the circle is.
 """
 
 # %%
@@ -46,8 +46,8 @@ def explored(trust):
 runs = {trust: explored(trust) for trust in (1.0, 0.9)}
 truth = np.array([*hidden.center_mm, hidden.radius_mm])
 for trust, (_, found) in runs.items():
-    off = np.abs(found.last.mean - truth).max()
-    print(f"trust {trust:g}: {len(found.readings)} readings, off by {off:.1f} mm, sd up to {found.last.sd.max():.1f} mm")
+    off, sd = np.abs(found.last.mean - truth).max(), found.last.sd.max()
+    print(f"trust {trust:g}: {len(found.readings)} readings, off by {off:.1f} mm, sd up to {sd:.1f} mm")
 
 # %%
 # Where each of them believes the circle to be.

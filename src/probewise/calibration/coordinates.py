@@ -4,16 +4,31 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.priors import Prior
 
-if TYPE_CHECKING:
-    from probewise.calibration.priors import SSFPrior
+__all__ = ["MixtureDensity", "MomentCoordinates", "kinds_of"]
 
-__all__ = ["MomentCoordinates"]
+
+class MixtureDensity(Prior, Protocol):
+    """A prior of a mixture's parameters with what the coordinates need beside its density."""
+
+    @property
+    def n_gaussians(self) -> int:
+        """Number of Gaussians, N."""
+        ...
+
+    def amplitude_scale(self, determinant: FloatArray) -> FloatArray:
+        """Return the unit of a Gaussian's amplitude, for A B - C^2 of any shape."""
+        ...
+
+    def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
+        """Return the log density of parameters by kind, (6, N, n_samples), and levels, (n_samples,) each."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -30,7 +45,7 @@ class MomentCoordinates:
     readings do not depend on the labels, so N! equal modes become one and the evidence is unchanged.
     """
 
-    prior: SSFPrior
+    prior: MixtureDensity
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters to coordinates, both (n_samples, 6 N + 2)."""

@@ -333,8 +333,7 @@ def explore(
         cards=tuple(cards),
     )
     if isinstance(arm, LegoArm) and arm.geometry.accuracy is not None:
-        means = sensor.mean()
-        asked = replace(asked, fitted_arm=posing.FittedArm(arm.geometry, (means["I_min"], means["I_max"])))
+        asked = replace(asked, fitted_arm=posing.FittedArm.of(arm.geometry, sensor))
     path = None if journal is None else require_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
     about = {**posing.sensor_named(sensor), "arm": "simulated" if arm is None else type(arm).__name__}

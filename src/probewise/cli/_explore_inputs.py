@@ -99,9 +99,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
         trust=arguments.trust,
     )
     if chosen.is_apart and geometry is not None and geometry.accuracy is not None:
-        means = sensor.mean()
-        fitted = posing.FittedArm(geometry, (means["I_min"], means["I_max"]))
-        experiment = dataclasses.replace(experiment, fitted_arm=fitted)
+        experiment = dataclasses.replace(experiment, fitted_arm=posing.FittedArm.of(geometry, sensor))
     other, other_model = None, _other(arguments.model)
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)

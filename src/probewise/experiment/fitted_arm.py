@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 from probewise._kinds import require_kind
 from probewise.arm.geometry import Geometry
+from probewise.calibration.sensor_file import FittedSensor
 from probewise.errors import ParameterError
 
 __all__ = ["FittedArm"]
@@ -35,3 +37,9 @@ class FittedArm:
         require_kind("geometry", self.geometry, Geometry, "a Geometry, such as read_geometry(path) returns")
         if self.geometry.accuracy is None:
             raise ParameterError("geometry", "one without [accuracy]", "one that was fitted to marks")
+
+    @classmethod
+    def of(cls, geometry: Geometry, sensor: FittedSensor) -> Self:
+        """Take the levels from a sensor's posterior mean."""
+        means = sensor.mean()
+        return cls(geometry, (means["I_min"], means["I_max"]))

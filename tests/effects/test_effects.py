@@ -38,7 +38,7 @@ from probewise.effects import (
     ScanMisplacement,
     StickSlip,
 )
-from probewise.effects.spots import scanned_lines
+from probewise.effects.patches import scanned_lines
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import jittered

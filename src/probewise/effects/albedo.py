@@ -17,7 +17,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.spots import ALONG_X, ScanLine, SpotPrior, bell, scanned_lines, spot_bank
+from probewise.effects.patches import ALONG_X, PatchPrior, ScanLine, bell, patch_bank, scanned_lines
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
@@ -54,9 +54,9 @@ class AlbedoGradient(LinearEffect[SceneView]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many percent the white fades over 100 mm."""
         return (
-            f"white grows whiter by {give_or_take(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
-            f"{give_or_take(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, black stays: the paper or its "
-            "illumination is uneven"
+            f"the signal over white changes by {give_or_take(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
+            f"{give_or_take(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
+            "its illumination is uneven"
         )
 
 
@@ -84,9 +84,9 @@ class AlbedoPatch(NamedEffect[SceneView]):
         return cls(line=lines[0], lines=lines) if lines else None
 
     @cached_property
-    def prior(self) -> SpotPrior:
+    def prior(self) -> PatchPrior:
         """Albedo added at the centre, its place and its radius."""
-        return SpotPrior("albedo", self.typical, self.line)
+        return PatchPrior("albedo", self.typical, self.line)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Add the patch to every pattern."""
@@ -98,15 +98,15 @@ class AlbedoPatch(NamedEffect[SceneView]):
 
     def bank(self) -> FloatArray:
         """Spots of three radii along the line."""
-        return spot_bank(self.typical, self.line)
+        return patch_bank(self.typical, self.line)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say where, how large and how much whiter."""
         kind = "whiter" if mean[0] > 0 else "darker"
         return (
-            f"around ({give_or_take(mean[1], sd[1])}, {give_or_take(mean[2], sd[2])}) mm, within about "
-            f"{give_or_take(mean[3], sd[3])} mm, every pattern is "
-            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than it should be: a stain or a worn spot"
+            f"within {give_or_take(mean[3], sd[3])} mm of the place ({give_or_take(mean[1], sd[1])}, "
+            f"{give_or_take(mean[2], sd[2])}) mm every pattern is "
+            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than it should be: a stain or a worn area"
         )
 
 

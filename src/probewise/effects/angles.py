@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.linear import LinearEffect, OneScanEffect
+from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
 from probewise.effects.motion import in_scans, mountings
 from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
@@ -45,10 +45,7 @@ class OrientationError(LinearEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many degrees."""
-        return (
-            f"the sensor is turned {give_or_take(mean[0], sd[0])} degrees further anticlockwise than was commanded, "
-            "in all scans"
-        )
+        return f"in all scans the sensor is turned {_too_far(mean[0], sd[0])}"
 
 
 @dataclass(frozen=True)
@@ -79,7 +76,9 @@ class ScanAngleError(OneScanEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many degrees, and in which scans."""
-        return (
-            f"in {', '.join(self.scans)} the sensor is turned {give_or_take(mean[0], sd[0])} degrees further "
-            "anticlockwise than was commanded"
-        )
+        return f"in {scans_in_words(self.scans)} the sensor is turned {_too_far(mean[0], sd[0])}"
+
+
+def _too_far(deg: float, sd: float) -> str:
+    way = "anticlockwise" if deg > 0 else "clockwise"
+    return f"{give_or_take(abs(deg), sd)} degrees further {way} than commanded"

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.linear import LinearEffect
-from probewise.effects.spots import bell
+from probewise.effects.patches import bell
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
@@ -62,7 +62,7 @@ class EdgeBlur(LinearEffect[Footprint]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how soft."""
-        return f"the printed edges are soft: blurred by {give_or_take(mean[0], sd[0])} mm"
+        return f"the printed edges are soft: blurred by {give_or_take(mean[0], sd[0])} mm (sd)"
 
 
 @dataclass(frozen=True)
@@ -124,8 +124,8 @@ class Halo(NamedEffect[Footprint]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how much light comes from how far."""
         return (
-            f"a wide halo of {give_or_take(mean[1], sd[1])} mm around the footprint adds "
-            f"{give_or_take(mean[0], sd[0], factor=100)} % of the light: it is scattered in the lens"
+            f"a wide halo around the sensor's spot, of sd {give_or_take(mean[1], sd[1])} mm, contributes "
+            f"{give_or_take(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
         )
 
 
@@ -194,11 +194,11 @@ class EdgeShadow(NamedEffect[View]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how deep and how wide."""
         kind = "darker" if mean[0] > 0 else "brighter"
-        where = f" of {', '.join(self.patterns)}" if self.patterns else ""
+        where = f" of pattern {', '.join(self.patterns)}" if self.patterns else ""
+        why = "the edge casts a shadow" if mean[0] > 0 else "the edge reflects light"
         return (
-            f"within about {give_or_take(mean[1], sd[1])} mm of an edge{where} it is "
-            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: "
-            "the edge casts a shadow"
+            f"within {give_or_take(mean[1], sd[1])} mm of an edge{where} the surface looks "
+            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: {why}"
         )
 
 

@@ -51,6 +51,11 @@ class Extent:
         return cls(low, max(high, low + tiny), recording.plan)
 
     @property
+    def unit(self) -> str:
+        """Unit of a reading, as it is written after a number."""
+        return self.plan.instrumentation.unit_after_number
+
+    @property
     def span(self) -> float:
         """Range of the readings, in their unit."""
         return self.high - self.low

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -54,7 +54,7 @@ class Outliers(NoiseEffect):
         """Say how many readings are far off, and how far."""
         return (
             f"outliers: {give_or_take(mean[0], sd[0], factor=100)} % of the readings scatter "
-            f"{give_or_take(mean[1], sd[1])} times as wide as the others"
+            f"{give_or_take(mean[1], sd[1])} times as widely as the others"
         )
 
 
@@ -68,6 +68,7 @@ class Dropouts(NoiseEffect):
     lowest: float = -50.0
     highest: float = 150.0
     ends: tuple[float, ...] = ()
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "dropouts"
     stage: ClassVar[Stage] = Stage.NOISE
@@ -79,7 +80,7 @@ class Dropouts(NoiseEffect):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Allow any value from 1 % below the range of the readings to 1 % above; note the declared range's ends."""
         low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
-        return cls(low, high, extent.plan.instrumentation.ends)
+        return cls(low, high, extent.plan.instrumentation.ends, unit=extent.unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -111,5 +112,5 @@ class Dropouts(NoiseEffect):
         """Say how many readings are lost, and to which value."""
         return (
             f"readings are lost: {give_or_take(mean[0], sd[0], factor=100)} % of them read "
-            f"{give_or_take(mean[1], sd[1])} whatever there was to be read"
+            f"{give_or_take(mean[1], sd[1], self.unit)}, whatever the true value"
         )

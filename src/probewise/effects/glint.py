@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.spots import ALONG_X, ScanLine, SpotPrior, bell, scanned_lines, spot_bank
+from probewise.effects.patches import ALONG_X, PatchPrior, ScanLine, bell, patch_bank, scanned_lines
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -28,6 +28,7 @@ class Glint(NamedEffect[FloatArray]):
     typical: float = 1.0
     line: ScanLine = ALONG_X
     lines: tuple[ScanLine, ...] = ()
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "glint"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -39,12 +40,12 @@ class Glint(NamedEffect[FloatArray]):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical height to 2 % of the readings' range; search along straight scans, None without any."""
         lines = scanned_lines(extent.plan)
-        return cls(0.02 * extent.span, lines[0], lines) if lines else None
+        return cls(0.02 * extent.span, lines[0], lines, unit=extent.unit) if lines else None
 
     @cached_property
-    def prior(self) -> SpotPrior:
+    def prior(self) -> PatchPrior:
         """Height, place and radius."""
-        return SpotPrior("amp", self.typical, self.line)
+        return PatchPrior("amp", self.typical, self.line)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the reflection to the readings, (n_samples, n_points)."""
@@ -57,12 +58,12 @@ class Glint(NamedEffect[FloatArray]):
 
     def bank(self) -> FloatArray:
         """Spots of three radii along the line."""
-        return spot_bank(self.typical, self.line)
+        return patch_bank(self.typical, self.line)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say where, how large and how bright."""
         return (
-            f"around ({give_or_take(mean[1], sd[1])}, {give_or_take(mean[2], sd[2])}) mm, within about "
-            f"{give_or_take(mean[3], sd[3])} mm, readings are off by {give_or_take(mean[0], sd[0])}, black or white: "
-            "a reflection"
+            f"within {give_or_take(mean[3], sd[3])} mm of the place ({give_or_take(mean[1], sd[1])}, "
+            f"{give_or_take(mean[2], sd[2])}) mm the readings are {give_or_take(abs(mean[0]), sd[0], self.unit)} too "
+            f"{'high' if mean[0] > 0 else 'low'}, over black and white alike: a reflection"
         )

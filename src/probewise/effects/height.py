@@ -7,7 +7,7 @@ from typing import ClassVar, Self
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.linear import LinearEffect, OneScanEffect
+from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
 from probewise.effects.motion import in_scans, mountings
 from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
@@ -45,10 +45,10 @@ class HeightGradient(LinearEffect[Footprint]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far the sensor rises over 100 mm."""
-        way = "rises" if mean[0] > 0 else "sinks"
+        way = "grows" if mean[0] > 0 else "shrinks"
         return (
-            f"the sensor {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} mm above the surface for each 100 mm "
-            "along X: the table slopes"
+            f"the sensor's height above the surface {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} mm per "
+            "100 mm along X: the table slopes"
         )
 
 
@@ -78,7 +78,7 @@ class HeightOffset(OneScanEffect[Footprint]):
         """Say how much higher, and in which scans."""
         way = "higher" if mean[0] > 0 else "lower"
         much = give_or_take(abs(mean[0]), sd[0])
-        return f"in {', '.join(self.scans)} the sensor hangs {much} mm {way} than in the others"
+        return f"in {scans_in_words(self.scans)} the sensor hangs {much} mm {way} than in the others"
 
 
 def _height_mm(plan: Plan) -> float:

@@ -63,9 +63,9 @@ class ArmKnock(ChangePointEffect[Poses]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say when, and how far."""
         return (
-            f"from {give_or_take(mean[3], sd[3])} s on every place is off by {give_or_take(mean[0], sd[0])} mm along X "
-            f"and {give_or_take(mean[1], sd[1])} mm along Y, and the sensor turned by {give_or_take(mean[2], sd[2])} "
-            "degrees: arm or paper was pushed"
+            f"from {give_or_take(mean[3], sd[3])} s on, all positions are off by {give_or_take(mean[0], sd[0])} mm "
+            f"along X and {give_or_take(mean[1], sd[1])} mm along Y, and the sensor is turned by "
+            f"{give_or_take(mean[2], sd[2])} degrees: the arm or the paper was pushed"
         )
 
 
@@ -104,6 +104,6 @@ class GainStep(ChangePointEffect[FloatArray]):
         """Say when, and by how many percent."""
         way = "stronger" if mean[0] > 0 else "weaker"
         return (
-            f"from {give_or_take(mean[1], sd[1])} s on the signal is {give_or_take(abs(mean[0]), sd[0], factor=100)} % "
-            f"{way}: lamp or lens changed at once"
+            f"from {give_or_take(mean[1], sd[1])} s on, the signal is {give_or_take(abs(mean[0]), sd[0], factor=100)} "
+            f"% {way}: the lamp or the lens changed suddenly"
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -29,6 +29,7 @@ class Quantisation(NoiseEffect):
 
     smallest: float = 0.05
     largest: float = 20.0
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "quantisation"
     stage: ClassVar[Stage] = Stage.NOISE
@@ -44,7 +45,7 @@ class Quantisation(NoiseEffect):
         """Search steps from a thousandth to a fifth of the readings' range; None where a step is declared."""
         if extent.plan.instrumentation.step is not None:
             return None
-        return cls(1e-3 * extent.span, 0.2 * extent.span)
+        return cls(1e-3 * extent.span, 0.2 * extent.span, unit=extent.unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -62,7 +63,9 @@ class Quantisation(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how coarse the readings are."""
-        return f"the readings come in steps of {give_or_take(mean[0], sd[0])}, which nobody declared: they are rounded"
+        return (
+            f"the readings are rounded to steps of {give_or_take(mean[0], sd[0], self.unit)}, which were not declared"
+        )
 
 
 def lattice_step(readings: FloatArray) -> float:

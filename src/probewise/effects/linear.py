@@ -13,7 +13,7 @@ from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.vocabulary import NamedEffect, V
 from probewise.priors import Product
 
-__all__ = ["LinearEffect", "OneScanEffect"]
+__all__ = ["LinearEffect", "OneScanEffect", "scans_in_words"]
 
 
 class LinearEffect(NamedEffect[V]):
@@ -61,3 +61,8 @@ class OneScanEffect(LinearEffect[V]):
     def variants(self) -> tuple[Self, ...]:
         """One variant for each candidate group."""
         return tuple(replace(self, scans=choice) for choice in self.choices)
+
+
+def scans_in_words(scans: tuple[str, ...]) -> str:
+    """Write the names of scans: "scan a", or "scans a, b"."""
+    return f"scan{'s' if len(scans) > 1 else ''} {', '.join(scans)}"

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.linear import LinearEffect, OneScanEffect
+from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
 from probewise.effects.motion import in_scans
 from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.patterns import HalfPlane, Ramp, Stripes
@@ -42,7 +42,9 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far off the pattern lies."""
-        return f"the printed edges lie {give_or_take(mean[0], sd[0])} mm from where they are said to be, in all scans"
+        return (
+            f"in all scans the printed edges lie {give_or_take(mean[0], sd[0])} mm from where the description has them"
+        )
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ class ScanMisplacement(OneScanEffect[SceneView]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far off the pattern lies, and in which scan."""
         return (
-            f"in scan {', '.join(self.scans)} the pattern lies {give_or_take(mean[0], sd[0])} mm from where it lay "
+            f"in {scans_in_words(self.scans)} the pattern lies {give_or_take(mean[0], sd[0])} mm from where it lies "
             "in the others"
         )
 

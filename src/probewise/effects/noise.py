@@ -51,8 +51,8 @@ class CorrelatedNoise(NoiseEffect):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how strongly neighbouring readings correlate."""
         return (
-            f"the noise of neighbouring readings correlates by {give_or_take(mean[0], sd[0])}: "
-            "readings repeat each other's errors"
+            f"the noise of successive readings has correlation {give_or_take(mean[0], sd[0])}: "
+            "part of each error returns in the next reading"
         )
 
 
@@ -86,8 +86,8 @@ class SignalDependentNoise(NoiseEffect):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how much larger the variance is at the highest level than at the lowest."""
         return (
-            f"the noise grows with the level: its variance at the highest is {give_or_take(1 + mean[0], sd[0])} times "
-            "that at the lowest"
+            f"the noise grows with the reading: its variance at the highest level is "
+            f"{give_or_take(1 + mean[0], sd[0])} times that at the lowest"
         )
 
 
@@ -124,7 +124,7 @@ class DriftingNoise(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how the noise has changed."""
-        return f"the noise is {give_or_take(mean[0], sd[0])} times as loud at the end as at the start"
+        return f"the sd of the noise at the end is {give_or_take(mean[0], sd[0])} times that at the start"
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ class RandomWalk(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how large the steps are."""
-        return f"the offset walks at random, by {give_or_take(mean[0], sd[0])} noise sds from each row to the next"
+        return f"the offset is a random walk with steps of sd {give_or_take(mean[0], sd[0])} noise sds from row to row"
 
 
 _SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
@@ -254,8 +254,8 @@ class NoisePerRun(NoiseEffect):
         """Say which runs have the least and the most noise."""
         low, high = int(np.argmin(mean)), int(np.argmax(mean))
         return (
-            f"the noise differs from run to run: {give_or_take(mean[high], sd[high])} times its typical sd in run "
-            f"{self.runs[high]}, {give_or_take(mean[low], sd[low])} times in run {self.runs[low]}"
+            f"the noise differs from run to run: its sd is {give_or_take(mean[high], sd[high])} times the typical one "
+            f"in run {self.runs[high]} and {give_or_take(mean[low], sd[low])} times in run {self.runs[low]}"
         )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -26,6 +26,7 @@ class AmbientGradient(LinearEffect[FloatArray]):
     """Stray light that grows across the table: reading + per_mm_x X + per_mm_y Y, lab frame."""
 
     typical_per_mm: float = 0.005
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "ambient_gradient"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -38,7 +39,7 @@ class AmbientGradient(LinearEffect[FloatArray]):
         """Set the typical slope to 1 % of the readings' range over the longest scan; None where nothing moves."""
         if np.ptp(extent.plan.x_mm) == np.ptp(extent.plan.y_mm) == 0:
             return None
-        return cls(typical_per_mm=0.01 * extent.span / extent.length_mm)
+        return cls(typical_per_mm=0.01 * extent.span / extent.length_mm, unit=extent.unit)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the plane to the readings, (n_samples, n_points)."""
@@ -47,8 +48,9 @@ class AmbientGradient(LinearEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how much the reading rises over 100 mm along each axis."""
         return (
-            f"the reading changes by {give_or_take(mean[0], sd[0], factor=100)} per 100 mm along X and by "
-            f"{give_or_take(mean[1], sd[1], factor=100)} per 100 mm along Y, black or white: stray light from one side"
+            f"the reading changes by {give_or_take(mean[0], sd[0], self.unit, factor=100)} per 100 mm along X and by "
+            f"{give_or_take(mean[1], sd[1], self.unit, factor=100)} per 100 mm along Y, over black and white alike: "
+            "stray light from one side"
         )
 
 
@@ -57,6 +59,7 @@ class OffsetDrift(LinearEffect[FloatArray]):
     """A slow drift: reading + per_hour t, t as in `time_s`."""
 
     typical_per_hour: float = 1.0
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "offset_drift"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -67,7 +70,7 @@ class OffsetDrift(LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical drift to 1 % of the readings' range over the recording."""
-        return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600))
+        return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600), unit=extent.unit)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the drift to the readings, (n_samples, n_points)."""
@@ -77,8 +80,8 @@ class OffsetDrift(LinearEffect[FloatArray]):
         """Say by how much the reading drifts in an hour."""
         way = "rises" if mean[0] > 0 else "falls"
         return (
-            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0])} an hour, black or white: "
-            "the electronics or the light in the room drift"
+            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0], self.unit)} per hour, over black and white "
+            "alike: the electronics or the room light drift"
         )
 
 
@@ -87,6 +90,7 @@ class AmbientStep(ChangePointEffect[FloatArray]):
     """Light switched on or off in the room: reading + amp 1(t > at_s)."""
 
     typical: float = 0.5
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "ambient_step"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -98,7 +102,7 @@ class AmbientStep(ChangePointEffect[FloatArray]):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical step to 1 % of the readings' range; None where all readings share one time."""
         times = change_point_times(extent)
-        return None if times is None else cls(times, typical=0.01 * extent.span)
+        return None if times is None else cls(times, typical=0.01 * extent.span, unit=extent.unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -121,6 +125,6 @@ class AmbientStep(ChangePointEffect[FloatArray]):
         """Say when the reading jumped, and how far."""
         way = "jumps up" if mean[0] > 0 else "drops"
         return (
-            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0])} at {give_or_take(mean[1], sd[1])} s and stays "
-            "there, black or white: the light in the room changed"
+            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0], self.unit)} at {give_or_take(mean[1], sd[1])} s "
+            "and stays there, over black and white alike: the room light changed"
         )

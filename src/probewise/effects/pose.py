@@ -87,5 +87,5 @@ class PositionScale(LinearEffect[Poses]):
         """Say by how many percent the arm moves too far."""
         return (
             f"the arm moves {give_or_take(mean[0], sd[0], factor=100)} % too far along X and "
-            f"{give_or_take(mean[1], sd[1], factor=100)} % along Y: its scale is off"
+            f"{give_or_take(mean[1], sd[1], factor=100)} % along Y: the scale of its positions is wrong"
         )

@@ -108,8 +108,8 @@ class MissingTooth(NamedEffect[Poses]):
         """Say where, and how far."""
         axis = "Y" if mean[2] > 0.5 else "X"
         return (
-            f"beyond {axis} = {give_or_take(mean[1], sd[1])} mm the arm is off by {give_or_take(mean[0], sd[0])} mm: "
-            "a tooth is missing"
+            f"beyond {axis} = {give_or_take(mean[1], sd[1])} mm the arm is {give_or_take(mean[0], sd[0])} mm off "
+            f"along {axis}: a tooth is missing"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -26,6 +26,7 @@ class Hysteresis(LinearEffect[FloatArray]):
     """A reading that depends on the direction of motion: reading + amp d, d the sign of motion along X, or along Y."""
 
     typical: float = 0.5
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "hysteresis"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -36,7 +37,7 @@ class Hysteresis(LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical amplitude to 1 % of the readings' range; None where the direction never changes."""
-        return cls(typical=0.01 * extent.span) if direction_varies(extent.plan) else None
+        return cls(typical=0.01 * extent.span, unit=extent.unit) if direction_varies(extent.plan) else None
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Add the hysteresis to the readings, (n_samples, n_points)."""
@@ -46,8 +47,8 @@ class Hysteresis(LinearEffect[FloatArray]):
         """Say by how much the two directions differ."""
         way = "higher" if mean[0] > 0 else "lower"
         return (
-            f"readings on the way forth are {give_or_take(abs(mean[0]), sd[0], factor=2)} {way} than on the way back, "
-            "black or white: hysteresis"
+            f"readings of forward motion are {give_or_take(abs(mean[0]), sd[0], self.unit, factor=2)} {way} than those "
+            "of backward motion, over black and white alike: hysteresis"
         )
 
 
@@ -107,6 +108,6 @@ class Lag(NamedEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how slow the sensor is."""
         return (
-            f"each reading still holds some of the one before, with a time constant of {give_or_take(mean[0], sd[0])} "
-            "s: the electronics lag behind"
+            f"each reading keeps part of the previous one, with a time constant of {give_or_take(mean[0], sd[0])} s: "
+            "the electronics lag"
         )

@@ -73,8 +73,8 @@ class Reflection(NamedEffect[Footprint]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how strong the second image is, and where."""
         return (
-            f"a reflection: {give_or_take(mean[0], sd[0], factor=100)} % of the light comes from "
-            f"{give_or_take(mean[1], sd[1])} mm along X and {give_or_take(mean[2], sd[2])} mm along Y beside the spot"
+            f"a second spot, {give_or_take(mean[1], sd[1])} mm along X and {give_or_take(mean[2], sd[2])} mm along Y "
+            f"from the first, contributes {give_or_take(mean[0], sd[0], factor=100)} % of the light: a reflection"
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -30,6 +30,7 @@ class Saturation(NamedEffect[FloatArray]):
     highest: float = 150.0
     sharpest: float = 0.05
     softest: float = 20.0
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "saturation"
     stage: ClassVar[Stage] = Stage.SATURATION
@@ -50,6 +51,7 @@ class Saturation(NamedEffect[FloatArray]):
             highest=extent.high + 0.3 * extent.span,
             sharpest=1e-3 * extent.span,
             softest=0.3 * extent.span,
+            unit=extent.unit,
         )
 
     @cached_property
@@ -75,6 +77,6 @@ class Saturation(NamedEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say above which reading nothing is reported, and how gently that limit sets in."""
         return (
-            f"no reading rises above {give_or_take(mean[0], sd[0])}: the electronics saturate, "
-            f"within about {mean[1]:.2g} of that limit"
+            f"no reading rises above {give_or_take(mean[0], sd[0], self.unit)}: the electronics saturate, "
+            f"from about {mean[1]:.2g} {self.unit} below that limit".replace("  ", " ")
         )

@@ -39,6 +39,6 @@ class SensorTilt(LinearEffect[Poses]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far the sensor looks from where it should."""
         return (
-            f"the sensor looks {give_or_take(mean[0], sd[0])} mm along X and {give_or_take(mean[1], sd[1])} mm along Y "
-            "beside where it should, however it is turned: it hangs at a tilt"
+            f"the sensor's spot is off by {give_or_take(mean[0], sd[0])} mm along X and "
+            f"{give_or_take(mean[1], sd[1])} mm along Y, whatever the orientation: the sensor is tilted"
         )

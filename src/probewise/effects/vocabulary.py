@@ -197,10 +197,12 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
         return None
 
 
-def give_or_take(mean: float, sd: float, *, factor: float = 1.0) -> str:
-    """Write mean ± sd, rounded to two significant digits of the sd."""
+def give_or_take(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:
+    """Write mean ± sd and the unit, rounded to two significant digits of the sd."""
     mean, sd = factor * mean, factor * sd
-    if not (np.isfinite(sd) and sd > 0):
-        return f"{mean:.4g}"
-    digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, 8))
-    return f"{mean:z.{digits}f} ± {sd:.{digits}f}"  # "z": no minus sign on a rounded zero
+    if np.isfinite(sd) and sd > 0:
+        digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, 8))
+        written = f"{mean:z.{digits}f} ± {sd:.{digits}f}"  # "z": no minus sign on a rounded zero
+    else:
+        written = f"{mean:.4g}"
+    return f"{written} {unit}".rstrip()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -36,6 +36,7 @@ class Flicker(NamedEffect[FloatArray]):
     lowest_hz: float = 0.01
     highest_hz: float = 0.5
     n_frequencies: int = 128
+    unit: str = field(default="", kw_only=True)
 
     name: ClassVar[str] = "flicker"
     stage: ClassVar[Stage] = Stage.OFFSET
@@ -50,7 +51,8 @@ class Flicker(NamedEffect[FloatArray]):
         if highest <= cls.lowest_hz:
             return None
         wanted = 2 * (highest - cls.lowest_hz) * extent.duration_s
-        return cls(0.01 * extent.span, cls.lowest_hz, highest, int(np.clip(np.ceil(wanted), 8, _MOST_FREQUENCIES)))
+        n_frequencies = int(np.clip(np.ceil(wanted), 8, _MOST_FREQUENCIES))
+        return cls(0.01 * extent.span, cls.lowest_hz, highest, n_frequencies, unit=extent.unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -75,8 +77,9 @@ class Flicker(NamedEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far the reading swings, and how fast."""
         return (
-            f"the reading swings by {give_or_take(mean[0], sd[0])} either way at {give_or_take(mean[1], sd[1])} Hz, "
-            f"a period of {1 / mean[1]:.4g} s, black or white: a lamp that flickers"
+            f"the reading oscillates with an amplitude of {give_or_take(mean[0], sd[0], self.unit)} at "
+            f"{give_or_take(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), over black and white alike: "
+            "a lamp flickers"
         )
 
 
@@ -126,8 +129,8 @@ class PeriodicPositionError(NamedEffect[Poses]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how large the position error is, and its period."""
         return (
-            f"the arm swings by {give_or_take(mean[0], sd[0])} mm about the place it was sent to, again every "
-            f"{give_or_take(mean[1], sd[1])} mm of X: a gear or lead screw that is not round"
+            f"the arm's position along X is off by up to {give_or_take(mean[0], sd[0])} mm, with a period of "
+            f"{give_or_take(mean[1], sd[1])} mm: a gear or lead screw is not round"
         )
 
 
@@ -175,8 +178,8 @@ class StickSlip(NamedEffect[Poses]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far the slide jumps, and how often."""
         return (
-            f"the slide sticks and jumps by {give_or_take(abs(mean[0]), sd[0], factor=2)} mm, again every "
-            f"{give_or_take(mean[1], sd[1])} mm of X: it runs dry"
+            f"the slide sticks and then jumps by {give_or_take(abs(mean[0]), sd[0], factor=2)} mm, once every "
+            f"{give_or_take(mean[1], sd[1])} mm along X: it lacks lubrication"
         )
 
 

@@ -42,7 +42,7 @@ class SlowTurn(LinearEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how fast it turns."""
-        return f"the sensor turns by {give_or_take(mean[0], sd[0])} degrees an hour: it is loose in its holder"
+        return f"the sensor turns by {give_or_take(mean[0], sd[0])} degrees per hour: it is loose in its holder"
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,6 @@ class SlowSinking(LinearEffect[Footprint]):
         """Say how fast it sinks or rises."""
         way = "rises" if mean[0] > 0 else "sinks"
         return (
-            f"the sensor {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} % of its height an hour: "
+            f"the sensor {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} % of its height per hour: "
             "it is loose in its holder"
         )

@@ -71,6 +71,11 @@ class Instrumentation:
         object.__setattr__(self, "controls", tuple(self.controls))
 
     @property
+    def unit_after_number(self) -> str:
+        """Unit of a reading as it is written after a number: "LEGO units" for the LEGO brick's."""
+        return "LEGO units" if self.unit == "LEGO" else self.unit
+
+    @property
     def ends(self) -> tuple[float, ...]:
         """The declared ends of the range."""
         return tuple(end for end in (self.min, self.max) if end is not None)

@@ -1,8 +1,8 @@
-"""Local effects: a bell-shaped spot on or beside a scanned line, and its prior.
+"""Local effects: a Gaussian patch on or beside a scanned line, and its prior.
 
-One scan cannot distinguish a bright spot beside its line from a faint one on it. So the prior is over what
+One scan cannot distinguish a bright patch beside its line from a faint one on it. So the prior is over what
 the scan shows: the height on the line, the place along it, the distance from it in radii, and the radius.
-The spot's own height follows from the height on the line and the distance in radii.
+The patch's own height follows from the height on the line and the distance in radii.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.plan import Plan
 
-__all__ = ["ALONG_X", "ScanLine", "SpotPrior", "bell", "scanned_lines", "spot_bank"]
+__all__ = ["ALONG_X", "PatchPrior", "ScanLine", "bell", "patch_bank", "scanned_lines"]
 
 _RADII = (0.04, 0.1, 0.25)  # of the line's length, for the bank; the prior reaches twice as far either way
-_MARGIN = 0.1  # of the line's length: a spot may lie beyond its ends
+_MARGIN = 0.1  # of the line's length: a patch may lie beyond its ends
 _STRAIGHT = 0.02  # of a scan's length: the largest deviation from a straight line
 _LEAST_PLACES = 8
 
@@ -82,8 +82,8 @@ def scanned_lines(plan: Plan) -> tuple[ScanLine, ...]:
 
 
 @dataclass(frozen=True)
-class SpotPrior:
-    """Prior of a spot of either sign on or beside a line; parameters: its height (named `size`), x, y, r."""
+class PatchPrior:
+    """Prior of a patch of either sign on or beside a line; parameters: its height (named `size`), x, y, r."""
 
     size: str
     typical: float
@@ -132,12 +132,12 @@ class SpotPrior:
         return np.stack([height * np.exp(-0.5 * beside**2), along, beside, r], axis=-1)
 
 
-def spot_bank(typical: float, line: ScanLine) -> FloatArray:
-    """List spots on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
-    spots = []
+def patch_bank(typical: float, line: ScanLine) -> FloatArray:
+    """List patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
+    patches = []
     for share in _RADII:
         r = share * line.length_mm
         along = np.arange(line.low_mm, line.high_mm + r / 2, r)
         x, y = line.place(along, np.zeros_like(along))
-        spots.append(np.stack([np.full_like(along, typical), x, y, np.full_like(along, r)], axis=-1))
-    return np.concatenate(spots)[:, None, :]
+        patches.append(np.stack([np.full_like(along, typical), x, y, np.full_like(along, r)], axis=-1))
+    return np.concatenate(patches)[:, None, :]

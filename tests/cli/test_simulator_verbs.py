@@ -99,7 +99,7 @@ def test_a_diagnosis_writes_what_the_contract_promises(folder):
         assert json.loads(text)["format"] == "system/1"
         run(folder, "predict", str(out / name), "new.csv", "--out", str(folder / f"{name}.csv"))
     page = (out / "report.html").read_text().lower()
-    for word in (" scan ", "lamp", " arm ", "black or white", "sensor.json", "next_plan"):
+    for word in (" scan ", "lamp", " arm ", "black and white", "sensor.json", "next_plan"):
         assert word not in page
     if document["next_measurement"] is not None:
         assert document["next_measurement"]["plan"] == "next.csv"

@@ -33,6 +33,7 @@ from probewise.diagnosis.verdict_report.beyond import Formula, Remainder
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.document import NEXT_PLAN, diagnosis_json, diagnosis_schema
 from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound, ParameterFound
+from probewise.diagnosis.verdict_report.reason import TO_SEPARATE
 from probewise.diagnosis.verdict_report.words import p_in_words
 
 __all__ = [
@@ -40,6 +41,7 @@ __all__ = [
     "CURE_PLAN",
     "MOST_READINGS",
     "NEXT_PLAN",
+    "TO_SEPARATE",
     "Alias",
     "Cure",
     "Diagnosis",

@@ -29,7 +29,8 @@ class Words:
     """Words for sentences about an apparatus: the name of the calibrated model, and how to obtain a signal.
 
     `settles_nothing`: no reading separates two aliased effects; `run`: name of a group of rows; `next_plan`, `model`:
-    files of the next readings and of the repaired model; `no_cure`: no further rows would make an effect detectable.
+    files of the next readings and of the repaired model; `no_cure`: no further rows would make an effect detectable;
+    `covariates`: names of covariates other than a table's own columns and states, which keep theirs; None: no table.
     """
 
     null: str
@@ -39,6 +40,13 @@ class Words:
     next_plan: str = "next_plan.csv"
     model: str = "sensor.json"
     no_cure: str = "no scan of this arm helps"
+    covariates: Mapping[str, str] | None = None
+
+    def covariate(self, name: str) -> str:
+        """Write the name of a covariate."""
+        if self.covariates is None:
+            return name.replace("_", " ")
+        return self.covariates.get(name, name.replace("state:", "state "))
 
 
 class Apparatus(Protocol):

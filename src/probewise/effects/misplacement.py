@@ -42,9 +42,7 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far off the pattern lies."""
-        return (
-            f"in all scans the printed edges lie {give_or_take(mean[0], sd[0])} mm from where the description has them"
-        )
+        return f"the printed edges lie {give_or_take(mean[0], sd[0])} mm from their described place, in all scans"
 
 
 @dataclass(frozen=True)

@@ -19,14 +19,16 @@ _CURED_BY = "The fewest extra readings that would help"
 
 
 def answer(audit: PlanAudit) -> str:
-    """Summarise in twenty words at most which effects the plan can identify, and what the others need."""
+    """Summarise in twenty words at most how many effects are fine, aliased and invisible, and what would help."""
     n_fine, n_aliased = len(audit.seen_as("fine")), len(audit.seen_as("aliased"))
-    of = f"{n_fine} of {len(audit.effects)} effects"
-    said = f"This plan can identify {of}; {n_aliased} are aliased, {len(audit.seen_as('invisible'))} undetectable."
+    n_invisible = len(audit.seen_as("invisible"))
+    said = (
+        f"This plan is fine for {n_fine} of {len(audit.effects)} effects; {n_aliased} aliased, {n_invisible} invisible."
+    )
     if not audit.cures:
         return said
     cured = len(audit.seen_as("fine", after=True)) - n_fine
-    return f"{said} {count(audit.extra_readings, 'more reading')} would identify {cured} more."
+    return f"{said} {count(audit.extra_readings, 'more reading')} make {cured} more fine."
 
 
 def figures(audit: PlanAudit) -> dict[str, bytes]:
@@ -36,8 +38,8 @@ def figures(audit: PlanAudit) -> dict[str, bytes]:
 
 def picture(audit: PlanAudit) -> AxesGrid:
     """Draw the detectability of every effect, and which effects are aliased."""
-    names, statuses = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
-    return audit_matrix(names, statuses, audit.cosines, alias=ALIAS)
+    names, detectability = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
+    return audit_matrix(names, detectability, audit.cosines, alias=ALIAS)
 
 
 def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
@@ -47,11 +49,10 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
         "Left: share of each effect's change in the readings that "
         f"{audit.words.null}'s own parameters cannot absorb. "
         "Right: the effect of the row is present, at typical parameters; the cosine measures how well the effect of "
-        "the "
-        "column imitates it, at the parameters that suit it best. The matrix is not symmetric: an effect with many "
+        "the column imitates it, at the parameters that suit it best. The matrix is not symmetric: an effect with many "
         "parameters can imitate a simple one, but not the other way round. A circle marks an "
         f"alias: at size λ = {LAMBDA:g} these readings favour the row over the column by less than {LEAST_NATS:g} "
-        f"nats.",
+        "nats.",
     )
     sections = [
         Section("Effects that cannot be told apart", _classes(audit))
@@ -93,7 +94,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     plan = audit.cure_plan
     if plan is None:
         if all(effect.detectability == "fine" for effect in audit.effects):
-            return (paragraph("None are needed: every effect can be identified."),)
+            return (paragraph("None are needed: this plan is fine for every effect."),)
         return (
             paragraph(
                 "No scan that this arm can take (repeated, reversed, faster or turned) and no other position of the "
@@ -103,7 +104,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     left = [spoken_name(e.name) for e in audit.after if e.detectability != "fine"]
     return (
         table(
-            ("step", "what to do", "readings", "effects that can then be identified"),
+            ("step", "what to do", "readings", "effects for which it is then fine"),
             (
                 (
                     str(k),
@@ -116,7 +117,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
         ),
         paragraph(
             f"{count(len(plan), 'reading')}, about {number(audit.extra_minutes, 0)} minutes; "
-            f"the plan is in cure_plan.csv. Still not identifiable: {', '.join(left) or 'nothing'}."
+            f"the plan is in cure_plan.csv. Still aliased or invisible: {', '.join(left) or 'nothing'}."
         ),
     )
 

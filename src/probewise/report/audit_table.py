@@ -42,7 +42,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
     counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")
     return table(
-        ("effect", "status", "detectable share", "aliased with (cosine)", "size at λ = 8", *["rows"] * counted),
+        ("effect", "detectability", "detectable share", "aliased with (cosine)", "size at λ = 8", *["rows"] * counted),
         (
             (
                 spoken_name(effect.name),
@@ -54,8 +54,8 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
             )
             for effect in sorted(effects, key=lambda e: rank.index(e.detectability))
         ),
-        caption="Status: fine (these readings detect the effect and tell it from every other), aliased (they detect "
-        "it, but cannot tell it from the effect named, given with its cosine; the reverse need not hold), or invisible "
+        caption="Detectability: fine (these readings detect the effect and tell it from every other), aliased (they "
+        "detect it, but the named effect can imitate it, to the cosine given; the reverse need not hold), or invisible "
         f"(they cannot detect it). Detectable share: share of the effect's change in the readings that {of}'s own "
         "parameters do not absorb. Size at λ = 8: value of each parameter at which the effect reaches eight noise sds; "
         "– where no parameter scales the effect."

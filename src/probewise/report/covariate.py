@@ -66,14 +66,8 @@ def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
     unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
     if not isinstance(apparatus, PersonsSystem):
         return ("scan" if name == "scan" else covariate_words(name)), covariate_unit(name, unit)
-    own = apparatus.system.simulator
-    known = {
-        "time": (own.time or "time", own.time_unit),
-        "row": ("row of the table", ""),
-        "level": (f"predicted {own.reading}", unit),
-        "previous": (f"change of {own.reading} since the row before", unit),
-    }
-    return known.get(name, (name.replace("state:", "state "), ""))
+    units = {"time": apparatus.system.simulator.time_unit, "level": unit, "previous": unit}
+    return apparatus.words.covariate(name), units.get(name, "")
 
 
 def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:

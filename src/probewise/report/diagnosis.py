@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from probewise.diagnosis import (
     ALARM,
     MOST_READINGS,
+    TO_SEPARATE,
     Alias,
     Diagnosis,
     EffectFound,
@@ -158,7 +159,7 @@ def _formula(formula: Formula) -> str:
 
 def _found(diagnosis: Diagnosis) -> str:
     """Return the reason without the plan, which the page gives elsewhere, and with names in words."""
-    said = diagnosis.reason.partition("; to tell: ")[0]
+    said = diagnosis.reason.partition(TO_SEPARATE)[0]
     names = "|".join(EFFECTS_IN_WORDS)
     return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
 
@@ -214,8 +215,7 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
     if told < _TELLS_SOMETHING:
         return (
             f"Nothing that is worth the time: the best plan of up to {MOST_READINGS} readings has an expected log "
-            f"Bayes "
-            f"factor of {number(told, 1)} nats. It is in {file}: {description} ({asked})."
+            f"Bayes factor of {number(told, 1)} nats. It is in {file}: {description} ({asked})."
         )
     said = f"{description}: {asked}, {file}."
     *others, last = map(_plain, plan.between)
@@ -393,7 +393,7 @@ def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ..
         *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
         figure(
             drawn["noise.svg"],
-            "Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
+            f"Residuals after the repair, if any. Above: autocorrelation within {diagnosis.apparatus.words.run}s. "
             "Middle: scatter by predicted reading. Below: histogram on a logarithmic scale.",
         ),
     )
@@ -482,12 +482,12 @@ def _design(audit: PlanAudit) -> tuple[Markup, ...]:
     return (
         definition_list(
             (
-                ("detectable and identifiable", names([e.name for e in audit.seen_as("fine")])),
+                ("fine (detected, and told from every other)", names([e.name for e in audit.seen_as("fine")])),
                 (
-                    "detectable, but aliased",
+                    "aliased (detected, but another effect can imitate it)",
                     names(aliased),
                 ),
-                ("not detectable", names([e.name for e in audit.seen_as("invisible")])),
+                ("invisible (not detected)", names([e.name for e in audit.seen_as("invisible")])),
             )
         ),
         element("details", element("summary", "every effect, with numbers"), audit_table(audit.effects)),

@@ -159,7 +159,7 @@ def test_along_an_edge_there_is_nothing_to_lay_otherwise():
     under = np.where(plan.scan == 1, len(names) - 1, plan.pattern)
     patterns = {**along.patterns, "upright": HalfPlane(0.0, 0.0)}
     second = replace(along, pattern=under, pattern_names=names, patterns=patterns)
-    assert any("upright, turned half round" in command.description for command in target_swaps(second))
+    assert any("turn pattern upright by 180 degrees" in command.description for command in target_swaps(second))
 
 
 def test_short_scans_are_taken_whole():

@@ -80,5 +80,5 @@ def test_outliers_anywhere_are_noise_and_at_one_end_of_a_scan_they_are_not():
     at_one_end = np.concatenate([np.arange(k, k + 12, 4) for k in (86, 187, 288, 389)])
     found = diagnose(spotted(at_one_end), rng=np.random.default_rng(0))
     assert found.verdict == "unknown"
-    assert "far out lie together in place" in found.reason
+    assert "Outlying readings cluster in place" in found.reason
     assert found.where

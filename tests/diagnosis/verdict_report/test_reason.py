@@ -23,7 +23,7 @@ SAID = [
         judged("named", ("lag", "step")),
         {"p_value_after": 0.002},
         "The probe follows with 8 s; it jumps by 2 at 40 s (p = 0.0001). "
-        "Something more is missing: after the repair p = 0.002.",
+        "Something more is missing: the repaired model has p = 0.002.",
     ),
     (judged("noise", ("lag",)), {}, "The probe follows with 8 s; nothing is missing from the mean (p = 0.0001)."),
     (
@@ -40,36 +40,42 @@ SAID = [
     (
         judged("cannot_tell"),
         {"settles": "repeat run 2"},
-        "These 100 readings do not tell apart lag 0.70, clean 0.20, unknown 0.10; to tell: repeat run 2.",
+        "These 100 readings cannot tell apart lag (0.70), clean (0.20) and unknown (0.10); to tell them apart: "
+        "repeat run 2.",
     ),
     (
         judged("unknown", ("unknown",)),
         {"beside": ("lag",), "shows_in": ("time", "level")},
-        "Something is missing (p = 0.0001) that no named effect explains, beside lag. It shows most in time.",
+        "Beside lag, something is missing (p = 0.0001) that no named effect explains; it shows most in time.",
     ),
     (
         judged("unknown", ("unknown",)),
         {"like": ("the arm was knocked",), "shows_in": ("time",)},
-        "Something is missing (p = 0.0001) that has no name; it is most like this: the arm was knocked.",
+        "Something is missing (p = 0.0001) that no named effect explains; it looks most like this: the arm was "
+        "knocked.",
     ),
     (
         judged("unknown", ("unknown",)),
         {"family": "edge_distance, locally", "shows_in": ("time", "edge_distance")},
-        "Something is missing (p = 0.0001) that no named effect explains. It shows most in edge distance.",
+        "Something is missing (p = 0.0001) that no named effect explains; it shows most in edge distance.",
     ),
     (
         judged("unknown", ("unknown",)),
         {"family": "edge_distance, far out"},
-        "The readings that are far out lie together in edge distance: something is missing there, not noise "
-        "(to a test of the mean they are noise with a heavy tail, p = 0.0001).",
+        "Outlying readings cluster in edge distance: something is missing there (a test of the mean alone, which takes "
+        "them for heavy-tailed noise, gives p = 0.0001).",
     ),
     (
         judged("named", ("lag",)).withdraw(),
         {},
-        "Something is missing (p = 0.0001); lag explains these readings best, and predicts those kept back far worse "
+        "Something is missing (p = 0.0001); lag fits these readings best, but predicts held-out readings far worse "
         "than the oven's law without it.",
     ),
-    (judged("cannot_tell", too_little=True), {"n_readings": 1}, "1 usable reading is too few to tell; 24 or more are"),
+    (
+        judged("cannot_tell", too_little=True),
+        {"n_readings": 1},
+        "1 usable reading is too few for a diagnosis; 24 or more",
+    ),
     (
         judged("cannot_tell", too_little=True),
         {},

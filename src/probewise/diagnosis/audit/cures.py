@@ -1,4 +1,4 @@
-"""The fewest extra readings that make effects identifiable: scans chosen greedily from those possible."""
+"""The fewest extra readings that make effects fine (detected, not aliased): scans chosen greedily."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def cures_of(
     effects
         The vocabulary, by name.
     ailing
-        Names of the effects that are not identifiable under the plan.
+        Names of the effects that are aliased or invisible under the plan.
     progress
         Called for every chosen scan.
     """

@@ -43,9 +43,9 @@ _MOST_READINGS = 4000  # readings of a recording that are used; of a longer one 
 _SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis
 _LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
 _READING_GUIDE = (
-    "(fine: these readings show the effect and tell it from every other. aliased (as X, c): they show it, but X at its",
-    " best setting passes for it, by a cosine c of 1 at most; where X is there, it may still be told from this one.",
-    " invisible: they cannot show it.)",
+    "(fine: these readings detect the effect and tell it from every other. aliased (with X, c): they detect it, but X",
+    " can imitate it, up to a cosine c (1: exactly); if X is the true effect, they may still tell it from this one.",
+    " invisible: they cannot detect it.)",
 )
 _NOISE = 0.01  # noise as a share of the span between the levels, likewise
 # Two Gaussians, a core and a faint halo, off-centre and not round, so that no effect is invisible by symmetry.
@@ -63,7 +63,10 @@ class Smallest:
 
 @dataclass(frozen=True)
 class EffectAudit:
-    """Detectability of one effect under a plan.
+    """Detectability of one effect under a plan: fine, aliased or invisible.
+
+    Fine: the readings detect the effect and tell it from every other. Aliased: they detect it, but another effect can
+    imitate it. Invisible: they cannot detect it.
 
     Attributes
     ----------
@@ -98,7 +101,7 @@ class EffectAudit:
 
 @dataclass(frozen=True, eq=False)
 class Cure:
-    """One scan to add: its kind (`Scan`), description, plan, minutes, and the effects that become identifiable."""
+    """One scan to add: its kind (`Scan`), description, plan, minutes, and the effects that become fine."""
 
     kind: str
     description: str
@@ -181,12 +184,12 @@ class PlanAudit(ShowsItself):
         lines += _listed("invisible", [e.name for e in self.seen_as("invisible")])
         lines += _READING_GUIDE
         if not self.cures:
-            cured = "nothing to cure" if len(self.seen_as("fine")) == len(self.effects) else self.words.no_cure
+            cured = "not needed" if len(self.seen_as("fine")) == len(self.effects) else self.words.no_cure
             return "\n".join([*lines, f"cure       {cured}"])
         minutes = "1 minute" if self.extra_minutes < 1.5 else f"{self.extra_minutes:.0f} minutes"
         lines.append(f"cure       {self.extra_readings} more readings, about {minutes}:")
         for k, cure in enumerate(self.cures, start=1):
-            so_that = ", ".join(cure.cured) or "helps the next"
+            so_that = ", ".join(cure.cured) or "prepares the next"
             said = f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}"
             lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
         left = [e.name for e in self.after if e.detectability != "fine"]
@@ -199,7 +202,7 @@ def count_of(names: Sequence[str], noun: str) -> str:
 
 
 def _with_aliases(effect: EffectAudit) -> str:
-    return f"{effect.name} (as {effect.alike[0][0]}, {effect.alike[0][1]:.2f})"
+    return f"{effect.name} (with {effect.alike[0][0]}, {effect.alike[0][1]:.2f})"
 
 
 def _listed(label: str, names: Sequence[str], width: int = 100) -> list[str]:
@@ -222,7 +225,7 @@ def audit_plan(
     effects: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
     progress: Progress = silent,
 ) -> PlanAudit:
-    """Determine for each effect whether a plan detects and identifies it, and which readings would help.
+    """Determine for each effect whether a plan detects it and tells it from every other, and which readings would help.
 
     Parameters
     ----------
@@ -362,7 +365,7 @@ def judged(
             out.append(EffectAudit(name, "invisible", 0.0, reason="its covariate does not vary here"))
         elif effect.stage is Stage.NOISE:
             enough = seen.n_points >= LEAST_READINGS
-            reason = "" if enough else f"{seen.n_points} readings show no scatter; {LEAST_READINGS} do"
+            reason = "" if enough else f"{seen.n_points} readings do not show the scatter; {LEAST_READINGS} would"
             out.append(EffectAudit(name, "fine" if enough else "invisible", float(enough), reason=reason))
         else:
             share, like = detectability[name]

@@ -44,7 +44,7 @@ def target_swaps(plan: Plan) -> list[Scan]:
     name = plan.scan_names[int(plan.scan[first[0]])]
     for part in excerpts(first, strides=(_STRIDE // 2, _STRIDE)):
         across = _turned(_scan(plan, part.rows, f"across{part.suffix}"))
-        out.append(Scan("across", f"scan across scan {name}, along the other axis{part.words}", across))
+        out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
     edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
     laid = (_laid_otherwise(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
     return [*out, *next(filter(None, laid), [])]
@@ -60,26 +60,33 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     once = _scan(plan, scan, name)
     half_round = replace(edge, normal_rad=edge.normal_rad + math.pi, offset_mm=-edge.offset_mm)
     laid = [
-        (f"{name}_half_round", f"{name}, turned half round about where its edge should be", once, half_round),
-        (f"{name}_quarter", f"{name}, turned by a quarter with the scan", *_both_turned(once, edge)),
+        (f"{name}_half_round", f"turn pattern {name} by 180 degrees about its edge and scan it", once, half_round),
+        (f"{name}_quarter", f"turn pattern {name} and its scan by 90 degrees", *_both_turned(once, edge)),
     ]
     middle_mm = float(beyond.mean())
     for end in (-1.0, 1.0):
         exactly_mm = middle_mm + end * _ASIDE * length
         aside_mm = float(np.round(exactly_mm)) or exactly_mm
         moved = replace(edge, offset_mm=edge.offset_mm + aside_mm)
-        laid.append((f"{name}_by_{aside_mm:g}_mm", f"{name}, moved by {aside_mm:g} mm along its normal", once, moved))
+        laid.append(
+            (
+                f"{name}_by_{aside_mm:g}_mm",
+                f"move pattern {name} by {aside_mm:g} mm along its normal and scan it",
+                once,
+                moved,
+            )
+        )
     out = []
     for label, words, whole, pattern in laid:
         rows = np.arange(len(whole))
         seen = ndtr(_beyond(whole, rows, pattern) / (_FOOTPRINT * length))
         for part in excerpts(rows, strides=(_STRIDE,), level=seen):
             taken = _over(_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
-            out.append(Scan("lay", f"scan {words}{part.words}", taken))
+            out.append(Scan("lay", f"{words}{part.words}", taken))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
-        label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of {name}"
+        label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
         for part in excerpts(scan, strides=(_STRIDE // 2, _STRIDE)):
             taken = _over(_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
             out.append(Scan("lay", f"{words}{part.words}", taken))

@@ -75,6 +75,7 @@ class PersonsSystem:
     @property
     def words(self) -> Words:
         """Words for sentences about the simulator."""
+        own = self.system.simulator
         return Words(
             null="the simulator",
             find_signal="record where the reading changes",
@@ -83,6 +84,12 @@ class PersonsSystem:
             next_plan="next.csv",
             model="repaired.json",
             no_cure="more rows, or columns and runs that vary otherwise",
+            covariates={
+                "time": own.time or "time",
+                "row": "row of the table",
+                "level": f"predicted {own.reading}",
+                "previous": f"change of {own.reading} since the row before",
+            },
         )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:

@@ -50,7 +50,7 @@ class Formula:
 
 
 def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.random.Generator) -> Remainder | None:
-    """Describe the residual after the repair; None if nothing is named, or nothing is left."""
+    """Describe the residual after the repair; None if nothing is named, or no misfit is significant."""
     p_value, names = best.improvement.p_value_after, best.fit.names
     if judged.verdict not in ("named", "cannot_tell") or not names or p_value >= ALARM:
         return None
@@ -63,9 +63,9 @@ def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.rand
     draws = best.problem.draws(_N_DRAWS, rng=rng)
     found = places(best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws)
     where = found[0].covariate if found else None
-    shows = "" if where is None else f"; it shows most in {where}"
+    shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate(where)}"
     share = more / (named + more) if named + more > 0 else 0.0
-    sentence = f"Something smaller is left ({p_in_words(p_value)}, {share:.0%} of what is gained){shows}."
+    sentence = f"A smaller misfit remains ({p_in_words(p_value)}, {share:.0%} of the gain in log evidence){shows}."
     return Remainder(p_value, share, where, sentence)
 
 

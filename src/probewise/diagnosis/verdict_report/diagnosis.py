@@ -153,11 +153,11 @@ class Diagnosis(ShowsItself):
         lines += [f"  {h.probability:9.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
         # The reason is not repeated.
         lines += [
-            f"{e.name}, in all explanations together {e.probability:.3f}: {e.sentence}"
+            f"{e.name} (probability {e.probability:.3f}, all explanations together): {e.sentence}"
             for e in self.effects
             if e.probability > 0.05 and e.sentence.lower() not in self.reason.lower()
         ]
-        gain, unit = self.improvement, self.recording.plan.instrumentation.unit
+        gain, unit = self.improvement, self.recording.plan.instrumentation.unit_after_number
         if self.repair.changes_predictions:
             held = f"{gain.heldout_log_density_per_reading:+.4f} ± {gain.heldout_sd:.4f} nats per held-out reading"
             tested = held if gain.heldout_by_scan else "no reading could be held out"
@@ -166,23 +166,22 @@ class Diagnosis(ShowsItself):
                 f"rms of the residuals {gain.rms_before:.4g} -> {gain.rms_after:.4g} {unit}".rstrip()
             )
         elif self.verdict == "noise":
-            lines.append(f"the noise repaired: log evidence {gain.log_evidence:+.1f} nats")
+            lines.append(f"repaired noise model: log evidence {gain.log_evidence:+.1f} nats")
         if self.repair.by_rows:
             model = self.apparatus.words.model
-            lines.append(f"what has no name is corrected in these readings alone: {model} does not carry it")
-        lines += [f"in {share:.0%} of its samples: {sentence}" for _, share, sentence in self.carried]
+            lines.append(f"the unknown effect is corrected in these readings only: {model} does not contain it")
+        lines += [f"in {share:.0%} of the repaired model's samples: {sentence}" for _, share, sentence in self.carried]
         if self.repair.left_open:
             shares = ", ".join(
                 f"{' with '.join(n) or 'no effect'} in {p:.0%}" for n, p in self.repair.left_open.items()
             )
-            lines.append(f"left open in its samples: {shares}")
+            lines.append(f"samples of the repaired model: {shares}")
         return "\n".join(lines)
 
 
 def _p_value_said(p_value: float) -> str:
     """Write the p-value with its meaning."""
-    meant = "how often chance alone, with nothing missing from the mean, gives readings as odd as these"
-    return f"{p_in_words(p_value)} ({meant})"
+    return f"{p_in_words(p_value)} (probability of readings at least this odd if nothing is missing from the mean)"
 
 
 def require_diagnosis(diagnosis: object) -> None:

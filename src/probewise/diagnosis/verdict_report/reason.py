@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
@@ -13,7 +12,12 @@ from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import spoken_name
 
-__all__ = ["Grounds", "reason_of"]
+__all__ = ["TO_SEPARATE", "Grounds", "reason_of"]
+
+TO_SEPARATE = "; to tell them apart: "
+"""Introduces the next readings in the reason of `cannot_tell`."""
+
+_WORTH_NAMING = 0.01  # least probability of a third rival
 
 
 @dataclass(frozen=True)
@@ -69,8 +73,8 @@ def reason_of(judged: Judged, grounds: Grounds) -> str:
 
 def _withdrawn(judged: Judged, grounds: Grounds) -> str:
     leader, p = judged.hypotheses[0].label, p_in_words(judged.p_value)
-    worse = f"predicts those kept back far worse than {grounds.words.null} without it"
-    return f"Something is missing ({p}); {leader} explains these readings best, and {worse}."
+    worse = f"predicts held-out readings far worse than {grounds.words.null} without it"
+    return f"Something is missing ({p}); {leader} fits these readings best, but {worse}."
 
 
 def _too_little(grounds: Grounds) -> str:
@@ -78,7 +82,7 @@ def _too_little(grounds: Grounds) -> str:
     if n >= grounds.least_readings:
         return f"All {n} usable readings are equal: there is no signal to diagnose; {grounds.words.find_signal}."
     has = "1 usable reading is" if n == 1 else f"{n} usable readings are"
-    return f"{has} too few to tell; {grounds.least_readings} or more are needed."
+    return f"{has} too few for a diagnosis; {grounds.least_readings} or more are needed."
 
 
 def _clean(judged: Judged, grounds: Grounds) -> str:
@@ -91,24 +95,26 @@ def _clean(judged: Judged, grounds: Grounds) -> str:
 def _unknown(judged: Judged, grounds: Grounds) -> str:
     p = p_in_words(judged.p_value)
     if grounds.like:
-        return f"Something is missing ({p}) that has no name; it is most like this: {'; '.join(grounds.like)}."
+        like = "; ".join(grounds.like)
+        return f"Something is missing ({p}) that no named effect explains; it looks most like this: {like}."
     if grounds.family.endswith(FAR_OUT):
-        covariate = grounds.family.removesuffix(FAR_OUT).replace("_", " ")
-        tail = f"to a test of the mean they are noise with a heavy tail, {p}"
-        together = f"The readings that are far out lie together in {covariate}"
-        return f"{together}: something is missing there, not noise ({tail})."
+        covariate = grounds.words.covariate(grounds.family.removesuffix(FAR_OUT))
+        tail = f"a test of the mean alone, which takes them for heavy-tailed noise, gives {p}"
+        return f"Outlying readings cluster in {covariate}: something is missing there ({tail})."
     likeliest = grounds.family.partition(",")[0].removesuffix(" within scans")
     most = likeliest if likeliest in grounds.shows_in else next(iter(grounds.shows_in), "")
-    place = f" It shows most in {most.replace('_', ' ')}." if most else ""
+    place = f"; it shows most in {grounds.words.covariate(most)}" if most else ""
     known = " and ".join(spoken_name(name) for name in grounds.beside)
-    beside = f", beside {known}" if known else ""
-    return f"Something is missing ({p}) that no named effect explains{beside}.{place}"
+    what = f"Beside {known}, something" if known else "Something"
+    return f"{what} is missing ({p}) that no named effect explains{place}."
 
 
 def _cannot_tell(judged: Judged, grounds: Grounds) -> str:
-    leading = ", ".join(f"{h.label} {h.probability:.2f}" for h in itertools.islice(judged.hypotheses, 3))
-    cure = "" if grounds.settles is None else f"; to tell: {grounds.settles}"
-    return f"These {grounds.n_readings} readings do not tell apart {leading}{cure}."
+    rivals = [h for k, h in enumerate(judged.hypotheses[:3]) if k < 2 or h.probability >= _WORTH_NAMING]
+    *others, last = (f"{h.label} ({h.probability:.2f})" for h in rivals)
+    rivals_said = f"{', '.join(others)} and {last}" if others else last
+    cure = "" if grounds.settles is None else f"{TO_SEPARATE}{grounds.settles}"
+    return f"These {grounds.n_readings} readings cannot tell apart {rivals_said}{cure}."
 
 
 def _noise(judged: Judged, grounds: Grounds) -> str:
@@ -117,7 +123,7 @@ def _noise(judged: Judged, grounds: Grounds) -> str:
 
 def _named(judged: Judged, grounds: Grounds) -> str:
     after = grounds.p_value_after
-    more = f" Something more is missing: after the repair {p_in_words(after)}." if after < ALARM else ""
+    more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
     return f"{_stated(judged, grounds)} ({p_in_words(judged.p_value)}).{more}"
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
+from probewise._renamed import renamed_arguments
 from probewise.effects import spoken_name
 from probewise.report.plots.canvas import (
     BLUE,
@@ -29,8 +30,14 @@ _NOT_COMPARED = "#e8e8e8"
 _MOST_NAMES = 36  # columns labelled with names; if there are more, they are numbered
 
 
+@renamed_arguments(sights="detectability", statuses="detectability")
 def audit_matrix(
-    names: Sequence[str], statuses: Sequence[str], cosines: FloatArray, *, alias: float, axes: AxesGrid | None = None
+    names: Sequence[str],
+    detectability: Sequence[str],
+    cosines: FloatArray,
+    *,
+    alias: float,
+    axes: AxesGrid | None = None,
 ) -> AxesGrid:
     """Draw the detectable share of each effect, and how well every other effect imitates it.
 
@@ -39,8 +46,8 @@ def audit_matrix(
 
     Parameters
     ----------
-    names, statuses
-       Names of the effects, and whether each is "fine", "aliased" or "invisible".
+    names, detectability
+        Names of the effects, and whether each is "fine", "aliased" or "invisible".
     cosines
         Cosine of the row's change with the column's best imitation, (n_effects, n_effects), 0 where not compared; the
         detectable share on the diagonal.
@@ -53,19 +60,19 @@ def audit_matrix(
     -------
     The two axes, shape (1, 2).
     """
-    order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(statuses[k]), -cosines[k, k]))
+    order = sorted(range(len(names)), key=lambda k: (list(COLOUR).index(detectability[k]), -cosines[k, k]))
     labels = [spoken_name(names[k]) for k in order]
     at = np.arange(len(order))
     own = axes is None
     axes = axes_or_grid(axes, 1, 2, size_in=(9.4, 1.5 + 0.25 * len(order)), width_ratios=[1, 2.8], sharey=True)
     bars, matrix = axes[0]
-    bars.barh(at, np.diag(cosines)[order], color=[COLOUR[statuses[k]] for k in order], height=0.7)
+    bars.barh(at, np.diag(cosines)[order], color=[COLOUR[detectability[k]] for k in order], height=0.7)
     bars.set_yticks(at, labels)
     bars.invert_yaxis()
     bars.set_xlim(0, 1)
-    for sight, colour in COLOUR.items():
-        if sight in statuses:
-            bars.barh([np.nan], [0], color=colour, label=sight)
+    for kind, colour in COLOUR.items():
+        if kind in detectability:
+            bars.barh([np.nan], [0], color=colour, label=kind)
     tidy(bars, x="detectable share (no unit)", y="")
     numbered = len(order) > _MOST_NAMES
     if numbered:

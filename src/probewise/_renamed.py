@@ -1,0 +1,31 @@
+"""Arguments under their names of the last release: accepted for one release, with a warning."""
+
+from __future__ import annotations
+
+import functools
+import warnings
+from collections.abc import Callable
+from typing import Any, ParamSpec, TypeVar
+
+__all__ = ["renamed_arguments"]
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def renamed_arguments(**new_by_old: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
+    """Decorate a function that also accepts arguments by their old names."""
+
+    def decorate(function: Callable[P, T]) -> Callable[P, T]:
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> T:
+            for old, new in new_by_old.items():
+                if old in kwargs and new not in kwargs:
+                    said = f"{old} of {function.__name__} is {new} now"
+                    warnings.warn(said, DeprecationWarning, stacklevel=2)
+                    kwargs[new] = kwargs.pop(old)
+            return function(*args, **kwargs)
+
+        return call
+
+    return decorate

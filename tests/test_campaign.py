@@ -77,7 +77,7 @@ def test_other_settings_and_damaged_files_are_refused(tmp_path):
     with pytest.raises(FileError, match="row 2"):
         read_campaign(path)
     path.write_text(json.dumps({"something": "else"}) + "\n")
-    with pytest.raises(FileError, match="no campaign begins here"):
+    with pytest.raises(FileError, match="this is not a campaign file"):
         read_campaign(path)
     with pytest.raises(FileError, match="there is no such file"):
         read_campaign(tmp_path / "missing.jsonl")

@@ -105,7 +105,7 @@ def read_campaign(path: str | os.PathLike[str]) -> Finished:
     *lines, _ = read_bytes(Path(path), "a campaign's file").split(b"\n")
     rows = [_parsed(path, number, line) for number, line in enumerate(lines, start=1)]
     if not rows or rows[0].get("format") != FORMAT or not isinstance(rows[0].get("settings"), dict):
-        raise FileError(path, "no campaign begins here", f'a first line with "format": "{FORMAT}" and its settings')
+        raise FileError(path, "this is not a campaign file", f'a first line with "format": "{FORMAT}" and its settings')
     results: dict[str, Result] = {}
     for number, row in enumerate(rows[1:], start=2):
         key, result = row.get("key"), row.get("result")

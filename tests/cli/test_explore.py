@@ -120,9 +120,9 @@ REFUSED = {
     "a point sees no height": (("--heights", "10", "--model", "naive"), "which knows no height"),
     "nor beside": (("--heights", "10", "--both-models"), "the naive model has no height"),
     "into the table": (("--heights", "0,10"), "finite, greater than 0"),
-    "no angle": (("--orientations", "0,north"), "no list of numbers"),
-    "no end": (("--orientations", "inf"), "no list of numbers"),
-    "never": (("--repeats", "1,0"), "no whole number above 0"),
+    "no angle": (("--orientations", "0,north"), "not a list of numbers"),
+    "no end": (("--orientations", "inf"), "not a list of numbers"),
+    "never": (("--repeats", "1,0"), "not a whole number greater than 0"),
 }
 
 
@@ -269,9 +269,9 @@ def test_the_papers_robot_goes_on_bit_for_bit_from_its_journal(explore, tmp_path
         (("--method", "paper", "--utility", "finishing"), "utility is 'finishing'; allowed: entropy"),
         (("--method", "paper", "--learn-sensor"), "learn_sensor is True; allowed: False"),
         (("--method", "paper", "--batch", "2"), "batch is 2; allowed: 1"),
-        (("--nested-stop", "change"), "--nested-stop is 'change'; allowed: none but with --method paper"),
-        (("--levels", "x.csv"), "--levels is 'x.csv'; allowed: none but with --method paper and a naive model"),
-        (("--method", "paper", "--levels", "x.csv"), "--levels is 'x.csv'; allowed: none but with"),
+        (("--nested-stop", "change"), "--nested-stop is 'change'; allowed: only with --method paper"),
+        (("--levels", "x.csv"), "--levels is 'x.csv'; allowed: only with --method paper and --model naive"),
+        (("--method", "paper", "--levels", "x.csv"), "--levels is 'x.csv'; allowed: only with"),
         (("--method", "paper", "--model", "naive", "--arm", "nxt:x"), "--levels is 'none'; allowed: a recording"),
     ],
 )

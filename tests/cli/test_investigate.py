@@ -55,8 +55,8 @@ def test_what_stands_in_the_folder_is_not_lost(few, tmp_path, capsys):
     ("options", "way_out"),
     [
         (("--truth", "bcklash:1"), "did you mean backlash"),
-        (("--minutes", "-1"), "above 0"),
-        (("--readings", "0"), "above 0"),
+        (("--minutes", "-1"), "greater than 0"),
+        (("--readings", "0"), "greater than 0"),
         (("--plan", "nowhere.csv"), "nowhere.csv"),
     ],
 )
@@ -126,7 +126,7 @@ def test_what_hands_would_have_to_do_is_refused_before_anything_moves(tmp_path, 
     file, out = tmp_path / "edge.py", tmp_path / "out"
     file.write_text("def connect():\n    raise RuntimeError('it moved')\n")
     assert run("investigate", "--arm", file, "--plan", "paper", "--no-hands", "--out", out) == 2
-    assert "a plan over one pattern; paper has more" in capsys.readouterr().err
+    assert "a plan over one pattern; paper has several" in capsys.readouterr().err
     assert run("investigate", "--arm", file, "--plan", "paper", "--truth", "lag:1", "--out", out) == 2
     assert "--truth" in capsys.readouterr().err
     assert not out.exists()

@@ -228,7 +228,7 @@ def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, 
     assert "cut it out" in said
     for words, told in (
         (["paper", "--paper", "a3"], "--paper is 'a3'; allowed: a4 or letter"),
-        (["target"], "--target is None; allowed: a shape"),
+        (["target"], "--target is missing: give a shape"),
         (["target", "--target", "blob:1,2"], "--target is 'blob:1,2'; allowed: a shape of"),
         (["paper", "--target", "600,250,80"], "none with paper"),
         (["nothing.csv"], "nothing.csv"),

@@ -83,7 +83,7 @@ class Bench:
             If the arm is not an emulated one.
         """
         if self._stand is None:
-            raise ParameterError("--arm", "simulated", "emulator: the simulated arm is where it says")
+            raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")
         stand = self._stand()
         across = (look.mark_mm[0] - stand.x_mm, look.mark_mm[1] - stand.y_mm)
         gap_mm = stand.height_mm - look.block_mm
@@ -184,7 +184,7 @@ def moved(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
             return replace(pattern, origin_mm=(pattern.origin_mm[0] + x_mm, pattern.origin_mm[1] + y_mm))
         case Ramp():
             if by_mm != (0.0, 0.0):
-                raise ParameterError("--origin-mm", by_mm, "0,0 with a ramp, whose zero is the field's")
+                raise ParameterError("--origin-mm", by_mm, "0,0 with a ramp, which is given in field coordinates")
             return pattern
 
 

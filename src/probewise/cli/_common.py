@@ -78,7 +78,7 @@ class OneLineParser(argparse.ArgumentParser):
         if action.choices is not None and value not in action.choices:
             choices = [str(choice) for choice in action.choices]
             raise argparse.ArgumentError(
-                action, f"{value!r} is none of {', '.join(choices)}{did_you_mean(value, choices)}"
+                action, f"{value!r} is not one of {', '.join(choices)}{did_you_mean(value, choices)}"
             )
 
 
@@ -113,7 +113,7 @@ def add_out_directory(parser: argparse.ArgumentParser) -> None:
 def a_path(text: str) -> Path:
     """Parse a path, for argparse; the empty string, such as an unset shell variable, is refused."""
     if not text:
-        raise argparse.ArgumentTypeError("'' names no file or directory")
+        raise argparse.ArgumentTypeError("an empty text names no file or directory")
     return Path(text)
 
 
@@ -124,7 +124,7 @@ def positive_int(text: str) -> int:
     except ValueError:
         value = 0
     if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number above 0")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number greater than 0")
     return value
 
 
@@ -137,7 +137,7 @@ def positive_number(unit: str) -> Callable[[str], float]:
         except ValueError:
             value = math.nan
         if not 0 < value < math.inf:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number of {unit} above 0")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number of {unit} greater than 0")
         return value
 
     return read
@@ -150,7 +150,7 @@ def seed_number(text: str) -> int:
     except ValueError:
         value = -1
     if value < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number from 0 on")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
     return value
 
 

@@ -147,11 +147,11 @@ def _levels(
 ) -> Naive | None:
     """Return the paper's naive levels from the given recording, or from readings of the simulated sensor."""
     if arguments.nested_stop is not None and arguments.method != "paper":
-        raise ParameterError("--nested-stop", arguments.nested_stop, "none but with --method paper")
+        raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
     wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)
     if arguments.levels is not None:
         if not wanted:
-            raise ParameterError("--levels", str(arguments.levels), "none but with --method paper and a naive model")
+            raise ParameterError("--levels", str(arguments.levels), "only with --method paper and --model naive")
         return posing.levels_from(read_recording(arguments.levels), sensor)
     if not wanted:
         return None

@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 __all__ = ["add_simulator", "read_tables", "refuse_beside"]
 
 
-def add_simulator(parser: argparse.ArgumentParser) -> None:
-    """Add --simulator FILE.py."""
+def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead of the light sensor") -> None:
+    """Add --simulator FILE.py; the help says what it replaces."""
     parser.add_argument(
         "--simulator",
         type=a_path,
         metavar="FILE.py",
-        help="a simulator of your own instead of the light sensor; the file says which columns of the table it reads",
+        help=f"a simulator of your own{replaces}; the file says which columns of the table it reads",
     )
 
 

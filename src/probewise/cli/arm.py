@@ -60,6 +60,11 @@ _HEIGHTS, _APART_MM = 9, 1.0  # at which the light is learnt, from that of readi
 _STEP_OF_LIGHT = 0.1  # of a reading in all its steps, 0 to 100
 TOUCH_MM = 1.0
 UNITS = "LEGO units (1 dark to 100 bright)"
+_ALL_ARMS = f"where the readings come from: {ARMS}"
+_LEGO_ARMS = (
+    "the LEGO arm: nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or emulator:TRUE.toml, in software, built "
+    "differently from --geometry"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -84,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "fit-geometry",
         "Fit home angles, links and base to marks that the sensor is brought to; writes the geometry.",
         moves=True,
-        own=True,
+        arms=_LEGO_ARMS,
     )
     fit.add_argument("--out", type=a_path, required=True, metavar="ARM.toml", help="where the fitted geometry goes")
     fit.add_argument(
@@ -117,30 +122,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     heights = _task(
         tasks,
         "heights",
-        "Check by the light, over white, whether the sensor hangs as high as its counters say.",
+        "Check from the light over white whether the sensor hangs as high as its counters say.",
         moves=True,
-        own=True,
+        arms=_LEGO_ARMS,
     )
     heights.add_argument(
         "places", nargs="*", metavar="X,Y", help="places in mm, two or more (default: the field's middle and the marks)"
     )
     heights.add_argument(
-        "--readings", type=positive_int, default=16, metavar="N", help="how many at each height (default 16)"
+        "--readings", type=positive_int, default=16, metavar="N", help="number of readings at each height (default 16)"
     )
 
     _task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
 
-    scan = _task(tasks, "scan", "Read along a line; readings go to standard output as CSV.", moves=True, own=True)
-    scan.add_argument("start", metavar="X,Y", help="from here, mm")
-    scan.add_argument("end", metavar="X,Y", help="to here, mm")
-    scan.add_argument("--readings", type=positive_int, default=21, metavar="N", help="how many (default 21)")
+    scan = _task(tasks, "scan", "Read along a line; readings go to standard output as CSV.", moves=True, arms=_ALL_ARMS)
+    scan.add_argument("start", metavar="X,Y", help="first place of the line, mm")
+    scan.add_argument("end", metavar="X,Y", help="last place of the line, mm")
+    scan.add_argument("--readings", type=positive_int, default=21, metavar="N", help="number of readings (default 21)")
 
     record = _task(
         tasks,
         "record",
         "Carry out a plan and write the recording; asks when there is something to do.",
         moves=True,
-        own=True,
+        arms=_ALL_ARMS,
     )
     record.add_argument(
         "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER}, the paper's"
@@ -173,23 +178,23 @@ def _task(
     summary: str,
     *,
     moves: bool = False,
-    own: bool = False,
+    arms: str | None = None,
 ) -> OneLineParser:
     parser = tasks.add_parser(name, help=summary, description=summary)
     if moves:
-        _add_arm(parser, own=own)
+        _add_arm(parser, arms)
         parser.add_argument("--dry-run", action="store_true", help="only print the moves, from home")
     add_geometry(parser)
     add_quiet(parser)
     return parser
 
 
-def _add_arm(parser: argparse.ArgumentParser, *, own: bool = False) -> None:
-    brick = "the brick, such as nxt:/dev/rfcomm0 or nxt:COM5"
-    if own:
-        parser.add_argument("--arm", metavar="ARM", help=f"where the readings come from: {ARMS}")
+def _add_arm(parser: argparse.ArgumentParser, arms: str | None = None) -> None:
+    """Add --arm with its help; by default only a real brick is allowed."""
+    if arms is None:
+        parser.add_argument("--arm", metavar="nxt:PORT", help="the brick, such as nxt:/dev/rfcomm0 or nxt:COM5")
     else:
-        parser.add_argument("--arm", metavar="nxt:PORT", help=brick)
+        parser.add_argument("--arm", metavar="ARM", help=arms)
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report import calibration as report
 
     if arguments.nested_stop is not None and arguments.method != "paper":
-        raise ParameterError("--nested-stop", arguments.nested_stop, "none but with --method paper")
+        raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
     refuse_journal(arguments.recording)
     out = check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:

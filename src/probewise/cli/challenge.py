@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_int,
         default=60,
         metavar="N",
-        help="number of recordings, always the first of the seed; 60 are one of each kind, 6000 the whole table "
+        help="number of recordings, always the first of the seed; 60 give one case of each kind, 6000 the whole table "
         "(default 60)",
     )
     parser.add_argument(

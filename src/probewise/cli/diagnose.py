@@ -44,8 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--thorough",
         action="store_true",
-        help="compute the evidence of the leading hypotheses also by nested sampling, which takes precedence (reports "
-        "its duration)",
+        help="compute the evidence of the leading hypotheses by nested sampling too; it counts where it differs from "
+        "the Laplace approximation by more than a nat (says first how long it may take)",
     )
     add_out_directory(parser)
     add_common(parser)

@@ -43,15 +43,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--geometry",
         type=a_path,
         metavar="ARM.toml",
-        help="the arm's numbers (default: those of the arm that ships)",
+        help="the arm as built: lengths, gears, ports, limits (default: the file that ships)",
     )
     parser.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="NAME[=RATE]",
-        help="fragment, merge, double, corrupt, late, drop, half, error, silence, deaf, unasked, disconnect: how often "
-        "of 1; late=RATE,SECONDS; sag: mV per minute; may be given several times",
+        help="a fault and its probability per telegram, 0 to 1: fragment, merge, double, corrupt, drop, half, error, "
+        "silence, deaf, unasked, disconnect; late=RATE,SECONDS; sag=MV, by which the battery falls per minute; may be "
+        "given several times",
     )
     parser.add_argument("--name", default="NXT", help="the brick's name, up to 14 characters (default NXT)")
     parser.add_argument(
@@ -67,14 +68,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="a symbolic link to keep on the device, also after a disconnection",
     )
-    parser.add_argument("--log", type=a_path, metavar="FILE", help="write every telegram and mishap to a file")
+    parser.add_argument("--log", type=a_path, metavar="FILE", help="write every telegram and fault to a file")
     add_common(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until Ctrl-C, or until the brick goes to sleep."""
     if not hasattr(os, "openpty"):
-        raise LinkError("emulate-nxt needs pseudo-terminals, which this system has not; Linux, macOS and WSL do")
+        raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
 
     from probewise.cli._bench import world_of
     from probewise.emulator import Faults, parse_scene, read_geometry, set_up, shipped_geometry

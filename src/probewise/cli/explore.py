@@ -116,8 +116,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--trust",
         type=float,
         metavar="P",
-        help="probability that the sensor model leaves nothing out; below 1 the robot also infers which effects it "
-        "leaves out (default 0.9; 1 with --model naive, --learn-sensor, --utility or several shapes)",
+        help="prior probability that the sensor model leaves nothing out; below 1 the robot also infers which effects "
+        "it leaves out (default 0.9; 1 with --model naive, --learn-sensor, --utility or several shapes)",
     )
     parser.add_argument(
         "--reference",
@@ -249,7 +249,7 @@ def _numbers(text: str) -> tuple[float, ...]:
     except ValueError:
         values = (math.nan,)
     if not all(map(math.isfinite, values)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no list of numbers such as 0,45,90")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 0,45,90")
     return tuple(dict.fromkeys(values))
 
 

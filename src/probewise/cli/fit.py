@@ -5,10 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, say
+from probewise.cli._common import CommandError, Verb, a_path, add_common, add_out_directory, say
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._simulator import add_simulator, read_tables
-from probewise.errors import ParameterError
 
 __all__ = ["VERB"]
 
@@ -18,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "tables", type=a_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
     )
-    add_simulator(parser)
+    add_simulator(parser, replaces="")
     add_out_directory(parser)
     add_common(parser)
 
@@ -33,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.systems import read_simulator, samples_csv, write_fitted_system
 
     if arguments.simulator is None:
-        raise ParameterError("--simulator", None, "FILE.py, the simulator; a light sensor is fitted by calibrate")
+        raise CommandError("--simulator FILE.py is missing; to fit a light sensor, use probewise calibrate")
     out = check_out_directory(arguments.out)
     simulator = read_simulator(arguments.simulator)
     table, notes = read_tables(simulator, arguments.tables)

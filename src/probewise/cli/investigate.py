@@ -186,7 +186,9 @@ def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
     if chosen.kind == "simulated":
         return plan
     if arguments.no_hands and len(set(plan.pattern.tolist())) > 1:
-        raise ParameterError("--no-hands", True, f"a plan over one pattern; {arguments.plan} has more, laid by hand")
+        raise ParameterError(
+            "--no-hands", True, f"a plan over one pattern; {arguments.plan} has several, which a person must exchange"
+        )
     return read_by_own(plan) if chosen.kind == "file" else read_by_lego(plan, geometry_of(arguments))
 
 

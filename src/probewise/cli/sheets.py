@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, geometry_of
-from probewise.cli._common import Verb, a_path, add_quiet, say
+from probewise.cli._common import CommandError, Verb, a_path, add_quiet, say
 from probewise.cli._output import check_out_file
 from probewise.errors import ParameterError
 
@@ -76,7 +76,7 @@ def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     if what in (FIELD, TARGET):
         field_mm = geometry_of(arguments).field_mm
         if arguments.target is None and what == TARGET:
-            raise ParameterError("--target", None, "a shape, such as circle:524,260,80")
+            raise CommandError("--target is missing: give a shape, such as --target circle:524,260,80")
         outline = None if arguments.target is None else _outline(arguments.target, field_mm)
         if what == FIELD:
             return (field_sheet(field_mm, outline),)

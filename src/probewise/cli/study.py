@@ -42,34 +42,43 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--concealed",
         action="store_true",
-        help="conceal an effect from the robot in every row, three sizes each, and look for the same circles with and "
-        "without doubt about the sensor (writes report.html and concealed.csv; no other row)",
+        help="conceal an effect from the robot in every row, at three sizes, and search for the same circles with and "
+        "without doubt about the sensor (writes report.html and concealed.csv; replaces all other rows)",
     )
     parser.add_argument(
         "--seed", type=int, metavar="S", help="with --concealed: circles, noise and robot of another seed"
     )
-    parser.add_argument("--size", choices=_SIZES, help="with --concealed: one of the three sizes alone")
-    parser.add_argument("--clean", type=positive_int, metavar="N", help="with --concealed: circles of the clean row")
+    parser.add_argument("--size", choices=_SIZES, help="with --concealed: only this one of the three sizes")
+    parser.add_argument(
+        "--clean",
+        type=positive_int,
+        metavar="N",
+        help="with --concealed: circles of the row without a concealed effect",
+    )
     parser.add_argument(
         "--beside-paper",
         action="store_true",
         help="for each sensor model, our method and the paper's (explore --method paper) on the same circles; of the "
-        "factors below --population and --nested-stop may be given",
+        "options of one row, only --population and --nested-stop apply",
     )
     one = parser.add_argument_group("one row instead of the table's", "defaults are those of the reference row")
     one.add_argument("--population", metavar="NAME", help="inside (50 to 150 mm, entirely in the field) or anywhere")
     one.add_argument("--model", metavar="NAME", help="the robot's sensor model: ssf or naive")
     one.add_argument("--utility", metavar="NAME", help="acquisition function: finishing, information, entropy, ...")
     one.add_argument("--noise", type=float, metavar="SD", help="sd of the noise, LEGO units (reference: 1)")
-    one.add_argument("--width", type=float, metavar="F", help="believed width of the SSF over the true one")
-    one.add_argument("--batch", type=positive_int, metavar="N", help="readings that are chosen together")
+    one.add_argument("--width", type=float, metavar="F", help="assumed width of the SSF over the true one")
+    one.add_argument("--batch", type=positive_int, metavar="N", help="number of readings chosen at a time")
     one.add_argument("--learn-sensor", action="store_true", default=None, help="learn the sensor along with the shape")
     one.add_argument("--method", metavar="NAME", help="how the robot infers and chooses: particles or paper")
     one.add_argument(
         "--nested-stop", metavar="NAME", help="when the paper's nested sampling ends: change (of ln Z) or remaining"
     )
     parser.add_argument(
-        "--max-readings", type=positive_int, default=100, metavar="N", help="a run ends here as a miss (default 100)"
+        "--max-readings",
+        type=positive_int,
+        default=100,
+        metavar="N",
+        help="a run that is not done after N readings counts as a miss (default 100)",
     )
     add_executor(parser)
     add_quiet(parser)
@@ -87,12 +96,12 @@ def run(arguments: argparse.Namespace) -> int:
         return _run_concealed(arguments, out)
     for name in ("seed", "size", "clean"):
         if getattr(arguments, name) is not None:
-            raise ParameterError(f"--{name}", getattr(arguments, name), "with --concealed alone")
+            raise ParameterError(f"--{name}", getattr(arguments, name), "only with --concealed")
     rows = _rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)
     numbers[rows[0]] = arguments.quoted or arguments.circles
     if max(numbers.values()) < 2:
-        raise ParameterError("--circles", arguments.circles, "2 or more, so that there is an error to tell")
+        raise ParameterError("--circles", arguments.circles, "2 or more: one circle gives no standard error")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "trials.jsonl"
     kept = partial(campaign_keeps, trials, "run", arguments)
@@ -119,7 +128,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
 
     others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
     if others:
-        raise ParameterError(others[0], "given", "none with --concealed, whose rows are its own")
+        raise ParameterError(others[0], "given", "none with --concealed, which has its own rows")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "concealed.jsonl"
     with campaign_running(trials, "run", arguments) as (executor, progress):
@@ -154,7 +163,7 @@ def _rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
     if arguments.beside_paper:
         others = [f"--{name.replace('_', '-')}" for name in given if name not in ("population", "nested_stop")]
         if others:
-            raise ParameterError(others[0], "given", "none with --beside-paper, whose rows are its own")
+            raise ParameterError(others[0], "given", "none with --beside-paper, which has its own rows")
         return paper_rows(**given)
     if not given:
         return standard_rows()

@@ -52,7 +52,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
         require_one_of("names", name, list(EFFECTS))
         effect = EFFECTS[name].for_extent(extent)
         if effect is None:
-            raise ParameterError("names", name, "effects of the vocabulary that can show in this recording")
+            raise ParameterError("names", name, "effects of the vocabulary that this recording can show")
         effects[name] = effect
     prepared = Prepared(recording, effects, None, LightSensor(), recording)
     found = search(prepared, max_order=MAX_ORDER, depth=max(len(names), 1))
@@ -62,5 +62,5 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     best = found.best(on_mean, noise) or found.best((), noise)
     assert best is not None  # the calibrated sensor is always fitted
     if not np.isfinite(best.evidence[noise].log_z):
-        raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that show in this recording")
+        raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that this recording can show")
     return sample_model(best.found, best.evidence[noise], recording, weights=best.weights, rng=rng)

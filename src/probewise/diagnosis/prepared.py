@@ -94,7 +94,7 @@ def prepare(
 ) -> Prepared:
     """Join recordings, thin out long ones, build the effects; parameters and errors as in `diagnose`."""
     if sensor is not None and null is not None:
-        raise ParameterError("sensor, null", "both", "one of them: a null holds what is known of its sensor")
+        raise ParameterError("sensor, null", "both", "one of them: a null contains the prior of its sensor")
     if sensor is not None:
         require_sensor_prior(sensor)
     everything = join([recordings] if isinstance(recordings, Recording) else recordings)

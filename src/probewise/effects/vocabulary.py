@@ -150,7 +150,7 @@ def require_effects(effects: object) -> None:
     assert isinstance(effects, Mapping)
     for name, kind in effects.items():
         if not isinstance(kind, type) or not hasattr(kind, "for_extent"):
-            raise ParameterError(f"effects[{name!r}]", kind, "a class as NamedEffect, of probewise.effects, has it")
+            raise ParameterError(f"effects[{name!r}]", kind, "a class that follows probewise.effects.NamedEffect")
         lacking = [each for each in _OWN if getattr(kind, each, None) in (None, _inherited(kind, each))]
         if lacking:
             raise ParameterError(

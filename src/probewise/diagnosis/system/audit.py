@@ -88,7 +88,7 @@ def _middle(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, st
                 else "a place of the prior beside its middle, where readings stand still"
             )
             return z, predicted, at
-    raise ParameterError("the table", "one reading in all rows", "rows over which what the simulator predicts changes")
+    raise ParameterError("the table", "one reading in all rows", "rows over which the predicted reading changes")
 
 
 def _noise(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tuple[float, str]:

@@ -66,7 +66,7 @@ def test_an_effect():
     poses = Poses(*(np.zeros((1, len(plan))) for _ in range(3)))
     moved = creep.apply(poses, np.array([[0.8]]), plan)
     np.testing.assert_allclose(moved.x_mm[0], 0.8 * plan.time_s / 3600)
-    assert creep.sentence(np.array([0.8]), np.array([0.1])) == "the arm creeps by 0.80 ± 0.10 mm an hour along X"
+    assert creep.sentence(np.array([0.8]), np.array([0.1])) == "the arm creeps by 0.80 ± 0.10 mm per hour along X"
 
 
 def test_a_form():

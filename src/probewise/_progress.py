@@ -45,7 +45,7 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
     if quiet or not (looked_at or lines):
         yield silent
         return
-    shown = _Bars() if looked_at else _Lines()
+    shown = _Bars() if looked_at else _TextProgress()
     stopped = threading.Event()
 
     def keep_beating() -> None:
@@ -155,7 +155,7 @@ class _Bars:
         self._bar = self._now = None
 
 
-class _Lines:
+class _TextProgress:
     """A line of text after two seconds, after five more, and then at growing intervals."""
 
     def __init__(self) -> None:

@@ -84,7 +84,7 @@ def run_campaign(
             raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
         done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
         left = {key: task for key, task in tasks.items() if key not in done}
-        with _Lines(path, wanted, fresh=before is None) as lines, _ended(work, left, executor) as ended:
+        with _ResultLog(path, wanted, fresh=before is None) as lines, _ended(work, left, executor) as ended:
             progress(noun, len(done), len(tasks))
             for key, result in ended:
                 line = json.loads(lines.add(key, result))  # as a later reader will see it
@@ -124,7 +124,7 @@ def _parsed(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str,
     return row
 
 
-class _Lines:
+class _ResultLog:
     """Append lines, each synced to disk before the next; an incomplete last line is cut off first."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, fresh: bool) -> None:

@@ -13,7 +13,7 @@ from probewise.calibration import FittedSensor, predict
 from probewise.errors import DoubtfulResultWarning, ShapeError
 from probewise.recordings import Disc, Instrumentation, Plan, Recording, paper_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FieldSSF, FixedLevels, FreeLevels, FreeMixture
+from probewise.sensor import Chain, DiscreteSSF, FixedLevels, FreeLevels, FreeMixture
 
 
 def _chain(plan: Plan) -> Chain:
@@ -114,7 +114,7 @@ def test_effects_of_single_scans_do_not_carry_over(make_sensor: Callable[..., Fi
 def test_the_mean_field_and_the_parameters_predict_alike(sensor: FittedSensor) -> None:
     """Discrete route by the mean field against closed forms by the samples: 1e-3 of the span."""
     for plan in (paper_plan(), _disc_plan()):
-        discrete = Chain(FieldSSF(sensor.field), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
+        discrete = Chain(DiscreteSSF(sensor.field), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
         by_field = discrete.predict(np.empty((1, 0)), plan)[0]
         by_samples = _chain(plan).predict(sensor.samples * [1, 1, 1, 1, 1, 1, 0, 0] + [0, 0, 0, 0, 0, 0, 0, 1], plan)
         assert np.abs(by_field - by_samples.mean(axis=0)).max() < 1e-3

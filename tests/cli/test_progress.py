@@ -34,7 +34,7 @@ def clock(monkeypatch):
 
 
 def test_lines_begin_after_two_seconds_and_come_every_five(clock, capsys):
-    lines = _progress._Lines()
+    lines = _progress._TextProgress()
     for _ in range(13):
         lines("refitting effects", int(clock[0]) - 100, 20)
         clock[0] += 1.0
@@ -47,7 +47,7 @@ def test_lines_begin_after_two_seconds_and_come_every_five(clock, capsys):
 
 
 def test_hours_of_work_are_told_of_more_seldom(clock, capsys):
-    lines = _progress._Lines()
+    lines = _progress._TextProgress()
     for _ in range(3600):
         lines("runs", note="a key")
         clock[0] += 1.0

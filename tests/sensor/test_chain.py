@@ -19,7 +19,7 @@ from probewise.sensor import (
     ACCURATE_NODES,
     FAST_NODES,
     Chain,
-    FieldSSF,
+    DiscreteSSF,
     FixedLevels,
     FixedMixture,
     FreeLevels,
@@ -39,6 +39,7 @@ PATTERNS = {
     "disc": kinds.Disc((3.0, 1.0), 8.0),
 }
 ONE = np.array([1.0, 0.5, 1.5, 0.02, 0.01, 0.005])
+U_MM = np.arange(-30, 31, 2.0)
 TWO = np.concatenate([ONE, [0.6, -2.0, 3.0, 0.03, 0.05, -0.01]])
 
 
@@ -72,7 +73,7 @@ CHAINS = {
     ),
     "field": (
         Chain(
-            FieldSSF(field_of(footprint_of(TWO[None], 2), u_mm=np.arange(-30, 31, 2.0), v_mm=np.arange(-30, 31, 2.0))),
+            DiscreteSSF(field_of(footprint_of(TWO[None], 2), u_mm=U_MM, v_mm=U_MM)),
             FixedLevels(10, 50),
             HypothesisScene(Circle()),
         ),
@@ -175,7 +176,7 @@ def test_turning_scene_and_sensor_together_changes_nothing(turn, seed):
 def test_the_field_route_agrees_with_the_closed_forms():
     """1 mm pixels, 1e-3 of the span of 40."""
     u = np.arange(-40.0, 41.0)
-    field = FieldSSF(field_of(footprint_of(TWO[None], 2), u_mm=u, v_mm=u))
+    field = DiscreteSSF(field_of(footprint_of(TWO[None], 2), u_mm=u, v_mm=u))
     plan = plan_of(20)
     scene, levels = KnownScene(PATTERNS), FixedLevels(10, 50)
     closed = Chain(FixedMixture.from_parameters(TWO), levels, scene).predict(np.zeros((1, 0)), plan)
@@ -361,7 +362,7 @@ def test_effects_that_cannot_be_are_refused():
     base = CHAINS["one_free"][0]
     with pytest.raises(ParameterError, match="each name once"):
         base.with_effects(GAIN, GAIN)
-    with pytest.raises(ParameterError, match="none at the footprint with a FieldSSF"):
+    with pytest.raises(ParameterError, match="none at the footprint with a DiscreteSSF"):
         CHAINS["field"][0].with_effects(SPREAD)
 
 

@@ -12,7 +12,7 @@ from probewise.sensor import (
     N_BENDS,
     N_FREE_FORM,
     Chain,
-    FieldSSF,
+    DiscreteSSF,
     FreeLevels,
     FreeMixture,
     bends_of,
@@ -78,7 +78,7 @@ def test_a_bent_form_sees_what_the_sum_over_its_pixels_sees():
     bent = free_form(ONE, BENDS[:1])
     grid = np.arange(-25.0, 25.01, 0.25)
     field = field_of(footprint_of(bent, N_FREE_FORM), u_mm=grid, v_mm=grid)
-    chain = Chain(FieldSSF(field), FreeLevels(), KnownScene(PLAN.patterns))
+    chain = Chain(DiscreteSSF(field), FreeLevels(), KnownScene(PLAN.patterns))
     by_pixels = chain.predict(np.array([[10.0, 60.0]]), PLAN)
     np.testing.assert_allclose(predicted(bent), by_pixels, atol=0.02)
 

@@ -8,7 +8,7 @@ from scipy.integrate import dblquad
 
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor import (
-    FieldSSF,
+    DiscreteSSF,
     FixedMixture,
     FreeMixture,
     SSFField,
@@ -155,9 +155,9 @@ def test_sampled_mixtures_are_summarised_by_the_law_of_total_covariance():
 
 def test_a_known_ssf_has_no_parameters():
     field = field_of(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
-    assert FieldSSF(field).names == ()
+    assert DiscreteSSF(field).names == ()
     assert FixedMixture.from_parameters(TWO[0]).names == ()
-    assert FieldSSF(field).footprint(np.zeros((1, 0))).weight.shape == (1, 1, 1)
+    assert DiscreteSSF(field).footprint(np.zeros((1, 0))).weight.shape == (1, 1, 1)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from probewise.sensor.discrete import seen_discrete
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, seen
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
-    FieldSSF,
+    DiscreteSSF,
     FixedMixture,
     FreeMixture,
     SSFField,
@@ -43,8 +43,8 @@ __all__ = [
     "N_FREE_FORM",
     "AnyEffect",
     "Chain",
+    "DiscreteSSF",
     "Effect",
-    "FieldSSF",
     "FixedLevels",
     "FixedMixture",
     "Footprint",
@@ -74,3 +74,6 @@ __all__ = [
     "seen_discrete",
     "total_variation",
 ]
+
+FieldSSF = DiscreteSSF
+"""The old name of `DiscreteSSF`."""

@@ -19,7 +19,7 @@ from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegi
 from probewise.sensor.commanded import height_ratio, is_commanded, led_state, raised_as_commanded
 from probewise.sensor.discrete import seen_discrete
 from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, seen_by_one, turned
-from probewise.sensor.ssf import FieldSSF, FreeMixture, SSFModel
+from probewise.sensor.ssf import DiscreteSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
     Footprint,
@@ -134,9 +134,9 @@ class Chain:
         require_like("ssf", self.ssf, ("names", "footprint"), f"an SSF such as FreeMixture(1) or FixedMixture, {order}")
         require_levels(self.levels, order)
         require_scene(self.scene, order)
-        if isinstance(self.ssf, FieldSSF) and any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
+        if isinstance(self.ssf, DiscreteSSF) and any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
             names = [effect.name for effect in self.effects if effect.stage == Stage.FOOTPRINT]
-            raise ParameterError("effects", names, "none at the footprint with a FieldSSF; use mixture_of_field")
+            raise ParameterError("effects", names, "none at the footprint with a DiscreteSSF; use mixture_of_field")
         labels = [effect.name for effect in self.effects]
         if len(set(labels)) < len(labels):
             raise ParameterError("effects", labels, "each name once")
@@ -221,9 +221,9 @@ class Chain:
         """Compute the view of the scene: the stages of `predict` before SEEN."""
         require_columns(theta, self.names)
         layout = self._layout_of(theta, plan)
-        if isinstance(self.ssf, FieldSSF):
+        if isinstance(self.ssf, DiscreteSSF):
             if height_ratio(plan) is not None:
-                raise ParameterError("plan", "a commanded height_mm", "none with a FieldSSF; use mixture_of_field")
+                raise ParameterError("plan", "a commanded height_mm", "none with a DiscreteSSF; use mixture_of_field")
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
         plain = raised_as_commanded(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._applier(theta, plan)(Stage.FOOTPRINT, plain)
@@ -448,7 +448,7 @@ class _Geometries:
         return np.stack([own @ parts[at] for own, at in zip(weight, self.which, strict=True)])
 
 
-def _discrete_response(layout: Layout, ssf: FieldSSF) -> FloatArray:
+def _discrete_response(layout: Layout, ssf: DiscreteSSF) -> FloatArray:
     poses, found = layout.poses, []
     for rows, region in layout.parts:
         there = Poses(*(columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))

@@ -16,7 +16,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.sensor.stages import Footprint
 
 __all__ = [
-    "FieldSSF",
+    "DiscreteSSF",
     "FixedMixture",
     "FreeMixture",
     "SSFField",
@@ -172,7 +172,7 @@ class FixedMixture:
 
 @dataclass(frozen=True, eq=False)
 class SSFField(ShowsItself):
-    """A discrete SSF on square pixels (paper, the discrete SSF matrix).
+    """A field of SSF values on square pixels (paper, the discrete SSF matrix).
 
     `values` (n_y, n_x) are the pixels' shares, of either sign, normalised to sum one on construction;
     row 0 is the lowest v', column 0 the lowest u'. `origin_mm` is the centre (u', v') of pixel
@@ -223,8 +223,8 @@ class SSFField(ShowsItself):
 
 
 @dataclass(frozen=True)
-class FieldSSF:
-    """A discrete SSF for the chain: the response is the paper's sum over its pixels."""
+class DiscreteSSF:
+    """The SSF of a chain given as a field of pixels: the response is the paper's sum over them."""
 
     field: SSFField
 

@@ -5,7 +5,7 @@ import pytest
 
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.forms.scene import Scene
-from probewise.world.systems.kind import Kind, Law, Prior
+from probewise.world.systems.kind import Law, Prior, SystemKind
 from probewise.world.systems.rows import SystemRows
 from probewise.world.systems.vocabulary import forms_of
 
@@ -13,7 +13,7 @@ T = np.array([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0])
 
 
 def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
-    kind = Kind(
+    kind = SystemKind(
         name="by hand",
         reading="x",
         unit="m",

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.fields import batch, require_positive
+from probewise.scene.regions.checks import batch, require_positive
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 __all__ = ["EllipseRegion", "disc_region"]

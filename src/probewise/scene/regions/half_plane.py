@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.fields import batch
+from probewise.scene.regions.checks import batch
 from probewise.scene.regions.geometry import edge_distance
 
 __all__ = ["HalfPlaneRegion"]

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.scene._pixels import share_in_edges
-from probewise.scene.regions.fields import batch
+from probewise.scene.regions.checks import batch
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 __all__ = ["PolygonRegion"]

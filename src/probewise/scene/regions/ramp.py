@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.scene.regions.fields import batch
+from probewise.scene.regions.checks import batch
 
 __all__ = ["RampRegion"]
 

@@ -11,7 +11,7 @@ from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
 from probewise.world.challenge.regions import Region
 from probewise.world.challenge.sensors import NOISE_LEVELS, NOISE_MODELS, NOISE_NAMES, SSFS, draw_sensor, with_noise
 from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
-from probewise.world.challenge.strata import WHEEL, Kind, Stratum, stratum_of
+from probewise.world.challenge.strata import WHEEL, CaseKind, Stratum, stratum_of
 from probewise.world.challenge.truth import Alias, Hidden, Truth
 
 __all__ = [
@@ -29,9 +29,9 @@ __all__ = [
     "WHEEL",
     "Alias",
     "Case",
+    "CaseKind",
     "EffectSizer",
     "Hidden",
-    "Kind",
     "NormAfterRefit",
     "Region",
     "Stratum",
@@ -45,3 +45,6 @@ __all__ = [
     "stratum_of",
     "with_noise",
 ]
+
+Kind = CaseKind
+"""The old name of `CaseKind`."""

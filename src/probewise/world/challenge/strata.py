@@ -5,16 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-__all__ = ["WHEEL", "Kind", "Stratum", "stratum_of"]
+__all__ = ["WHEEL", "CaseKind", "Stratum", "stratum_of"]
 
-Kind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_order"]
+CaseKind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_order"]
+"""What a case conceals: nothing, one effect, two, one out of vocabulary, an aliased one, or one more Gaussian."""
 
 
 @dataclass(frozen=True)
 class Stratum:
     """A kind of case, its size lambda (0 for clean), and whether its noise is of another kind than white."""
 
-    kind: Kind
+    kind: CaseKind
     size: float = 0.0
     other_noise: bool = False
 

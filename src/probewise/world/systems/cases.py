@@ -20,7 +20,7 @@ from probewise.world.systems.forms.form import Form, Placed
 from probewise.world.systems.forms.scene import Scene
 from probewise.world.systems.forms.strange import STRANGE, strangers
 from probewise.world.systems.formulas import FORMULAS
-from probewise.world.systems.kind import Kind
+from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
 from probewise.world.systems.laying import lay_out
 from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of
@@ -32,7 +32,7 @@ from probewise.world.systems.vocabulary import FAMILIES, forms_of
 
 __all__ = ["KINDS", "Drawn", "SystemCase", "SystemEffect", "draw_system", "draw_system_case"]
 
-KINDS: tuple[Kind, ...] = (*FORMULAS, *LAWS)
+KINDS: tuple[SystemKind, ...] = (*FORMULAS, *LAWS)
 """Every kind of system."""
 
 _ATTEMPTS = 16
@@ -53,7 +53,7 @@ class Drawn:
         True parameters; those per run have shape (n_runs,).
     """
 
-    kind: Kind
+    kind: SystemKind
     rows: SystemRows
     shared: Mapping[str, float]
     by_run: Mapping[str, FloatArray]
@@ -186,7 +186,7 @@ class SystemCase:
     cosine: float | None = None
 
 
-def draw_system(kind: Kind, *, rng: np.random.Generator) -> Drawn:
+def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> Drawn:
     """Draw rows and true parameters of a kind."""
     rows = lay_out(kind, rng=rng)
     each = [kind.draw_run(rng) for _ in range(rows.n_runs)]

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Now, Placed
-from probewise.world.systems.kind import Kind
+from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.motion import travel
 from probewise.world.systems.rows import SystemRows
 
@@ -25,7 +25,7 @@ class Trace:
 
 
 def simulate(
-    kind: Kind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()
+    kind: SystemKind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()
 ) -> Trace:
     """Simulate a system.
 

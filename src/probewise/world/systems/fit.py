@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.forms.form import Form, Numbers, Placed
-from probewise.world.systems.kind import Kind
+from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
 __all__ = ["Beside", "Fitted", "Model", "free_numbers", "left_over", "numbers_of"]
@@ -55,7 +55,7 @@ class Model:
     in units of their steps.
     """
 
-    kind: Kind
+    kind: SystemKind
     rows: SystemRows
     beside: Sequence[Beside] = field(default=())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.kind import Columns, Kind, Logged, Prior
+from probewise.world.systems.kind import Columns, Logged, Prior, SystemKind
 from probewise.world.systems.laying import blocks, irregular, there_and_back
 
 __all__ = ["FORMULAS"]
@@ -18,7 +18,7 @@ def _lay_bath(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return t, {"bath_c": rng.uniform(35, 55) * regime + 0.2 * np.sin(t / rng.uniform(9, 20))}
 
 
-BATH = Kind(
+BATH = SystemKind(
     name="thermometer in a bath",
     reading="probe_c",
     unit="degC",
@@ -62,7 +62,7 @@ def _lay_cup(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return t, {"room_c": rng.uniform(18, 24) * (1.25 if regime > 1 else 1.0) + 0.5 * np.sin(t / rng.uniform(10, 25))}
 
 
-CUP = Kind(
+CUP = SystemKind(
     name="cooling cup",
     reading="tea_c",
     unit="degC",
@@ -104,7 +104,7 @@ def _lay_photodiode(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Column
     return irregular(rng, n, 1.0), {"dist_mm": there_and_back(rng, n, 20.0, far)}
 
 
-PHOTODIODE = Kind(
+PHOTODIODE = SystemKind(
     name="photodiode against distance",
     reading="diode_mv",
     unit="mV",
@@ -148,7 +148,7 @@ def _lay_flow(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     }
 
 
-FLOW = Kind(
+FLOW = SystemKind(
     name="orifice flow meter",
     reading="drop_kpa",
     unit="kPa",
@@ -184,7 +184,7 @@ def _lay_lens(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular(rng, n, 9.0), {"nm": there_and_back(rng, n, low, high)}
 
 
-LENS = Kind(
+LENS = SystemKind(
     name="dispersion of a lens",
     reading="focus_mm",
     unit="mm",
@@ -222,7 +222,7 @@ def _lay_ph(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return t, {"buffer_ph": blocks(rng, n, levels, 5) + 0.02 * rng.standard_normal(n), "probe_c": warm}
 
 
-PH = Kind(
+PH = SystemKind(
     name="pH probe",
     reading="cell_mv",
     unit="mV",

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 
 from probewise._arrays import FloatArray
 
-__all__ = ["Columns", "Formula", "Kind", "Law", "Logged", "Prior", "Values"]
+__all__ = ["Columns", "Formula", "Law", "Logged", "Prior", "SystemKind", "Values"]
 
 Values: TypeAlias = Mapping[str, Any]
 """Parameters, states or columns by name: arrays that broadcast."""
@@ -92,7 +92,7 @@ class Logged:
 
 
 @dataclass(frozen=True, eq=False)
-class Kind:
+class SystemKind:
     """A kind of system.
 
     Parameters

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.kind import Columns, Kind, Law, Logged, Prior
+from probewise.world.systems.kind import Columns, Law, Logged, Prior, SystemKind
 from probewise.world.systems.laying import blocks, irregular, swings
 
 __all__ = ["LAWS"]
@@ -17,7 +17,7 @@ def _lay_tank(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular(rng, n, 5.0), {"valve_v": blocks(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)}
 
 
-TANK = Kind(
+TANK = SystemKind(
     name="tank",
     reading="level_cm",
     unit="cm",
@@ -70,7 +70,7 @@ def _lay_filter(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular(rng, n, 0.002), {"in_v": blocks(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)}
 
 
-FILTER = Kind(
+FILTER = SystemKind(
     name="RC filter of two stages",
     reading="out_v",
     unit="V",
@@ -123,7 +123,7 @@ def _lay_oscillator(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Column
     return t, {"force_n": swings(rng, t, 0.8 * regime, 2.5)}
 
 
-OSCILLATOR = Kind(
+OSCILLATOR = SystemKind(
     name="mass on a spring",
     reading="x_mm",
     unit="mm",
@@ -166,7 +166,7 @@ def _lay_servo(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular(rng, n, 0.03), {"volts": blocks(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)}
 
 
-SERVO = Kind(
+SERVO = SystemKind(
     name="DC motor",
     reading="angle_deg",
     unit="deg",
@@ -206,7 +206,7 @@ def _lay_reactor(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular(rng, n, 9.0 * (1.4 if regime > 1 else 1.0)), {}
 
 
-REACTOR = Kind(
+REACTOR = SystemKind(
     name="two reactions in a row",
     reading="absorbance",
     unit="AU",
@@ -258,7 +258,7 @@ def _lay_predator(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]
     return irregular(rng, n, 0.5), {"feed": blocks(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)}
 
 
-PREDATOR = Kind(
+PREDATOR = SystemKind(
     name="predator and prey",
     reading="prey_per_ml",
     unit="1/ml",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.kind import Columns, Kind
+from probewise.world.systems.kind import Columns, SystemKind
 from probewise.world.systems.rows import SystemRows
 
 __all__ = ["blocks", "irregular", "lay_out", "swings", "there_and_back"]
@@ -41,7 +41,7 @@ def there_and_back(rng: np.random.Generator, n: int, low: float, high: float) ->
     return np.asarray(low + (high - low) * np.concatenate([first, second]))
 
 
-def lay_out(kind: Kind, *, rng: np.random.Generator) -> SystemRows:
+def lay_out(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
     """Design all runs of a case; the last two are held out, the last one in a new regime."""
     n_runs = kind.n_runs + 2
     each = int(np.clip(rng.integers(150, 420) // kind.n_runs, 24, 120))
@@ -66,7 +66,7 @@ def lay_out(kind: Kind, *, rng: np.random.Generator) -> SystemRows:
     return SystemRows(joined, np.concatenate(run).astype(np.int64), kind.time, n_runs)
 
 
-def _logged(kind: Kind, n: int, k: int, regime: float, rng: np.random.Generator) -> Columns:
+def _logged(kind: SystemKind, n: int, k: int, regime: float, rng: np.random.Generator) -> Columns:
     out = {}
     for column in kind.logged:
         walk = np.cumsum(rng.standard_normal(n)) / np.sqrt(n) + rng.standard_normal()

@@ -18,7 +18,7 @@ from scipy.integrate import solve_ivp
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.forms.form import Form, Now, Placed
-from probewise.world.systems.kind import Kind
+from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
 __all__ = ["travel"]
@@ -32,7 +32,7 @@ _CLOSE = 1e-7  # share of a gap: closer events are merged
 
 
 def travel(
-    kind: Kind,
+    kind: SystemKind,
     rows: SystemRows,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, FloatArray],
@@ -58,7 +58,7 @@ def travel(
 
 @dataclass(frozen=True, eq=False)
 class _Trip:
-    kind: Kind
+    kind: SystemKind
     rows: SystemRows
     parameters: Mapping[str, FloatArray]
     columns: Mapping[str, FloatArray]

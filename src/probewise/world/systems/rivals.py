@@ -39,7 +39,7 @@ def _is_hard(form: Form) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class _Candidate:
+class _StartOfFit:
     form: Form
     start: dict[str, float]
     nats: float
@@ -96,7 +96,7 @@ def rivals_of(
     return dict(sorted(close.items(), key=lambda item: item[1]))
 
 
-def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model) -> list[_Candidate]:
+def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model) -> list[_StartOfFit]:
     """Return the best candidates by linearisation, with each form's best two starts."""
     size = float(left @ left)
     out = []
@@ -115,7 +115,7 @@ def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fit
             rest = left - columns @ amounts
             nats = 0.5 * float(rest @ rest)
             if nats < _NEAR or 1 - 2 * nats / size > _COSINE**2:
-                own.append(_Candidate(form, form.join(group, np.asarray(amounts, dtype=np.float64)), nats))
+                own.append(_StartOfFit(form, form.join(group, np.asarray(amounts, dtype=np.float64)), nats))
         out += sorted(own, key=lambda c: c.nats)[:2]
     return sorted(out, key=lambda c: c.nats)[:_MOST_FITS]
 

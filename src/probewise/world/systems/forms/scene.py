@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.world.systems.kind import Kind
+from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
 __all__ = ["Scene", "log_uniform"]
@@ -30,7 +30,7 @@ class Scene:
         Noise-free and without any effect, (n_points,).
     """
 
-    kind: Kind
+    kind: SystemKind
     rows: SystemRows
     parameters: Mapping[str, FloatArray]
     readings: FloatArray

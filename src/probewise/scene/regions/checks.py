@@ -1,4 +1,4 @@
-"""Checks of the fields of a batch of regions."""
+"""Checks of the arrays that describe a batch of regions."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["batch", "require_positive"]
 
 
 def batch(region: object, **shapes: tuple[int, ...]) -> None:
-    """Broadcast the named fields to (n_regions, *shape), check that they are finite, and freeze them."""
+    """Broadcast the named arrays of a region to (n_regions, *shape), check that they are finite, and freeze them."""
     arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
     lengths = set()
     for name, shape in shapes.items():
@@ -24,7 +24,7 @@ def batch(region: object, **shapes: tuple[int, ...]) -> None:
     n_regions = max(lengths, default=1)
     for name, array in arrays.items():
         if len(array) not in (1, n_regions):
-            raise ShapeError(f"{name} has {len(array)} rows; allowed: {n_regions}, as the other fields, or 1")
+            raise ShapeError(f"{name} has {len(array)} rows; allowed: {n_regions}, as the other arrays, or 1")
         require_finite(name, array)
         object.__setattr__(region, name, frozen(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
 

@@ -58,7 +58,7 @@ def write_page(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     run = (
         ("readings", f"{int(fit.recording.usable.sum())} used of {len(fit.recording)}, from {own.source}"),
         ("simulator", own.simulator.source or "given in Python"),
-        ("noise of a new reading", f"{np.median(own.noise_sd):.4g} {unit_name(own.simulator.unit)}"),
+        ("noise sd of a reading", f"{np.median(own.noise_sd):.4g} {unit_name(own.simulator.unit)}"),
         ("log evidence", f"{number(evidence.log_z, 2)}{error} nats by {evidence.method}{how}"),
         ("seed", str(seed)),
     )

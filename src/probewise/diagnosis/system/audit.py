@@ -1,4 +1,4 @@
-"""Audit a table before any reading: which effects it could not show, or not tell apart, for a person's simulator."""
+"""Audit a table before any reading: which effects it cannot detect or tell apart, for a user's simulator."""
 
 from __future__ import annotations
 
@@ -21,29 +21,29 @@ from probewise.systems.forms import About, driving_columns, forms_of
 
 __all__ = ["audit_system"]
 
-_STANDS_STILL = 0.02  # noise sds that predictions may move by when the step of the integration is halved
-_NOISE = 0.01  # of the span of the readings, where the noise was not declared
+_STANDS_STILL = 0.02  # noise sds by which predictions may change when the integration step is halved
+_NOISE = 0.01  # of the range of the readings, if no noise is declared
 _SETTINGS = 64  # of an effect's bank
-_MOST_ROWS = 1200  # that are looked at; of a longer table every second, every third, ...
+_MOST_ROWS = 1200  # rows used; of a longer table every second, third, ...
 
 
 def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> PlanAudit:
-    """Say of each effect whether a table could show it and tell it from the others, at the middle of the prior.
+    """Determine for each effect whether a table can detect it and tell it from the others.
 
-    Where the readings there do not change at all, as those of a pendulum at rest, another place of the prior is taken,
-    and `assumed` says so. The column of the readings plays no part.
+    The simulator is evaluated at the middle of its prior. If the readings there are constant, as those of a pendulum at
+    rest, another point of the prior is taken, and `assumed` says so. The column of readings is not used.
 
     Parameters
     ----------
     simulator
         The simulator.
     table
-        The rows, with the columns that it reads: a table, a dict of arrays, or a DataFrame.
+        Its input columns, row by row: a table, a dict of arrays, or a DataFrame.
 
     Raises
     ------
     ParameterError
-        If the simulator and the table do not fit together, or the readings change nowhere in the prior.
+        If the table lacks a column that the simulator reads, or the readings are constant everywhere in the prior.
     """
     table = table_for(simulator, table)
     own = cast(RunTable, as_recording(simulator, _without_readings(simulator, table)).plan)
@@ -78,14 +78,14 @@ def _without_readings(simulator: Simulator, table: RunTable) -> RunTable:
 
 
 def _middle(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
-    """Take the middle of the prior, or the first place of it at which readings change, and what they are there."""
+    """Return a point of the prior at which readings vary, its middle if possible; the readings there; its name."""
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
         if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-9 * max(float(np.abs(predicted).max()), 1e-300):
             at = (
                 "the middle of the prior"
                 if k == 0
-                else "a place of the prior beside its middle, where readings stand still"
+                else "a point of the prior other than its middle, where readings are constant"
             )
             return z, predicted, at
     raise ParameterError("the table", "one reading in all rows", "rows over which the predicted reading changes")
@@ -99,14 +99,14 @@ def _noise(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tupl
             return float(np.nanmedian(values)), f"the median of {declared}"
     elif declared is not None:
         return float(declared), "as declared"
-    return _NOISE * float(np.ptp(predicted)), "a hundredth of the span of the readings, for none was declared"
+    return _NOISE * float(np.ptp(predicted)), "a hundredth of the range of the readings, since none is declared"
 
 
 def _reasons(about: About) -> dict[str, str]:
-    """Say of every effect on such a simulator why it could not be bound, were it not."""
+    """Return, for every effect of the vocabulary, the reason to give if it cannot act in this table."""
     own, table = about.system.simulator, about.table
-    nothing = "it changes nothing here"
-    timeless = "no time was recorded" if not table.has_time else "it changes nothing here"
+    nothing = "it leaves no trace here"
+    timeless = "no time was recorded" if not table.has_time else nothing
     too_few = nothing if about.tells_runs_apart else "runs have too few rows"
     one_run = "there is one run" if len(table.scan_names) == 1 else too_few
     out = {"offset_drift": timeless, "gain_drift": timeless, "offset_step": nothing, "gain_step": nothing}
@@ -132,14 +132,14 @@ def _reasons(about: About) -> dict[str, str]:
 
 
 def _with_rows(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
-    """Count rows like these at which lambda 8 is left of an effect that changes readings by one noise sd rms."""
+    """Add the number of rows like these that give lambda 8 to an effect of one noise sd rms."""
     if effect.detectability == "invisible":
         return replace(effect, reason=effect.reason if effect.share > 0 else reasons.get(effect.name, effect.reason))
     return replace(effect, rows=math.ceil((LAMBDA / effect.share) ** 2))
 
 
 def _classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:
-    """Join effects that are taken for each other, directly or by way of others."""
+    """Group aliased effects, directly or through others in the class."""
     group = {effect.name: {effect.name} for effect in effects}
     for effect in effects:
         for name, _ in effect.alike:

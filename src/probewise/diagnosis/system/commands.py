@@ -1,4 +1,4 @@
-"""What a person could record next: a run again, backwards, slower, or with what they can set moved in another way."""
+"""Runs to record next: a run repeated, reversed, slower, or with its controls moved otherwise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from probewise.systems.joining import behind, unused_name
 __all__ = ["RunCommand", "in_turn", "one_after_another", "run_commands"]
 
 _LEAST_ROWS = 4
-_MOST_RUNS = 4  # recorded runs that candidates start from
+_MOST_RUNS = 4  # recorded runs to start from
 _MINUTES = {"ms": 1 / 60_000, "s": 1 / 60, "min": 1.0, "h": 60.0, "hour": 60.0, "day": 1440.0, "d": 1440.0}
 _A_READING = 1 / 60  # minutes, where no time tells how long one takes
 _BREAK = 0.5  # minutes, before a run
@@ -27,7 +27,7 @@ _RUN = "run"
 
 @dataclass(frozen=True, eq=False)
 class RunCommand:
-    """One run that could be recorded: how its rows are made, in words, its rows, how long they take."""
+    """One run that could be recorded: its kind, a description, its rows, and its duration."""
 
     kind: str
     description: str
@@ -41,16 +41,16 @@ class RunCommand:
 
 
 def run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[RunCommand]:
-    """List runs that a person could record: every recorded run again, and with its controls moved otherwise.
+    """List runs that could be recorded: every recorded run again, and with its controls moved otherwise.
 
     Parameters
     ----------
     table
-        What was recorded.
+        The recorded rows.
     reading
-        The column that is predicted: empty in what is yet to be taken.
+        The predicted column, which is empty in rows yet to be taken.
     controls
-        Columns that can be set; without any, runs are taken again as they were.
+        Columns that can be set; without any, runs can only be repeated.
     time_unit
         Unit of time.
     """
@@ -108,7 +108,7 @@ def _run(
     like: str,
     slower: float,
 ) -> RunTable:
-    """Take rows as a new run, with what is set, and no readings yet."""
+    """Return rows as a new run, with its controls set and without readings."""
     taken = table.take(rows)
     changed: dict[str, Any] = {**columns}
     if reading in table.columns:
@@ -123,7 +123,7 @@ def _run(
 
 
 def _begin(table: RunTable) -> float:
-    """Say when a run after a table begins: as long after it as runs lie apart, ten rows where there is one run."""
+    """Return the start of a run after a table: after the usual gap between runs, or ten rows if there is one run."""
     by_run = [table.time_s[rows] for rows in table.rows_by_scan()]
     between = [later[0] - earlier[-1] for earlier, later in itertools.pairwise(by_run)]
     gaps = np.concatenate([np.diff(time) for time in by_run])
@@ -133,13 +133,13 @@ def _begin(table: RunTable) -> float:
 
 
 def one_after_another(commands: Sequence[RunCommand], after: Plan) -> Plan:
-    """Set runs behind each other, each as if it came next: to predict all of them at once."""
+    """Concatenate runs, each as if it came next, for one joint prediction."""
     first, *more = (command.table for command in commands)
     return cast(Plan, behind(first, more))
 
 
 def in_turn(commands: Sequence[RunCommand], after: Plan) -> Plan:
-    """Take runs one after the other: where time goes on from run to run, each begins later than the one before."""
+    """Concatenate runs in turn: unless time restarts with each run, each begins after the one before."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []
     for command in commands:
@@ -152,7 +152,7 @@ def in_turn(commands: Sequence[RunCommand], after: Plan) -> Plan:
 
 
 def _distinct(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
-    """Row numbers of the first runs that differ in what was set, or in how many rows they have."""
+    """Return the row numbers of the first runs that differ in their controls."""
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in table.rows_by_scan():
         if len(rows) >= _LEAST_ROWS:

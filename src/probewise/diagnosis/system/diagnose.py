@@ -1,4 +1,4 @@
-"""Diagnose a person's simulator against their table: fit it, bind the forms about the fit, go the engine's road."""
+"""Diagnose a user's simulator against a table: fit it, scale the effects to the fit, run the diagnosis engine."""
 
 from __future__ import annotations
 
@@ -42,29 +42,29 @@ def diagnose_system(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Diagnosis:
-    """Tell what physics a simulator leaves out of a table of readings.
+    """Diagnose which physics a simulator leaves out, from a table of readings.
 
     Parameters
     ----------
     simulator
-        What predicts the readings.
+        The model that predicts the readings.
     table
-        What was recorded, with the column that is predicted: a table, a dict of arrays, or a DataFrame.
+        The recorded rows, with the predicted column: a table, a dict of arrays, or a DataFrame.
     source, notes
-        What the table is called, and what is to be noted of it.
+        Name of the table, and notes on it for the report.
     thorough
-        Weighs what leads a second time: `weigh_thoroughly`, by nested sampling.
+        Computes the evidence of the leading hypotheses a second time: `weigh_thoroughly`, by nested sampling.
     rng
         Source of randomness.
     progress
-        Told what is being done, and how often `simulate` has been called.
+        Called with each stage, and with the number of calls of `simulate`.
 
     Raises
     ------
     ParameterError
-        If the simulator and the table do not fit together.
+        If the table lacks a column that the simulator names.
     NotConvergedError
-        If the fit of the simulator did not arrive anywhere.
+        If the fit of the simulator did not converge.
     """
     table = table_for(simulator, table)
     require_rng(rng)
@@ -83,7 +83,7 @@ def prepare_system(
     progress: Progress = silent,
     bound: bool = True,
 ) -> Prepared:
-    """Fit the simulator, and bind the forms about the fit; none where they are not to be `bound`."""
+    """Fit the simulator, and build the effects at the scales of the fit; none unless `bound`."""
     recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
     recording = without_lost_rows(system, recording)
@@ -92,18 +92,18 @@ def prepare_system(
     system, found, sd = fit_system(system, recording)
     apparatus = PersonsSystem(About(system, table, found.z, sd))
     begun = replace(system, first=found.z)
-    told("binding effects")
+    told("building the effects")
     effects = apparatus.effects(recording, begun) if bound else {}
     return Prepared(recording, effects, begun, apparatus, recording)
 
 
 def _counting(progress: Progress, system: System) -> Progress:
-    """Tell beside every stage how often `simulate` has been called, where there is one."""
+    """Add the number of calls of `simulate`, if there is one, to the progress."""
     return progress if system.caller is None else CountedCalls(progress, system.caller)
 
 
 def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
-    """Leave out readings of rows in which a column is missing, so that nothing can be predicted there, and note it.
+    """Leave out, with a note, readings of rows whose missing columns make a prediction impossible.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Say where a person's `simulate` gave no readings, and which parameters it could not take row by row."""
+    """Return notes: calls of `simulate` that failed, and parameters that it does not accept as arrays."""
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, PersonsSystem):
         return ()
@@ -143,13 +143,13 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     if caller.cut_short:
         out.append(
             f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls no further combination of effects "
-            "was fitted; one that takes arrays is searched in full"
+            "was fitted; if simulate takes arrays, the search is complete"
         )
     if caller.n_failed:
-        out.append(f"simulate raised an error for {caller.n_failed:,} parameters tried: taken to be impossible")
+        out.append(f"simulate raised an error for {caller.n_failed:,} parameter vectors, which count as impossible")
     if caller.interpolated:
         names = ", ".join(sorted(caller.interpolated))
-        out.append(f"simulate takes no array of {names}: readings are interpolated between fixed values of it")
+        out.append(f"simulate takes no array of {names}: readings are interpolated between fixed values")
     return tuple(out)
 
 
@@ -157,19 +157,19 @@ def _notes_on_law(tally: Tally) -> Iterator[str]:
     if tally.cut_short:
         yield (
             f"integrating the law takes long: after {STEPS_OF_A_SEARCH:,} steps no further combination of effects "
-            "was fitted; a larger max_step_s, shorter runs side by side or fewer rows are searched in full"
+            "was fitted; with a larger max_step_s, shorter runs or fewer rows the search is complete"
         )
     if tally.n_failed:
-        yield f"rates raised an error for {tally.n_failed:,} parameters tried: taken to be impossible"
+        yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"
 
 
 def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
-    """Take the predicted column as readings; the simulator gets every row, at most 2,400 readings are compared.
+    """Return the predicted column as readings; the fit uses at most 2,400 of them, the simulator every row.
 
     Raises
     ------
     ParameterError
-        If the column is missing, or holds no number.
+        If the column is missing, or contains no number.
     """
     if simulator.reading not in table.columns:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
@@ -200,12 +200,12 @@ def _require_rising_time(table: RunTable) -> None:
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:
-    """Fit a system to readings, with a step of its integration at which predictions there stand still.
+    """Fit a system to readings, with an integration step at which predictions no longer change.
 
     Returns
     -------
-    The system with that step, the fit, and the sd of a reading: as declared, or else the least of what the fit and
-    neighbouring readings show.
+    The system with that step, the fit, and the sd of a reading: as declared, or else the smaller of the estimates from
+    the fit and from successive readings.
     """
     table = cast(RunTable, recording.plan)
     law = white_of(recording)
@@ -222,7 +222,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
 
 
 def _from_best_start(system: System, recording: Recording, law: NoiseLaw) -> Fit:
-    """Go some steps from every start, and on from those that are lowest by then."""
+    """Take a few steps from every start, then continue from the best."""
     model = Model(system, (), recording.plan)
     tried = sorted(fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_height)[:_BEST_STARTS]
     if all(found.settled for found in tried):

@@ -1,4 +1,4 @@
-"""Fit a person's simulator to their table: posterior and evidence, and nothing else."""
+"""Fit a user's simulator to a table: posterior and evidence, without a diagnosis."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ _MOST_PARAMETERS = 24  # beyond them it would take more
 
 @dataclass(frozen=True)
 class Evidence:
-    """Log evidence (nats) and its error, 0 where none is known; by which method, and why not by nested sampling."""
+    """Log evidence (nats) and its error, 0 if unknown; its method, and the reason if that is not nested sampling."""
 
     log_z: float
     error: float
@@ -65,7 +65,7 @@ class SystemFit(ShowsItself):
     evidence
         Log evidence.
     predicted, sd
-        Mean and sd of every row's reading by the posterior, (n_points,).
+        Mean and sd of every row's posterior prediction, (n_points,).
     """
 
     recording: Recording
@@ -92,7 +92,7 @@ class SystemFit(ShowsItself):
         lines = [
             f"{int(self.recording.usable.sum())} readings, rms of the residuals {self.rms:.4g} {unit}",
             f"log evidence {self.evidence.log_z:.2f}{error} nats by {self.evidence.method}{how}",
-            f"noise of a new reading {np.median(own.noise_sd):.4g} {unit}",
+            f"noise sd of a reading {np.median(own.noise_sd):.4g} {unit}",
         ]
         return "\n".join([*lines, own.parameter_table()])
 
@@ -106,33 +106,34 @@ def fit_simulator(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> SystemFit:
-    """Fit a simulator to a table of readings: posterior and evidence, without asking what it leaves out.
+    """Fit a simulator to a table of readings: posterior and evidence, without a diagnosis.
 
     Parameters
     ----------
     simulator
-        What predicts the readings.
+        The model that predicts the readings.
     table
-        What was recorded, with the column that is predicted: a table, a dict of arrays, or a DataFrame.
+        The recorded rows, with the predicted column: a table, a dict of arrays, or a DataFrame.
     source, notes
-        What the table is called, and what is to be noted of it.
+        Name of the table, and notes on it for the report.
     rng
         Source of randomness.
     progress
-        Told what is being done.
+        Called with each stage.
 
     Returns
     -------
     SystemFit
-        With evidence and posterior by nested sampling where `simulate` takes all samples at once, or there is a law,
-        and that ends before 60 million readings have been predicted; else by the Laplace approximation, and it says so.
+        Evidence and posterior, by nested sampling if `simulate` takes all samples at once, or there is a law, and if
+        the run ends before 60 million readings have been predicted; otherwise by the Laplace approximation, with the
+        reason.
 
     Raises
     ------
     ParameterError
-        If simulator and table do not fit together, or there are too few readings.
+        If the table lacks a column that the simulator names, or has too few readings.
     NotConvergedError
-        If the fit did not arrive anywhere.
+        If the fit did not converge.
     """
     table = table_for(simulator, table)
     require_rng(rng)
@@ -157,7 +158,7 @@ def fit_simulator(
 
 
 def _weighed(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
-    """Weigh the simulator alone, noise white."""
+    """Compute the evidence of the simulator alone, with white noise."""
     prior = PriorOdds.over({})
     noises, templates = Noises(prepared.recording, {}, prior), TemplateMemory(prepared.usable)
     state = SearchState({}, prior, noises, templates, Refits(prepared.null, noises, templates), frozenset())
@@ -166,7 +167,7 @@ def _weighed(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
 
 
 def _why_not(prepared: Prepared) -> str:
-    """Say why nested sampling would take too long; "" where it would not."""
+    """Return why nested sampling would take too long; "" if it would not."""
     system = cast(PersonsSystem, prepared.apparatus).system
     if system.n_params > _MOST_PARAMETERS:
         return f"nested sampling of {system.n_params} parameters would take too many calls"
@@ -192,9 +193,10 @@ def _by_nested_sampling(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[ModelSamples, Evidence]:
-    """Search the prior; keep what is given where that does not end in time.
+    """Compute evidence and samples by nested sampling; keep those given if the run does not end in time.
 
-    A law, which is integrated, is searched from a prior near the samples that are given, which takes far fewer calls.
+    With a law, which must be integrated, nested sampling starts from a prior near the given samples, which takes far
+    fewer calls.
     """
     problem: nested.Samplable = JointProblem(null.found.model, prepared.recording, noise)
     system = cast(PersonsSystem, prepared.apparatus).system
@@ -205,7 +207,7 @@ def _by_nested_sampling(
         problem = nested.repartitioned(problem, np.clip(ndtri(u), -FARTHEST, FARTHEST))
         method = "nested sampling near the posterior"
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DoubtfulResultWarning)  # what speaks against it is told
+        warnings.simplefilter("ignore", DoubtfulResultWarning)  # the reason is reported below
         found = nested.run(
             problem, rng=rng, n_live=n_live, max_calls=_most_calls(prepared), progress=_told(progress),
             max_cost=1.0, return_interrupted=False,
@@ -222,8 +224,8 @@ def _by_nested_sampling(
     return replace(samples, theta=theta, noise_sd=noise_sd), evidence
 
 
-def _told(progress: Progress) -> Callable[[nested.State], None]:
-    def tell(state: nested.State) -> None:
+def _told(progress: Progress) -> Callable[[nested.RoundSummary], None]:
+    def tell(state: nested.RoundSummary) -> None:
         to_come = state.log_ratio_remaining
         progress(
             "nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come"
@@ -233,7 +235,7 @@ def _told(progress: Progress) -> Callable[[nested.State], None]:
 
 
 def fit_json(fit: SystemFit) -> dict[str, Any]:
-    """Lay a fit out as fit.json, format "fit/1": strict JSON."""
+    """Convert a fit to the content of fit.json, format "fit/1": strict JSON."""
     require_kind("fit", fit, SystemFit, "a SystemFit, as fit_simulator returns it")
     own, interval = fit.fitted, fit.fitted.interval()
     median, sd = np.median(own.samples, axis=0).tolist(), own.samples.std(axis=0).tolist()

@@ -1,4 +1,4 @@
-"""The models of a diagnosis as files carry them: a simulator with posterior samples of what it leaves out."""
+"""The models of a diagnosis for their files: the simulator, posterior samples, and effects."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ __all__ = ["bound_about", "calibrated_of", "fitted_system", "repaired_of"]
 
 
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
-    """Take the repaired model of a diagnosis: the simulator with what it leaves out.
+    """Return the repaired model of a diagnosis: the simulator with the effects that it leaves out.
 
     Raises
     ------
     ParameterError
-        If it is no diagnosis of a simulator.
+        If it is not the diagnosis of a simulator.
     """
     return _fitted(diagnosis, "repaired")
 
 
 def calibrated_of(diagnosis: Diagnosis) -> FittedSystem:
-    """Take the null of a diagnosis: the simulator alone; what is raised is as in `repaired_of`."""
+    """Return the calibrated null model of a diagnosis: the simulator alone. Raises as `repaired_of`."""
     return _fitted(diagnosis, "null")
 
 
@@ -52,25 +52,25 @@ def _fitted(diagnosis: Diagnosis, which: str) -> FittedSystem:
 
 
 def bound_about(about: About, model: ModelSamples) -> Recorded | None:
-    """Give what a model needs of the recording: what its effects were bound about, and how exact readings were."""
+    """Return what a model needs of the recording: the fit that set its effects' scales, and declared noise sds."""
     return recorded(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
 
 
 def fitted_system(
     system: System, model: ModelSamples, recording: Recording, predicted: FloatArray, *, known: Recorded | None = None
 ) -> FittedSystem:
-    """Take posterior samples of a system for the file that carries them.
+    """Return posterior samples of a system as the content of its file.
 
     Parameters
     ----------
     system, model
         The simulator over the runs of the recording, and the samples.
     recording
-        What it was fitted to.
+        The fitted recording.
     predicted
-        What it predicts of every row, (n_points,).
+        Prediction for every row, (n_points,).
     known
-        What the effects were bound about, if there are any.
+        The fit that set the effects' scales, if there are effects.
     """
     level = predicted[recording.usable]
     return FittedSystem(

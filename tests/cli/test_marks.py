@@ -162,7 +162,7 @@ def test_a_sheet_is_looked_at_over_its_white_and_its_black():
     watch = SheetWatch(plan, white_is_bright=True)
     everywhere = lambda places: np.ones(len(places), dtype=bool)  # noqa: E731
     for name, pattern in plan.patterns.items():
-        places = watch.places(name, everywhere)
+        places = watch.check_places(name, everywhere)
         assert set(places) == {True, False}
         for is_white, place in places.items():
             assert shades(pattern, np.array([place]))[0] == is_white

@@ -9,7 +9,7 @@ from typing import Any, cast
 import pytest
 
 from probewise.diagnosis import PriorOdds
-from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.effects import UNNAMED, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
 from probewise.sensor import Stage
@@ -37,7 +37,7 @@ def test_half_of_the_unknown_has_a_name_of_our_own():
 
 def test_two_effects_of_a_simulator_are_no_less_likely_than_one_beside_a_fault_of_the_noise():
     """And all that may be missing from the mean sums to one."""
-    odds = PersonsSystem.prior_odds(cast(Any, None), {})
+    odds = SimulatorApparatus.prior_odds(cast(Any, None), {})
     assert odds.clean_mean + odds.unknown + sum(odds.by_size) == pytest.approx(1.0)
     one_and_noise = odds.by_size[0] * odds.noise_by_size[0]
     assert odds.by_size[1] * odds.white >= one_and_noise

@@ -86,7 +86,7 @@ class Hands:
     def _look(self, name: str) -> str | None:
         bounds, origin = bounds_of(self._arm), np.array(self._origin)
         values = {}
-        for is_white, place in self._watch.places(name, lambda places: bounds.holds(places + origin)).items():
+        for is_white, place in self._watch.check_places(name, lambda places: bounds.holds(places + origin)).items():
             x_mm, y_mm = (np.array(place) + origin).tolist()
             standing = float(self._arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
             values[is_white] = self._arm.measure(Pose(x_mm, y_mm, standing)).value

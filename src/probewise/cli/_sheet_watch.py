@@ -86,7 +86,7 @@ class SheetWatch:
             self._read[is_white].append(value)
         return None
 
-    def places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
+    def check_places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
         """Choose places for checking a sheet: over uniform white and uniform black, by shade.
 
         Parameters

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, Place
-from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.report.words import unit_name
 
 __all__ = [
@@ -64,7 +64,7 @@ def covariate_unit(name: str, unit: str) -> str:
 def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
     """Return the name of a covariate in words and its unit, "" if none is known."""
     unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
-    if not isinstance(apparatus, PersonsSystem):
+    if not isinstance(apparatus, SimulatorApparatus):
         return ("scan" if name == "scan" else covariate_words(name)), covariate_unit(name, unit)
     units = {"time": apparatus.system.simulator.time_unit, "level": unit, "previous": unit}
     return apparatus.words.covariate(name), units.get(name, "")

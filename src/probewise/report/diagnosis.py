@@ -20,7 +20,7 @@ from probewise.diagnosis import (
     notes_on_calls,
     p_in_words,
 )
-from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import family_words, words_and_unit
@@ -138,7 +138,7 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 def _simulator(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Name the user's simulator, if there is one, and how often it was called."""
-    if not isinstance(diagnosis.apparatus, PersonsSystem):
+    if not isinstance(diagnosis.apparatus, SimulatorApparatus):
         return []
     system = diagnosis.apparatus.system
     own = [("simulator", system.simulator.source or "given in Python")]

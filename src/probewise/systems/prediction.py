@@ -52,7 +52,7 @@ class SystemPrediction(ShowsItself):
     n_failed: int = 0
 
     def summary(self) -> str:
-        """Return the number of predicted readings and a score of those that were recorded."""
+        """Return the number of predicted readings, and chi-square and log density per recorded one."""
         return prediction_summary(self.readings, self.mean, self.sd, self.log_density)
 
 

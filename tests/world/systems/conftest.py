@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.world.systems.chain import simulate
-from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.kind import Law, Prior, SystemKind
 from probewise.world.systems.rows import SystemRows
 from probewise.world.systems.vocabulary import forms_of
@@ -44,8 +44,8 @@ def solve():
     def run(name, numbers, **options):
         kind, rows, parameters = small(**options)
         bare = simulate(kind, rows, parameters)
-        scene = Scene(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
-        form = next(f for f in forms_of(scene) if f.name == name)
+        true = TrueSystem(kind, rows, parameters, bare.readings[0], {s: v[0] for s, v in bare.states.items()})
+        form = next(f for f in forms_of(true) if f.name == name)
         return simulate(kind, rows, parameters, [(form, numbers)]).readings[0], rows, bare.readings[0]
 
     return run

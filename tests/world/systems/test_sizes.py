@@ -18,7 +18,7 @@ def _drawn(name, seed=3):
 
 
 def _form(drawn, name):
-    return next(f for f in forms_of(drawn.scene) if f.name == name)
+    return next(f for f in forms_of(drawn.true_system) if f.name == name)
 
 
 @pytest.mark.parametrize("wanted", [6.0, 20.0])
@@ -49,11 +49,11 @@ def test_what_a_bent_model_leaves_is_as_large_as_asked():
 
 def test_an_offset_that_depends_on_a_column_is_a_sensitivity_by_another_name():
     drawn = _drawn("orifice flow meter")
-    forms = forms_of(drawn.scene)
+    forms = forms_of(drawn.true_system)
     effect = _sized(_form(drawn, "sensitivity:water_c"), 12.0, drawn, np.random.default_rng(1))
     target = drawn.changed([effect.placed])
     fitted = drawn.nominal.fit(target, drawn.at)
-    rivals = rivals_of(drawn.scene, forms, target, fitted, drawn.nominal, frozenset({effect.name}))
+    rivals = rivals_of(drawn.true_system, forms, target, fitted, drawn.nominal, frozenset({effect.name}))
     assert rivals["depends:zero_kpa:water_c"] < 0.01
     assert "sensitivity:baro_hpa" not in rivals
     assert all(nats < 3 for nats in rivals.values())

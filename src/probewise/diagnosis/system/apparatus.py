@@ -33,7 +33,7 @@ from probewise.systems import RunTable, System
 from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.proposals import proposals
 
-__all__ = ["ON_NOISE", "PersonsSystem"]
+__all__ = ["ON_NOISE", "SimulatorApparatus"]
 
 ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     SignalDependentNoise,
@@ -56,7 +56,7 @@ _BY_SIZE = (0.318, 0.02, 0.002)
 
 
 @dataclass(frozen=True, eq=False)
-class PersonsSystem:
+class SimulatorApparatus:
     """A system with a first fit, which sets the scales of the forms.
 
     Parameters

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, judged
-from probewise.diagnosis.system.apparatus import ON_NOISE, PersonsSystem
+from probewise.diagnosis.system.apparatus import ON_NOISE, SimulatorApparatus
 from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, first_of
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
@@ -69,7 +69,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     found, cosines = judged(laid, cast(Any, names), simulator.unit)
     effects = tuple(_with_rows(effect, reasons) for effect in found)
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
-    words = PersonsSystem(about).words
+    words = SimulatorApparatus(about).words
     return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _classes(effects))
 
 

@@ -15,7 +15,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.noise.law import NoiseLaw, white_of
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, STEPS_OF_A_SEARCH, PersonsSystem
+from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, STEPS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
@@ -70,7 +70,7 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
-    told = _counting(progress, cast(PersonsSystem, prepared.apparatus).system)
+    told = _counting(progress, cast(SimulatorApparatus, prepared.apparatus).system)
     return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
 
 
@@ -90,7 +90,7 @@ def prepare_system(
     told = _counting(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
-    apparatus = PersonsSystem(About(system, table, found.z, sd))
+    apparatus = SimulatorApparatus(About(system, table, found.z, sd))
     begun = replace(system, first=found.z)
     told("building the effects")
     effects = apparatus.effects(recording, begun) if bound else {}
@@ -134,7 +134,7 @@ def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return notes: calls of `simulate` that failed, and parameters that it does not accept as arrays."""
     apparatus = diagnosis.apparatus
-    if not isinstance(apparatus, PersonsSystem):
+    if not isinstance(apparatus, SimulatorApparatus):
         return ()
     caller, tally = apparatus.system.caller, apparatus.system.tally
     if caller is None:

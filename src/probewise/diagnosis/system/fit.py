@@ -26,7 +26,7 @@ from probewise.diagnosis.search.nulls import fit_nulls
 from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
-from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.diagnosis.system.fitted import bound_about, fitted_system
 from probewise.errors import DoubtfulResultWarning, ParameterError
@@ -149,10 +149,10 @@ def fit_simulator(
     evidence = Evidence(noise.log_z + null.log_factor, 0.0, "the Laplace approximation", _why_not(prepared))
     if not evidence.reason:
         samples, evidence = _by_nested_sampling(prepared, null, noise, samples, evidence, rng=rng, progress=progress)
-    recording, system = prepared.recording, cast(PersonsSystem, prepared.apparatus).system
+    recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
     predicted = samples.chain.predict(samples.theta, recording.plan)
     sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2) * recording.relative_sd**2)
-    known = bound_about(cast(PersonsSystem, prepared.apparatus).about, samples)
+    known = bound_about(cast(SimulatorApparatus, prepared.apparatus).about, samples)
     fitted = fitted_system(system, samples, recording, predicted.mean(axis=0), known=known)
     return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
 
@@ -168,7 +168,7 @@ def _weighed(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
 
 def _why_not(prepared: Prepared) -> str:
     """Return why nested sampling would take too long; "" if it would not."""
-    system = cast(PersonsSystem, prepared.apparatus).system
+    system = cast(SimulatorApparatus, prepared.apparatus).system
     if system.n_params > _MOST_PARAMETERS:
         return f"nested sampling of {system.n_params} parameters would take too many calls"
     if system.caller is not None and not system.caller.broadcasts:
@@ -179,7 +179,7 @@ def _why_not(prepared: Prepared) -> str:
 
 
 def _most_calls(prepared: Prepared) -> int:
-    each = 1 if cast(PersonsSystem, prepared.apparatus).system.simulator.law is None else 2
+    each = 1 if cast(SimulatorApparatus, prepared.apparatus).system.simulator.law is None else 2
     return _MOST_NUMBERS // (each * len(prepared.recording))
 
 
@@ -199,7 +199,7 @@ def _by_nested_sampling(
     fewer calls.
     """
     problem: nested.Samplable = JointProblem(null.found.model, prepared.recording, noise)
-    system = cast(PersonsSystem, prepared.apparatus).system
+    system = cast(SimulatorApparatus, prepared.apparatus).system
     n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * system.n_params)
     method = "nested sampling"
     if system.simulator.law is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
 from probewise.diagnosis.repair.samples import ModelSamples
-from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
@@ -43,7 +43,7 @@ def _fitted(diagnosis: Diagnosis, which: str) -> FittedSystem:
         allowed += f"; of this {type(diagnosis).__name__} take its .fitted"
     require_kind("diagnosis", diagnosis, Diagnosis, allowed)
     apparatus, model = diagnosis.apparatus, getattr(diagnosis, which)
-    if not isinstance(apparatus, PersonsSystem):
+    if not isinstance(apparatus, SimulatorApparatus):
         raise ParameterError("diagnosis", diagnosis, f"{allowed}; a light sensor's is {which}.fitted_sensor(...)")
     before = diagnosis.repair.before.readings
     return fitted_system(

@@ -17,8 +17,8 @@ from probewise.world.challenge.strata import Stratum
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.fit import Beside, Fitted, Model, left_over, numbers_of
 from probewise.world.systems.forms.form import Form, Placed
-from probewise.world.systems.forms.scene import Scene
 from probewise.world.systems.forms.strange import STRANGE, strangers
+from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.formulas import FORMULAS
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
@@ -85,11 +85,11 @@ class Drawn:
         return Fitted(self.at, readings, slopes, 0.0)
 
     @cached_property
-    def scene(self) -> Scene:
-        """The context in which forms are bound."""
+    def true_system(self) -> TrueSystem:
+        """The system at its true parameters, about which effects are built."""
         parameters = self.nominal.parameters(self.at[None, :])
         trace = simulate(self.kind, self.seen, parameters)
-        return Scene(
+        return TrueSystem(
             self.kind, self.seen, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()}
         )
 
@@ -275,10 +275,10 @@ def _conceal(
     """Draw the effects of a stratum once."""
     if stratum.kind == "clean":
         return (), None
-    forms = forms_of(drawn.scene)
+    forms = forms_of(drawn.true_system)
     if stratum.kind == "outside":
         wanted = STRANGE[before % len(STRANGE)]
-        own = [f for f in strangers(drawn.scene, rng) if f.name.removeprefix("strange_").split(":")[0] == wanted]
+        own = [f for f in strangers(drawn.true_system, rng) if f.name.removeprefix("strange_").split(":")[0] == wanted]
         one = _sized(_any_of(own, wanted, rng), stratum.size, drawn, rng)
         return (_with_rivals(one, forms, drawn, ()),), None
     if stratum.kind == "single":
@@ -346,7 +346,7 @@ def _with_rivals(
     start = model.coordinates(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
     rivals = rivals_of(
-        drawn.scene,
+        drawn.true_system,
         [_at_its_moment(form, effect.values) for form in forms],
         target,
         fitted,
@@ -354,4 +354,4 @@ def _with_rivals(
         frozenset({effect.name, *(e.name for e in others)}),
     )
     left = (target - fitted.readings) / drawn.kind.sd
-    return replace(effect, rivals=rivals, covariates=covariates_of(effect.form, left, drawn.scene))
+    return replace(effect, rivals=rivals, covariates=covariates_of(effect.form, left, drawn.true_system))

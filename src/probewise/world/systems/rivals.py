@@ -15,7 +15,7 @@ from probewise.errors import NotConvergedError
 from probewise.world.systems.chain import read, simulate
 from probewise.world.systems.fit import Beside, Fitted, Model, free_numbers, left_over
 from probewise.world.systems.forms.form import Form, Placed, as_numbers
-from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.forms.true_system import TrueSystem
 
 __all__ = ["TELLING_NATS", "rivals_of", "short_name", "templates_of"]
 
@@ -46,13 +46,13 @@ class _StartOfFit:
 
 
 def rivals_of(
-    scene: Scene, forms: Sequence[Form], target: FloatArray, fitted: Fitted, model: Model, without: frozenset[str]
+    true: TrueSystem, forms: Sequence[Form], target: FloatArray, fitted: Fitted, model: Model, without: frozenset[str]
 ) -> dict[str, float]:
     """Find the forms that explain noise-free readings as well.
 
     Parameters
     ----------
-    scene
+    true
         The system.
     forms
         Forms to try.
@@ -67,8 +67,8 @@ def rivals_of(
     -------
     Loss of log likelihood in nats by name, for those below TELLING_NATS, the best first.
     """
-    left = left_over((target - fitted.readings) / scene.sd, fitted.slopes)
-    near = _screened(scene, [f for f in forms if short_name(f) not in without], left, fitted, model)
+    left = left_over((target - fitted.readings) / true.sd, fitted.slopes)
+    near = _screened(true, [f for f in forms if short_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
     hard = any(_is_hard(b.form) for b in model.beside)
     for candidate in near:
@@ -77,8 +77,8 @@ def rivals_of(
             found[name] = min(candidate.nats, found.get(name, np.inf))
             continue
         wider = Model(
-            scene.kind,
-            scene.rows,
+            true.kind,
+            true.rows,
             [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))],
         )
         own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free_numbers(candidate.form)]
@@ -96,16 +96,18 @@ def rivals_of(
     return dict(sorted(close.items(), key=lambda item: item[1]))
 
 
-def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model) -> list[_StartOfFit]:
+def _screened(
+    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model
+) -> list[_StartOfFit]:
     """Return the best candidates by linearisation, with each form's best two starts."""
     size = float(left @ left)
     out = []
-    for form, changes in templates_of(scene, forms, fitted, model).items():
+    for form, changes in templates_of(true, forms, fitted, model).items():
         own = []
         groups = [list(group) for group in form.bank]
         at = 0
         for group in groups:
-            columns = left_over(changes[at : at + len(group)].T / scene.sd, fitted.slopes)
+            columns = left_over(changes[at : at + len(group)].T / true.sd, fitted.slopes)
             at += len(group)
             good = np.isfinite(columns).all(axis=0) & (np.sqrt(np.sum(columns**2, axis=0)) > 1e-6)
             if not good.any():
@@ -120,30 +122,30 @@ def _screened(scene: Scene, forms: Sequence[Form], left: FloatArray, fitted: Fit
     return sorted(out, key=lambda c: c.nats)[:_MOST_FITS]
 
 
-def templates_of(scene: Scene, forms: Sequence[Form], fitted: Fitted, model: Model) -> dict[Form, FloatArray]:
+def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model: Model) -> dict[Form, FloatArray]:
     """Return the change of the readings by every setting of every form's bank about a fit, (n_settings, n_points)."""
     settings = {form: [each for group in form.bank for each in group] for form in forms}
     x = fitted.at[None, :]
     parameters, beside = model.parameters(x), model.effects(x)
     inner = [e for e in beside if e[0].side != "reading"]
     outer = [e for e in beside if e[0].side == "reading"]
-    bare = simulate(scene.kind, scene.rows, parameters, inner).readings
+    bare = simulate(true.kind, true.rows, parameters, inner).readings
     out: dict[Form, FloatArray] = {}
     with np.errstate(all="ignore"):
         for form in forms:
             if form.side == "reading":
                 numbers = as_numbers(settings[form])
                 out[form] = (
-                    read(np.repeat(bare, len(settings[form]), axis=0), scene.rows, [*outer, (form, numbers)])
+                    read(np.repeat(bare, len(settings[form]), axis=0), true.rows, [*outer, (form, numbers)])
                     - fitted.readings
                 )
-        alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or scene.kind.law is None)]
+        alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or true.kind.law is None)]
         for form in alone:
-            found = _simulated(scene, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))
+            found = _simulated(true, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))
             out[form] = found - fitted.readings
         together = [f for f in forms if f.side != "reading" and f not in alone]
         for chunk in _chunks(together, settings):
-            out |= _at_once(scene, chunk, settings, fitted, model)
+            out |= _at_once(true, chunk, settings, fitted, model)
     return out
 
 
@@ -160,7 +162,7 @@ def _chunks(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]])
 
 
 def _at_once(
-    scene: Scene, forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]], fitted: Fitted, model: Model
+    true: TrueSystem, forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]], fitted: Fitted, model: Model
 ) -> dict[Form, FloatArray]:
     """Simulate many forms at once, each with its null setting except in its own samples."""
     ends = np.cumsum([len(settings[form]) for form in forms])
@@ -175,15 +177,15 @@ def _at_once(
             numbers[name] = whole
         # For screening, a delayed column may be interpolated; a full fit treats its jumps exactly.
         placed.append((replace(form, late=""), numbers))
-    found = _simulated(scene, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
+    found = _simulated(true, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
     if len(forms) > 1 and not np.isfinite(found).all():  # one of them diverges, which stops the integration of all
-        return {form: each for own in forms for form, each in _at_once(scene, [own], settings, fitted, model).items()}
+        return {form: each for own in forms for form, each in _at_once(true, [own], settings, fitted, model).items()}
     return {form: found[end - len(settings[form]) : end] for form, end in zip(forms, ends, strict=True)}
 
 
-def _simulated(scene: Scene, parameters: Mapping[str, FloatArray], effects: Sequence[Placed], n: int) -> FloatArray:
+def _simulated(true: TrueSystem, parameters: Mapping[str, FloatArray], effects: Sequence[Placed], n: int) -> FloatArray:
     """Simulate; NaN if a law diverges."""
     try:
-        return simulate(scene.kind, scene.rows, parameters, effects).readings
+        return simulate(true.kind, true.rows, parameters, effects).readings
     except NotConvergedError:
-        return np.full((n, len(scene.rows)), np.nan)
+        return np.full((n, len(true.rows)), np.nan)

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.world.systems.forms.form import Form
-from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.forms.true_system import TrueSystem
 
 __all__ = ["covariates_of"]
 
@@ -15,7 +15,7 @@ _AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts 
 _PLAIN = 0.25  # least explained share of the sum of squares
 
 
-def covariates_of(form: Form, left: FloatArray, scene: Scene) -> tuple[str, ...]:
+def covariates_of(form: Form, left: FloatArray, true: TrueSystem) -> tuple[str, ...]:
     """Return the covariates that a right answer may rank first: the form's own, and equivalent ones.
 
     Parameters
@@ -24,13 +24,13 @@ def covariates_of(form: Form, left: FloatArray, scene: Scene) -> tuple[str, ...]
         The concealed form.
     left
         Residuals after the refit of the nominal model, (n_points,).
-    scene
+    true
         The system.
     """
-    rows = scene.rows
+    rows = true.rows
     pooled = {name: values for name, values in rows.columns.items() if name != rows.time}
-    pooled |= {"level": scene.readings, "previous": _change(scene)}
-    pooled |= {f"state:{name}": values for name, values in scene.states.items()}
+    pooled |= {"level": true.readings, "previous": _change(true)}
+    pooled |= {f"state:{name}": values for name, values in true.states.items()}
     if rows.time is not None:
         pooled["time"] = rows.t
     shares = {name: _share(left, _binned(values)) for name, values in pooled.items()}
@@ -41,10 +41,10 @@ def covariates_of(form: Form, left: FloatArray, scene: Scene) -> tuple[str, ...]
     return tuple(dict.fromkeys((*form.covariates, *sorted(plain, key=lambda name: -shares[name]))))
 
 
-def _change(scene: Scene) -> FloatArray:
-    out = np.zeros(len(scene.rows))
-    for own in scene.rows.by_run:
-        out[own[1:]] = np.diff(scene.readings[own])
+def _change(true: TrueSystem) -> FloatArray:
+    out = np.zeros(len(true.rows))
+    for own in true.rows.by_run:
+        out[own[1:]] = np.diff(true.readings[own])
     return out
 
 

@@ -6,7 +6,7 @@ from probewise.world.systems.forms.form import Form
 from probewise.world.systems.forms.inputs import forms_of_inputs
 from probewise.world.systems.forms.inside import forms_of_parameters, forms_of_rates
 from probewise.world.systems.forms.readings import forms_of_readings
-from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.forms.true_system import TrueSystem
 
 __all__ = ["FAMILIES", "forms_of"]
 
@@ -50,7 +50,7 @@ FAMILIES = (
 """Names of forms without targets."""
 
 
-def forms_of(scene: Scene) -> list[Form]:
+def forms_of(true: TrueSystem) -> list[Form]:
     """Return every form of the vocabulary for which this system has a target; a floor counts as a saturation."""
-    of_rates = forms_of_rates(scene) if scene.kind.tells_states else ()
-    return [*forms_of_readings(scene), *forms_of_inputs(scene), *forms_of_parameters(scene), *of_rates]
+    of_rates = forms_of_rates(true) if true.kind.tells_states else ()
+    return [*forms_of_readings(true), *forms_of_inputs(true), *forms_of_parameters(true), *of_rates]

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
 from probewise.world.systems.forms.modulations import one_by_one, wave_bank, wave_joined
 from probewise.world.systems.forms.readings import earlier
-from probewise.world.systems.forms.scene import Scene, log_uniform
+from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 from probewise.world.systems.rows import SystemRows
 
 __all__ = ["forms_of_inputs", "play"]
@@ -19,13 +19,13 @@ __all__ = ["forms_of_inputs", "play"]
 Change = Callable[[FloatArray, SystemRows, Numbers], Any]
 
 
-def forms_of_inputs(scene: Scene) -> Iterator[Form]:
+def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
     """Yield the forms on each column that drives the system, and on the clock."""
-    for column in scene.kind.drives:
-        yield from _of_column(scene, column)
-    time = scene.rows.time
+    for column in true.kind.drives:
+        yield from _of_column(true, column)
+    time = true.rows.time
     # A clock error is detectable only if the law or the formula uses time.
-    if time is not None and (scene.kind.law is not None or scene.kind.time_anew):
+    if time is not None and (true.kind.law is not None or true.kind.time_anew):
         yield _linear("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
 
 
@@ -70,8 +70,8 @@ def _sized(
     )
 
 
-def _of_column(scene: Scene, column: str) -> Iterator[Form]:
-    values, spread = scene.rows.columns[column], scene.spread(column)
+def _of_column(true: TrueSystem, column: str) -> Iterator[Form]:
+    values, spread = true.rows.columns[column], true.spread(column)
     low, high = float(values.min()), float(values.max())
     span, own = high - low, (column, "level")
     if not span > 0:
@@ -103,7 +103,7 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
             sizes,
             own,
         )
-    moves = np.concatenate([np.diff(values[rows]) for rows in scene.rows.by_run])
+    moves = np.concatenate([np.diff(values[rows]) for rows in true.rows.by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
         yield _sized(f"backlash:{column}", "width", play, column, sizes, ("previous", column))
     if len(np.unique(values)) > 20:
@@ -133,8 +133,8 @@ def _of_column(scene: Scene, column: str) -> Iterator[Form]:
             own,
             signed=False,
         )
-    if scene.rows.time is not None:
-        taus = scene.rows.gap * np.geomspace(0.05, 6, 12 if scene.kind.law is None else 5)
+    if true.rows.time is not None:
+        taus = true.rows.gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
         yield _sized(
             f"input_delay:{column}",
             "tau_s",

@@ -10,34 +10,34 @@ import numpy as np
 from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form
 from probewise.world.systems.forms.modulations import Modulation, one_by_one
-from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.forms.true_system import TrueSystem
 
 __all__ = ["forms_of_parameters", "forms_of_rates", "pushing", "varying"]
 
 _N_WAVES = 20
 
 
-def forms_of_parameters(scene: Scene) -> Iterator[Form]:
+def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
     """Yield the ways in which each parameter may vary."""
-    over = {"steps": modulations.step(scene)}
-    if scene.rows.time is not None:
-        over["drifts"] = modulations.along_time(scene)
-    for name in scene.kind.priors:
+    over = {"steps": modulations.step(true)}
+    if true.rows.time is not None:
+        over["drifts"] = modulations.along_time(true)
+    for name in true.kind.priors:
         own = dict(over)
-        if name not in scene.kind.per_run and scene.kind.run is not None and len(scene.rows.by_run) > 1:
-            own["differs"] = modulations.by_run(scene)
-        if name in scene.kind.per_run and scene.kind.law is not None:
+        if name not in true.kind.per_run and true.kind.run is not None and len(true.rows.by_run) > 1:
+            own["differs"] = modulations.by_run(true)
+        if name in true.kind.per_run and true.kind.law is not None:
             own = {}  # initial values do not vary within a run
         for kind, how in own.items():
-            yield varying(scene, f"{kind}:{name}", name, how)
-        if not (name in scene.kind.per_run and scene.kind.law is not None):
-            for column in scene.logged:
-                yield varying(scene, f"depends:{name}:{column}", name, modulations.with_column(scene, column))
+            yield varying(true, f"{kind}:{name}", name, how)
+        if not (name in true.kind.per_run and true.kind.law is not None):
+            for column in true.logged:
+                yield varying(true, f"depends:{name}:{column}", name, modulations.with_column(true, column))
 
 
-def varying(scene: Scene, name: str, target: str, how: Modulation) -> Form:
+def varying(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
     """Bind a modulation to a parameter."""
-    first = 0.003 * float(np.abs(scene.parameters[target]).mean()) / how.reach
+    first = 0.003 * float(np.abs(true.parameters[target]).mean()) / how.reach
     return Form(
         name,
         "parameter",
@@ -57,7 +57,7 @@ def varying(scene: Scene, name: str, target: str, how: Modulation) -> Form:
 
 
 def pushing(
-    scene: Scene,
+    true: TrueSystem,
     name: str,
     state: str,
     push: Callable[[Any, Any, Any], Any],
@@ -69,7 +69,7 @@ def pushing(
     signed: bool = True,
 ) -> Form:
     """Bind a term a push(states, now, parameters) to the rate of a state; `size` is the scale of the push."""
-    first = 0.01 * scene.speed(state) / size
+    first = 0.01 * true.speed(state) / size
     return Form(
         name,
         "rate",
@@ -89,26 +89,26 @@ def pushing(
     )
 
 
-def forms_of_rates(scene: Scene) -> Iterator[Form]:
+def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
     """Yield the terms that may be missing from the rate of each state."""
-    if scene.kind.law is None:
+    if true.kind.law is None:
         return
-    for state, values in scene.states.items():
+    for state, values in true.states.items():
         size = float(np.abs(values).max())
         own = (f"state:{state}", "time")
-        yield pushing(scene, f"damping:{state}", state, _of(state, lambda r: -r), size, own, signed=False)
+        yield pushing(true, f"damping:{state}", state, _of(state, lambda r: -r), size, own, signed=False)
         drags = _of(state, lambda r: -np.abs(r) * r)
-        yield pushing(scene, f"drag:{state}", state, drags, size**2, own, signed=False)
-        yield pushing(scene, f"forcing:{state}", state, _of(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own))
-        for other, there in scene.states.items():
+        yield pushing(true, f"drag:{state}", state, drags, size**2, own, signed=False)
+        yield pushing(true, f"forcing:{state}", state, _of(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own))
+        for other, there in true.states.items():
             most = float(np.abs(there).max())
             seen = (f"state:{other}", "time")
-            yield pushing(scene, f"cubic:{state}:{other}", state, _of(other, lambda r: -(r**3)), most**3, seen)
-            yield pushing(scene, f"quadratic:{state}:{other}", state, _of(other, lambda r: -(r**2)), most**2, seen)
+            yield pushing(true, f"cubic:{state}:{other}", state, _of(other, lambda r: -(r**3)), most**3, seen)
+            yield pushing(true, f"quadratic:{state}:{other}", state, _of(other, lambda r: -(r**2)), most**2, seen)
             if other != state:
-                yield pushing(scene, f"coupling:{state}:{other}", state, _of(other, lambda r: -r), most, seen)
-        yield _periodic(scene, state)
-        yield from _hard(scene, state)
+                yield pushing(true, f"coupling:{state}:{other}", state, _of(other, lambda r: -r), most, seen)
+        yield _periodic(true, state)
+        yield from _hard(true, state)
 
 
 def _of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
@@ -116,9 +116,9 @@ def _of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any
     return lambda s, now, v: term(s[state])
 
 
-def _periodic(scene: Scene, state: str) -> Form:
-    how = modulations.waves(scene, _N_WAVES)
-    first = 0.02 * scene.speed(state)
+def _periodic(true: TrueSystem, state: str) -> Form:
+    how = modulations.waves(true, _N_WAVES)
+    first = 0.02 * true.speed(state)
     return Form(
         f"periodic_forcing:{state}",
         "rate",
@@ -136,8 +136,8 @@ def _periodic(scene: Scene, state: str) -> Form:
     )
 
 
-def _hard(scene: Scene, state: str) -> Iterator[Form]:
-    speed, values = scene.speed(state), scene.states[state]
+def _hard(true: TrueSystem, state: str) -> Iterator[Form]:
+    speed, values = true.speed(state), true.states[state]
     sizes = speed * np.geomspace(1e-3, 0.3, 4)
     yield Form(
         f"friction:{state}",

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Bank, Now, Numbers
-from probewise.world.systems.forms.scene import Scene, log_uniform
+from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 
 __all__ = [
     "Modulation",
@@ -68,22 +68,22 @@ def _plain(
     )
 
 
-def along_time(scene: Scene) -> Modulation:
+def along_time(true: TrueSystem) -> Modulation:
     """Linear drift in recorded time."""
-    names = ("time",) if scene.rows.time in (None, "time") else ("time", str(scene.rows.time))
-    return _plain(lambda now, v: v["a"] * now.t, names, float(np.abs(scene.rows.t).max()))
+    names = ("time",) if true.rows.time in (None, "time") else ("time", str(true.rows.time))
+    return _plain(lambda now, v: v["a"] * now.t, names, float(np.abs(true.rows.t).max()))
 
 
-def with_column(scene: Scene, column: str) -> Modulation:
+def with_column(true: TrueSystem, column: str) -> Modulation:
     """Variation in proportion to a column, about its mean over the recording."""
-    middle = scene.middle(column)
-    return _plain(lambda now, v: v["a"] * (now.u[column] - middle), (column,), scene.spread(column), (column,))
+    middle = true.middle(column)
+    return _plain(lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.spread(column), (column,))
 
 
-def step(scene: Scene) -> Modulation:
+def step(true: TrueSystem) -> Modulation:
     """Step at a time, or at a row if there is no time."""
-    at, timed = ("at_s", True) if scene.rows.time is not None else ("at_row", False)
-    moments = np.quantile(np.unique(scene.rows.t), np.linspace(0.02, 0.98, 40))
+    at, timed = ("at_s", True) if true.rows.time is not None else ("at_row", False)
+    moments = np.quantile(np.unique(true.rows.t), np.linspace(0.02, 0.98, 40))
 
     def over(now: Now, v: Numbers) -> Any:
         return v["a"] * ((now.t if timed else now.row) > v[at])
@@ -91,21 +91,21 @@ def step(scene: Scene) -> Modulation:
     return Modulation(
         over,
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {at: scene.moment(rng)},
+        lambda rng: {at: true.moment(rng)},
         lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
         one_by_one,
         lambda a: {"a": a, at: 0.0},
-        ("time", str(scene.rows.time)) if timed else ("row",),
+        ("time", str(true.rows.time)) if timed else ("row",),
         1.0,
         breaks=(lambda v: np.asarray(v[at])) if timed else None,
     )
 
 
-def by_run(scene: Scene) -> Modulation:
+def by_run(true: TrueSystem) -> Modulation:
     """Random value per run, including held-out runs, scaled by the amplitude."""
-    n = scene.rows.n_runs
+    n = true.rows.n_runs
     names = [f"values[{k}]" for k in range(n)]
-    present = [int(scene.rows.run[own[0]]) for own in scene.rows.by_run]
+    present = [int(true.rows.run[own[0]]) for own in true.rows.by_run]
 
     def over(now: Now, v: Numbers) -> Any:
         values = np.concatenate(np.broadcast_arrays(*(np.atleast_2d(v[name]) for name in names)), axis=1)
@@ -137,9 +137,9 @@ def wave_joined(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[
     return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
 
 
-def waves(scene: Scene, n: int) -> Modulation:
+def waves(true: TrueSystem, n: int) -> Modulation:
     """One sinusoid in time, up to one period in four rows; the bank has n frequencies."""
-    rows = scene.rows
+    rows = true.rows
     slowest, fastest = 1.5 / rows.duration, 0.25 / rows.gap
     return Modulation(
         lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
@@ -154,17 +154,17 @@ def waves(scene: Scene, n: int) -> Modulation:
     )
 
 
-def settling(scene: Scene) -> Modulation:
+def settling(true: TrueSystem) -> Modulation:
     """Exponential settling after the start of each run."""
-    longest = float(scene.rows.since_start.max())
-    taus = np.geomspace(scene.rows.gap, longest, 12)
+    longest = float(true.rows.since_start.max())
+    taus = np.geomspace(true.rows.gap, longest, 12)
     return Modulation(
         lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {"tau_s": log_uniform(rng, 3 * scene.rows.gap, 0.4 * longest)},
+        lambda rng: {"tau_s": log_uniform(rng, 3 * true.rows.gap, 0.4 * longest)},
         lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
         one_by_one,
         lambda a: {"a": a, "tau_s": 0.05 * longest},
-        ("time", "run", str(scene.rows.time)),
+        ("time", "run", str(true.rows.time)),
         1.0,
     )

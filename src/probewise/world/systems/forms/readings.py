@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form, Now, Numbers
 from probewise.world.systems.forms.modulations import Modulation
-from probewise.world.systems.forms.scene import Scene
+from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.rows import SystemRows
 
 __all__ = ["GAIN", "OFFSET", "added_to_readings", "earlier", "forms_of_readings", "way_of"]
@@ -20,22 +20,22 @@ GAIN, OFFSET, _BEND, _LAG, _CEILING = range(5)
 _N_WAVES = 240
 
 
-def forms_of_readings(scene: Scene) -> Iterator[Form]:
+def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
     """Yield every form of the reading."""
-    yield from _varying(scene)
-    yield from _bent(scene)
-    yield from _behind(scene)
+    yield from _varying(true)
+    yield from _bent(true)
+    yield from _behind(true)
 
 
-def added_to_readings(scene: Scene, name: str, how: Modulation, *, gain: bool = False) -> Form:
+def added_to_readings(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
     """Bind a modulation to the reading, as an offset or a gain about 0."""
 
     def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         change = how.over(Now.at_rows(rows), v)
         return np.asarray(y * (1 + change) if gain else y + change)
 
-    typical = float(np.sqrt(np.mean(scene.readings**2))) if gain else 1.0
-    first = scene.sd / typical / how.reach
+    typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
+    first = true.sd / typical / how.reach
     return Form(
         name,
         "reading",
@@ -53,21 +53,21 @@ def added_to_readings(scene: Scene, name: str, how: Modulation, *, gain: bool = 
     )
 
 
-def _varying(scene: Scene) -> Iterator[Form]:
-    timed = scene.rows.time is not None
-    both = {"step": modulations.step(scene)}
+def _varying(true: TrueSystem) -> Iterator[Form]:
+    timed = true.rows.time is not None
+    both = {"step": modulations.step(true)}
     if timed:
-        both["drift"] = modulations.along_time(scene)
-    if scene.kind.run is not None and len(scene.rows.by_run) > 1:
-        both["per_run"] = modulations.by_run(scene)
+        both["drift"] = modulations.along_time(true)
+    if true.kind.run is not None and len(true.rows.by_run) > 1:
+        both["per_run"] = modulations.by_run(true)
     for kind, how in both.items():
-        yield added_to_readings(scene, f"offset_{kind}", how)
-        yield added_to_readings(scene, f"gain_{kind}", how, gain=True)
-    for column in scene.logged:
-        yield added_to_readings(scene, f"sensitivity:{column}", modulations.with_column(scene, column))
+        yield added_to_readings(true, f"offset_{kind}", how)
+        yield added_to_readings(true, f"gain_{kind}", how, gain=True)
+    for column in true.logged:
+        yield added_to_readings(true, f"sensitivity:{column}", modulations.with_column(true, column))
     if timed:
-        yield added_to_readings(scene, "interference", modulations.waves(scene, _N_WAVES))
-        yield added_to_readings(scene, "settling", modulations.settling(scene))
+        yield added_to_readings(true, "interference", modulations.waves(true, _N_WAVES))
+        yield added_to_readings(true, "settling", modulations.settling(true))
 
 
 def way_of(y: FloatArray, rows: SystemRows) -> FloatArray:
@@ -84,8 +84,8 @@ def way_of(y: FloatArray, rows: SystemRows) -> FloatArray:
     return out
 
 
-def _bent(scene: Scene) -> Iterator[Form]:
-    low, high, sd = float(scene.readings.min()), float(scene.readings.max()), scene.sd
+def _bent(true: TrueSystem) -> Iterator[Form]:
+    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.sd
     yield Form(
         "hysteresis",
         "reading",
@@ -176,10 +176,10 @@ def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
     return out
 
 
-def _behind(scene: Scene) -> Iterator[Form]:
-    if scene.rows.time is None:
+def _behind(true: TrueSystem) -> Iterator[Form]:
+    if true.rows.time is None:
         return
-    gap = scene.rows.gap
+    gap = true.rows.gap
     acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: earlier(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
     for name, (act, least) in acts.items():
         yield Form(

@@ -11,7 +11,7 @@ from probewise.world.systems.forms.form import Form, Now, Numbers
 from probewise.world.systems.forms.inside import pushing
 from probewise.world.systems.forms.modulations import one_by_one
 from probewise.world.systems.forms.readings import OFFSET
-from probewise.world.systems.forms.scene import Scene, log_uniform
+from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 from probewise.world.systems.rows import SystemRows
 
 __all__ = ["STRANGE", "strangers"]
@@ -31,27 +31,27 @@ STRANGE = (
 """Names of these effects, without targets."""
 
 
-def strangers(scene: Scene, rng: np.random.Generator) -> Iterator[Form]:
+def strangers(true: TrueSystem, rng: np.random.Generator) -> Iterator[Form]:
     """Bind every effect outside the vocabulary to randomly drawn columns and states."""
-    columns = [str(name) for name in rng.permutation(scene.logged)]
+    columns = [str(name) for name in rng.permutation(true.logged)]
     first, second = columns[0], columns[1]
-    yield _product(scene, first, second)
-    yield _switch(scene, first, float(rng.uniform(0.55, 0.8)))
-    yield _memory(scene, first)
-    yield _fading(scene, first)
-    if scene.rows.time is not None:
-        yield _square(scene, rng)
-        yield _chirp(scene)
-        yield _two_settlings(scene)
-    if scene.kind.law is not None and scene.states:
-        state = str(rng.choice(list(scene.states)))
-        yield _spring(scene, state)
-        yield _leak(scene, state)
-        yield _driven(scene, state, first)
+    yield _product(true, first, second)
+    yield _switch(true, first, float(rng.uniform(0.55, 0.8)))
+    yield _memory(true, first)
+    yield _fading(true, first)
+    if true.rows.time is not None:
+        yield _square(true, rng)
+        yield _chirp(true)
+        yield _two_settlings(true)
+    if true.kind.law is not None and true.states:
+        state = str(rng.choice(list(true.states)))
+        yield _spring(true, state)
+        yield _leak(true, state)
+        yield _driven(true, state, first)
 
 
 def _added(
-    scene: Scene,
+    true: TrueSystem,
     name: str,
     shape: str,
     over: object,
@@ -61,7 +61,7 @@ def _added(
     def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         return np.asarray(y + v["a"] * over(y, rows, v))  # type: ignore[operator]
 
-    sd = scene.sd
+    sd = true.sd
     return Form(
         f"strange_{name}",
         "reading",
@@ -79,11 +79,11 @@ def _added(
     )
 
 
-def _product(scene: Scene, one: str, other: str) -> Form:
-    a, b = scene.middle(one), scene.middle(other)
-    scale = scene.spread(one) * scene.spread(other)
+def _product(true: TrueSystem, one: str, other: str) -> Form:
+    a, b = true.middle(one), true.middle(other)
+    scale = true.spread(one) * true.spread(other)
     return _added(
-        scene,
+        true,
         f"product:{one}:{other}",
         "y + a (C - mean C)(D - mean D) / (sd C sd D)",
         lambda y, rows, v: (rows.columns[one] - a) * (rows.columns[other] - b) / scale,
@@ -91,10 +91,10 @@ def _product(scene: Scene, one: str, other: str) -> Form:
     )
 
 
-def _switch(scene: Scene, column: str, share: float) -> Form:
-    at = float(np.quantile(scene.rows.columns[column], share))
+def _switch(true: TrueSystem, column: str, share: float) -> Form:
+    at = float(np.quantile(true.rows.columns[column], share))
     return _added(
-        scene,
+        true,
         f"switch:{column}",
         "y + a 1(C > c)",
         lambda y, rows, v: 1.0 * (rows.columns[column] > at),
@@ -102,9 +102,9 @@ def _switch(scene: Scene, column: str, share: float) -> Form:
     )
 
 
-def _memory(scene: Scene, column: str) -> Form:
+def _memory(true: TrueSystem, column: str) -> Form:
     """Add the sum of a column since the start of the run, soft-limited."""
-    middle, spread = scene.middle(column), scene.spread(column)
+    middle, spread = true.middle(column), true.spread(column)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         out = np.empty(len(rows))
@@ -113,7 +113,7 @@ def _memory(scene: Scene, column: str) -> Form:
         return out
 
     return _added(
-        scene,
+        true,
         f"memory:{column}",
         "y + a tanh(sum of abs(C - mean C) since the start of the run)",
         over,
@@ -121,65 +121,65 @@ def _memory(scene: Scene, column: str) -> Form:
     )
 
 
-def _fading(scene: Scene, column: str) -> Form:
+def _fading(true: TrueSystem, column: str) -> Form:
     middle, spread, low, high = (
-        scene.middle(column),
-        scene.spread(column),
-        float(scene.readings.min()),
-        float(scene.readings.max()),
+        true.middle(column),
+        true.spread(column),
+        float(true.readings.min()),
+        float(true.readings.max()),
     )
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         z = np.clip((y - low) / (high - low), 0, 1)
         return np.asarray(4 * z * (1 - z) * (rows.columns[column] - middle) / spread)
 
-    return _added(scene, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", over, (column, "level"))
+    return _added(true, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", over, (column, "level"))
 
 
-def _square(scene: Scene, rng: np.random.Generator) -> Form:
-    hz = log_uniform(rng, 4 / scene.rows.duration, 0.06 / scene.rows.gap)
+def _square(true: TrueSystem, rng: np.random.Generator) -> Form:
+    hz = log_uniform(rng, 4 / true.rows.duration, 0.06 / true.rows.gap)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         return np.where((hz * rows.t) % 1.0 < 0.3, 1.0, 0.0)
 
     return _added(
-        scene, "square_wave", "y + a while (t / P) mod 1 < 0.3", over, ("time", str(scene.rows.time)), {"hz": hz}
+        true, "square_wave", "y + a while (t / P) mod 1 < 0.3", over, ("time", str(true.rows.time)), {"hz": hz}
     )
 
 
-def _chirp(scene: Scene) -> Form:
-    begin, end = float(scene.rows.t.min()), float(scene.rows.t.max())
+def _chirp(true: TrueSystem) -> Form:
+    begin, end = float(true.rows.t.min()), float(true.rows.t.max())
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         z = (rows.t - begin) / (end - begin)
         return np.asarray(np.sin(2 * np.pi * (3 * z + 8 * z**2)))
 
     return _added(
-        scene, "chirp", "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time", over, ("time", str(scene.rows.time))
+        true, "chirp", "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time", over, ("time", str(true.rows.time))
     )
 
 
-def _two_settlings(scene: Scene) -> Form:
-    longest = float(scene.rows.since_start.max())
+def _two_settlings(true: TrueSystem) -> Form:
+    longest = float(true.rows.since_start.max())
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         since = Now.at_rows(rows).since[0]
         return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
 
     return _added(
-        scene,
+        true,
         "two_settlings",
         "y + a (exp(-t / tau) - 1.5 exp(-t / (7 tau)))",
         over,
-        ("time", "run", str(scene.rows.time)),
+        ("time", "run", str(true.rows.time)),
     )
 
 
-def _spring(scene: Scene, state: str) -> Form:
-    at = float(np.quantile(scene.states[state], 0.6))
-    size = float(np.ptp(scene.states[state]))
+def _spring(true: TrueSystem, state: str) -> Form:
+    at = float(np.quantile(true.states[state], 0.6))
+    size = float(np.ptp(true.states[state]))
     return pushing(
-        scene,
+        true,
         f"strange_one_sided_spring:{state}",
         state,
         lambda s, now, v: -np.maximum(s[state] - at, 0.0),
@@ -189,14 +189,14 @@ def _spring(scene: Scene, state: str) -> Form:
     )
 
 
-def _leak(scene: Scene, state: str) -> Form:
-    scale = 0.3 * float(np.abs(scene.states[state]).max())
+def _leak(true: TrueSystem, state: str) -> Form:
+    scale = 0.3 * float(np.abs(true.states[state]).max())
 
     def push(s: dict[str, FloatArray], now: object, v: Numbers) -> FloatArray:
         return np.asarray(-np.expm1(np.clip(s[state] / scale, -30, 12)))
 
     return pushing(
-        scene,
+        true,
         f"strange_leak:{state}",
         state,
         push,
@@ -206,10 +206,10 @@ def _leak(scene: Scene, state: str) -> Form:
     )
 
 
-def _driven(scene: Scene, state: str, column: str) -> Form:
-    middle, spread, most = scene.middle(column), scene.spread(column), float(np.abs(scene.states[state]).max())
+def _driven(true: TrueSystem, state: str, column: str) -> Form:
+    middle, spread, most = true.middle(column), true.spread(column), float(np.abs(true.states[state]).max())
     return pushing(
-        scene,
+        true,
         f"strange_column_times_state:{state}:{column}",
         state,
         lambda s, now, v: -(now.u[column] - middle) / spread * s[state] ** 2 / most**2,

@@ -1,4 +1,4 @@
-"""The context in which forms are bound: a system at its true parameters, over the rows not held out."""
+"""The system at its true parameters, about which effects are built, over the rows not held out."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from probewise.errors import NotConvergedError
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["Scene", "log_uniform"]
+__all__ = ["TrueSystem", "log_uniform"]
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class TrueSystem:
     """A system at its true parameters.
 
     Parameters

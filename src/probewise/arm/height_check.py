@@ -1,9 +1,8 @@
-"""Heights checked by the light itself: over white a sensor that hangs lower reads more.
+"""Check the sensor's height by its light: over white, a lower sensor reads more.
 
-How a reading falls with the height is taken from the arm: at one place it reads at several heights. What it reads
-elsewhere over the same white then tells how high it hangs there, against where its counters say. That light falls with
-the square of the height is a first guess only: a room's light does not, nor does an LED's near the surface, where the
-sensor shades what it lights.
+The decrease of the reading with height is measured at one place. A reading elsewhere over the same white then gives the
+sensor's height there, to be compared with that of the counters. An inverse-square law is only a first approximation: it
+does not hold for the room's light, nor for the LED's near the surface, which the sensor shades.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ ROUNDING_MM = 0.2  # sd of a height that whole counts leave
 
 @dataclass(frozen=True)
 class Look:
-    """Readings over white at one place: where, how high by the counters, the mean reading and its standard error."""
+    """Readings over white: the place, the height by the counters, the mean reading and its standard error."""
 
     place_mm: tuple[float, float]
     height_mm: float
@@ -38,16 +37,16 @@ class Look:
 
 @dataclass(frozen=True, eq=False)
 class HeightCheck:
-    """What the light says of heights.
+    """Heights measured by the light, compared with those of the counters.
 
     Parameters
     ----------
     per_mm
-        By how much of itself a reading falls with each mm, at the lowest of the heights at the first place.
+        Relative decrease of a reading per mm, at the lowest of the heights at the first place.
     off_mm, sd_mm
         True height minus that of the counters at each other place, relative to the first, and its sd, (n_places,).
     p_value
-        How often heights that are as told give readings as odd as these.
+        Probability of readings at least this odd if the counters are right.
     """
 
     per_mm: float
@@ -57,19 +56,19 @@ class HeightCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether the readings contradict no height."""
+        """Whether the readings agree with the heights of the counters."""
         return self.p_value >= _LEAST_P
 
 
 def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
-    """Compare heights that the light tells with those of the counters.
+    """Compare heights measured by the light with those of the counters.
 
     Parameters
     ----------
     curve
         Readings at the first place, three heights or more.
     others
-        Readings elsewhere over the same white, one look a place.
+        Readings elsewhere over the same white, one Look per place.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What is uncertain of an arm's geometry, and what that does to where the sensor stands."""
+"""Uncertain parameters of an arm's geometry, and their effect on the sensor's place."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ FITTED = (
     *("base home", "shoulder home", "elbow home", "upper link", "lower link"),
     *("base x", "base y", "shoulder forward", "shoulder height"),
 )
-"""What is fitted, angles in radians, lengths in mm; the sensor's own lengths go with those of the shoulder."""
+"""Fitted parameters, angles in radians, lengths in mm; the sensor's own lengths are collinear with the shoulder's."""
 
 RULER_SDS = np.array([*np.radians([5.0, 5.0, 5.0]), 5.0, 5.0, 10.0, 10.0, 10.0, 10.0])
-"""So well is each known before, from a ruler and by eye."""
+"""Prior sd of each, as measured with a ruler and by eye."""
 
 
 def values_of(geometry: Geometry) -> FloatArray:
-    """Take the numbers of `FITTED`, (9,)."""
+    """Return the values of the parameters `FITTED`, (9,)."""
     homes = [joint.home_rad for joint in geometry.joints]
     return np.array([*homes, *geometry.links_mm, *geometry.axis_mm, *geometry.shoulder_mm])
 
 
 def places_of(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
-    """Place the sensor, (n, 3), of an arm of other numbers whose joints have turned so far from home, (n, 3)."""
+    """Return the sensor's places (n, 3) for these values of `FITTED` and joint turns from home (n, 3)."""
     return placed_mm(
         values[:3] + turned_rad,
         values[3:5],
@@ -38,18 +38,18 @@ def places_of(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) ->
 
 
 def slopes_mm(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
-    """Tell how the sensor's true place and height change with each number of the geometry.
+    """Return the derivatives of the sensor's true place and height with respect to each parameter `FITTED`.
 
     Parameters
     ----------
     geometry
-        The arm as it is known.
+        The nominal geometry.
     places_mm
-        Where it says that the sensor is, (n, 2), at the height of reading.
+        The sensor's places by that geometry, (n, 2), at the reading height.
 
     Returns
     -------
-    Shape (n, 3, 9): x, y and height by the numbers of `FITTED`; NaN at a place that the arm does not reach.
+    Shape (n, 3, 9): x, y and height by the parameters of `FITTED`; NaN at a place out of reach.
     """
     values = values_of(geometry)
     turned = geometry.angles_rad(places_mm, geometry.read_height_mm) - values[:3]

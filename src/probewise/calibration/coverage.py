@@ -47,7 +47,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Coverage:
-    """How often the 95 % interval of each quantity held the truth, in `n_recordings` recordings."""
+    """How often the 95 % interval of each quantity contained the truth, in `n_recordings` recordings."""
 
     n_recordings: int
     held: dict[str, int]

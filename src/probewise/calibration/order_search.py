@@ -34,7 +34,7 @@ class Found:
 
     @property
     def evidence(self) -> NestedResult | Climb | Weighted:
-        """What log Z is taken from: the refined one where it is sound."""
+        """The result whose log Z is used: the refined one if it is reliable."""
         return self.refined if self.refined is not None and self.refined.sound else self.result
 
 
@@ -60,7 +60,7 @@ def search_order(
 
 
 def _disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
-    """Say so where the two estimates of an evidence do not agree within their errors."""
+    """Return a warning if the two estimates of an evidence do not agree within their errors."""
     apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
     if apart <= _DISAGREE or not set(refined.doubts) <= set(refined.inherited):
         return ()

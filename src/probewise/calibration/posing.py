@@ -1,4 +1,4 @@
-"""Pose the calibration of one order as a problem of inference."""
+"""The calibration of one order as an inference problem."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ __all__ = ["Posing", "problem_for"]
 
 @dataclass(frozen=True, eq=False)
 class Posing:
-    """A recording, what is believed of each order before it, and which readings share a noise sd."""
+    """A recording, the prior of each order, and which readings share a noise sd."""
 
     recording: Recording
     prior: Callable[[Recording, int], SSFPrior]
     data_sets: IntArray | None = None
 
     def belief(self, n_gaussians: int) -> SSFPrior:
-        """Give the prior of an order."""
+        """Return the prior of an order."""
         found = self.prior(self.recording, n_gaussians)
         if not isinstance(found, SSFPrior):
             raise ParameterError("prior", found, "an SSFPrior")
         return found
 
     def problem(self, n_gaussians: int) -> SensorProblem:
-        """Pose an order."""
+        """Return the inference problem of an order."""
         return problem_for(self.recording, self.belief(n_gaussians), data_sets=self.data_sets)
 
 

@@ -298,7 +298,7 @@ def default_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
 
 
 def paper_prior(recording: Recording, n_gaussians: int) -> SSFPrior:
-    """Believe as the paper does: uniformly in each a, u, v, A, B, C and level, within the bounds of `default_prior`.
+    """Make the paper's prior: uniform in each a, u, v, A, B, C and level, within the bounds of `default_prior`.
 
     The paper prints no bounds. C is uniform where A and B leave the Gaussian positive definite.
 

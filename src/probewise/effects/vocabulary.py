@@ -144,7 +144,7 @@ class NamedEffect(Effect[V], Protocol[V]):
 
 
 def require_effects(effects: object) -> None:
-    """Raise ParameterError unless these are classes of effects by their names, each with what it has to say itself."""
+    """Raise ParameterError unless these are classes of effects by name, each with all members of its own."""
     allowed = "classes of effects by name, such as {**VOCABULARY, 'overflow': Overflow}, of probewise.effects"
     require_mapping("effects", effects, allowed)
     assert isinstance(effects, Mapping)
@@ -165,7 +165,7 @@ _OWN = ("name", "stage", "units", "covariates", "amplitudes", "for_extent", "pri
 
 
 def _inherited(kind: type, name: str) -> object:
-    """Give what the bare protocol has in the place of a member: for a class method, bound to this class."""
+    """Return a member as the bare protocol has it; a class method is bound to this class."""
     found = getattr(NamedEffect, name, None)
     return getattr(found, "__func__", found).__get__(kind) if name == "for_extent" else found  # type: ignore[union-attr]
 

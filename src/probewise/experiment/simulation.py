@@ -97,7 +97,7 @@ def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = Non
 
 
 def bin_width_of(sensor: FittedSensor) -> float:
-    """Give the width of the bins that the paper's entropy sorts readings into: the instrument's step, or its noise."""
+    """Return the bin width of the paper's entropy: the instrument's rounding step, or else its noise sd."""
     return scale_of(sensor.instrumentation).step or float(sensor.noise_sd.mean())
 
 

@@ -15,7 +15,7 @@ __all__ = ["reading_span", "sd_ceiling", "sd_floor", "student_t"]
 
 
 def reading_span(recording: Recording) -> float:
-    """Range of the usable readings; where they are all equal, the declared range, or else 1."""
+    """Range of the usable readings; if they are all equal, the declared range, or else 1."""
     readings = recording.readings[recording.usable]
     span = float(np.ptp(readings)) if readings.size else 0.0
     if span > 0:

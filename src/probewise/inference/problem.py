@@ -52,7 +52,7 @@ def scores(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) 
     Raises
     ------
     ShapeError
-        If the likelihood, which may be a person's own, gives anything else than one number a hypothesis.
+        If the likelihood, which may be a user's own, does not return one number per hypothesis.
     """
     scored = likelihood.log_prob(readings, predicted)
     if np.shape(scored) != (len(predicted),):

@@ -39,17 +39,17 @@ class Bound:
 
     @property
     def search(self) -> float:
-        """Readings until the shape is found."""
+        """Number of readings until the shape is found."""
         return self.search_bits / self.search_capacity_bits
 
     @property
     def refinement(self) -> float:
-        """Readings after that."""
+        """Number of readings from there until the target precision."""
         return self.refinement_bits / self.capacity_bits
 
     @property
     def readings(self) -> float:
-        """Readings in all."""
+        """Total number of readings."""
         return self.search + self.refinement
 
 

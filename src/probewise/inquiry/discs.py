@@ -219,7 +219,7 @@ class DiscTable:
 
 
 def is_alike_everywhere(effect: AnyEffect) -> bool:
-    """Tell whether an effect is known and changes the footprint alike at every place and time: a table can hold it."""
+    """Return whether an effect is known and changes the footprint equally everywhere, so that a table can hold it."""
     return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
 
 

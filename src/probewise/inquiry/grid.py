@@ -39,7 +39,7 @@ class Grid:
 
     @cached_property
     def x_mm(self) -> FloatArray:
-        """Columns, shape (n_x,)."""
+        """X of each column, (n_x,)."""
         return _read_only(np.linspace(0.0, self.width_mm, self.n_x))
 
     @cached_property

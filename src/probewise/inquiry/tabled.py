@@ -224,7 +224,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
 
 
 def _tabled(model: Chain) -> TabledChain | None:
-    """Look up what a chain with effects sees in a table of the same chain without those that no table holds."""
+    """Evaluate a chain with effects by the table of the same chain without the effects that no table can hold."""
     table = DiscTable.of(replace(model, effects=tuple(filter(is_alike_everywhere, model.effects))))
     return None if table is None else TabledChain.of(model, table)
 

@@ -28,7 +28,7 @@ class TabledChain:
 
     @classmethod
     def of(cls, chain: Chain, plain: SensorModel) -> Self | None:
-        """Look up what `chain` sees in the table of `plain`, the same chain with fewer effects; None where not."""
+        """Evaluate `chain` by the table of `plain`, the same chain with fewer effects; None if that is impossible."""
         if isinstance(plain, TabledChain):
             plain = plain.table if plain.cards is None else plain.cards
         cards = plain if isinstance(plain, CardedModel) else None

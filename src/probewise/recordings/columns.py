@@ -118,12 +118,12 @@ def seconds(values: ArrayLike) -> ArrayLike:
 
 
 def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
-    """Take what else was logged, one number a reading of each.
+    """Check the other logged columns: one number per reading in each.
 
     Raises
     ------
     ParameterError
-        If they have no names, or one that a recording has a column for.
+        If they have no names, or the name of one of a recording's own columns.
     """
     if columns is None:
         return {}
@@ -137,12 +137,12 @@ def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> di
 
 
 def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
-    """Take the rows that are asked for: numbers, one truth value a row, or a slice; their numbers, (n_rows,).
+    """Convert a selection of rows (numbers, one truth value per row, or a slice) to row numbers, (n_rows,).
 
     Raises
     ------
     ParameterError
-        If they are nothing of these, or a row is not there.
+        If the selection is none of these, or a row does not exist.
     """
     allowed = f"numbers of rows in a list, up to {n_points - 1}; {n_points} truth values; or a slice"
     if isinstance(rows, slice):
@@ -253,7 +253,7 @@ def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
 
 
 def _text(what: str, text: str) -> str:
-    """Take a name as it is read from a file: without the blanks around it."""
+    """Return a name as a file would hold it: without surrounding blanks."""
     if not text.strip().isprintable():
         raise ParameterError(what, text, "a printable text, without line ends")
     return text.strip()

@@ -1,4 +1,4 @@
-"""The page of a study of concealed faults: what doubt in the sensor is worth."""
+"""The page of a study of concealed faults: the robot with and without doubt in its sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cards whose place and albedo are known: they lie on the field, over whatever lies there."""
+"""Reference cards of known place and albedo, which lie on top of the field and its shapes."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Card:
 
     @property
     def telling_mm(self) -> FloatArray:
-        """Places that tell most about a sensor: its middle, and the middles of its sides, (5, 2)."""
+        """Most informative places for reading the card: its middle, and the middles of its sides, (5, 2)."""
         half_x, half_y = self.width_mm / 2, self.height_mm / 2
         away = np.array([[0.0, 0.0], [-half_x, 0.0], [half_x, 0.0], [0.0, -half_y], [0.0, half_y]])
         return np.asarray(np.array([self.x_mm, self.y_mm]) + away)
@@ -63,14 +63,14 @@ class Card:
 
 @dataclass(frozen=True, eq=False)
 class CardedRegion:
-    """A region with cards on it; what follows in the list lies on top."""
+    """A region with cards on it; later cards of the tuple lie on top."""
 
     region: Region
     cards: tuple[Card, ...]
 
     @property
     def n_regions(self) -> int:
-        """How many hypotheses it holds, or 1."""
+        """Number of hypotheses, or 1 if all share one region."""
         return self.region.n_regions
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -85,10 +85,10 @@ class CardedRegion:
 
 
 def laid_over(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
-    """Lay cards over what would be seen without them; `covered` is the share of the view on each card.
+    """Combine the fraction seen without cards with the cards; `covered` is the share of the view on each card.
 
-    Exact where a view holds no edge but a card's, or none of a card's: a view that holds both takes the shape
-    for as white under the card as beside it.
+    Exact for a view that contains edges of cards only, or none of a card; with both, the albedo under the card is taken
+    to be the mean albedo of the view.
     """
     for card, share in zip(cards, covered, strict=True):
         seen = np.asarray(seen * (1.0 - share) + card.albedo * share)
@@ -112,5 +112,5 @@ class CardedScene(HypothesisScene):
     cards: tuple[Card, ...] = field(default=())
 
     def regions(self, theta: FloatArray) -> SameForAll:
-        """Give the shape's region with the cards on it, theta (n_samples, n_params), under any pattern name."""
+        """Return the shape's region with the cards on it, theta (n_samples, n_params), under any pattern name."""
         return SameForAll(CardedRegion(self.shape.region(theta), self.cards))

@@ -236,7 +236,7 @@ class Chain:
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
-        """Stand where each hypothesis says that the sensor really stands: the way up to POSE, as `predict` goes it."""
+        """Return the sensor's true poses under each hypothesis: the chain up to stage POSE."""
         told = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
         found: Poses = self._applier(theta, plan)(Stage.POSE, told)
         return found

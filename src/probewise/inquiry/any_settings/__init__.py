@@ -1,8 +1,8 @@
-"""Choose the settings of any instrument: a model of its readings, a prior, the settings that it has, its noise.
+"""Choose the next setting of any instrument, given a model of its readings, a prior, its settings and its noise.
 
 The paper's machine learning system without a field of shapes: readings update the posterior (`belief`), and the next
-setting is the one whose reading promises most (`worth`), by expected information (Lindley 1956) or by what brings
-the sds that are asked for nearest.
+setting maximises an acquisition function (`worth`): expected information (Lindley 1956) or, near a goal, the expected
+decrease of the posterior sds towards it.
 """
 
 from probewise.inquiry.any_settings.inquiry import Inquiry

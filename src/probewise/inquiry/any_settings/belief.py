@@ -1,4 +1,4 @@
-"""What is believed after some readings: weighted samples and evidence, reweighted, redrawn, or sampled anew."""
+"""The posterior after some readings: weighted samples and evidence, reweighted, redrawn, or sampled anew."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Model:
 
     @classmethod
     def of(cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings) -> Model:
-        """Find out how a person's function can be called: for arrays at once, for one sample, for one reading."""
+        """Find out how a user's function can be called: with arrays, for one sample, or for one reading."""
 
         def many(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
             return function(dict(parameters), settings.given(columns))
@@ -61,7 +61,7 @@ class Model:
 
     @cached_property
     def prior(self) -> Prior:
-        """The prior, with that of the noise's sd at its end where that is unknown."""
+        """The prior of the parameters, and at its end that of the noise sd if it is unknown."""
         if not self.noise.inferred:
             return self.own_prior
         return Joint((self.own_prior, Product({NOISE_SD: self.noise.sd})))  # type: ignore[dict-item]
@@ -87,7 +87,7 @@ class Model:
         return out
 
     def _blame(self, theta: FloatArray, settings: Settings, out: FloatArray) -> None:
-        """Raise what the function raises at the first sample whose prediction is not finite, or say which it is."""
+        """Raise the function's own error at the first sample without a finite prediction, or name that sample."""
         sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
         own = {name: theta[[sample], k : k + 1] for k, name in enumerate(self.own_prior.names)}
         self.caller(own, settings.columns, strict=True)
@@ -134,9 +134,9 @@ class Readings:
         return out
 
     def fit(self, theta: FloatArray) -> tuple[float, int]:
-        """How well one hypothesis (1, n_params) fits: upper tail of chi-square, and the reading it explains worst.
+        """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
 
-        One degree of freedom for each reading, whatever was fitted, so that it errs towards fitting.
+        It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.
         """
         predicted = self.model.predict(theta, self.settings)
         scale = self.model.scale(theta, predicted)
@@ -146,7 +146,7 @@ class Readings:
 
 
 def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted:
-    """Draw equally weighted samples of the prior: the posterior of no readings, whose evidence is one."""
+    """Draw equally weighted samples of the prior, which is the posterior without readings; its evidence is one."""
     theta = prior.from_unit_cube(rng.random((n, len(prior.names))))
     return Weighted(prior.names, theta, np.zeros(n), np.full(n, -math.log(n)), 0.0, 0.0, float(n), 0, -math.inf)
 
@@ -154,10 +154,10 @@ def prior_samples(prior: Prior, n: int, *, rng: np.random.Generator) -> Weighted
 def updated(
     previous: Weighted, readings: Readings, log_density: FloatArray, n: int, n_live: int, *, rng: np.random.Generator
 ) -> Weighted:
-    """Take in the last of the readings.
+    """Update the posterior by the last of the readings.
 
-    Samples are reweighted; where too few count, `nested.update` draws `n` anew from a density fitted to them, against
-    all readings; where those are not sound either, nested sampling starts from the prior.
+    Samples are reweighted; if too few keep weight, `nested.update` draws `n` anew from a density fitted to them, against
+    all readings; if those are not reliable either, nested sampling starts from the prior.
 
     Parameters
     ----------

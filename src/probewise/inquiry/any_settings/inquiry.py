@@ -1,4 +1,4 @@
-"""Measure, infer, inquire with any instrument: which setting to read next, and what is known after each reading."""
+"""Measure, infer, inquire with any instrument: the posterior after each reading, and the setting to read next."""
 
 from __future__ import annotations
 
@@ -33,35 +33,34 @@ _NEARER = "expected fall of the sum of ln(sd / goal)"
 
 
 class Inquiry(ShowsItself):
-    """An inquiry: the posterior of a model's parameters, and the setting whose reading promises most.
+    """An inquiry: the posterior of a model's parameters, and the setting with the largest acquisition function.
 
     Parameters
     ----------
     model
         Predicts readings: `model(parameters, settings)`, `parameters` a dict by name, `settings` in the form in which
         they are given here. It is called with arrays that broadcast, parameters (n_samples, 1) against settings
-        (n_settings,), if it gives the same that way; else for one sample after the other, and if need be for one
-        setting after the other.
+        (n_settings,), if that gives the same readings; otherwise sample by sample, and if need be setting by setting.
     prior
         Distributions by name (`probewise.priors` or frozen ones of scipy.stats), or a prior.
     settings
         Every setting that the instrument has: numbers or names (n_settings,) of one knob; numbers (n_settings, n_knobs)
         of several, which the model gets as (n_knobs, n_settings), to be unpacked; or a dict of columns by name.
     noise
-        Sd of a reading's noise: a number, a function of the predicted reading, or its prior, where it is unknown;
-        or a `ReadingNoise`, for heavy tails and outliers.
+        Sd of a reading's noise: a number, a function of the predicted reading, or a prior if it is unknown; or a
+        `ReadingNoise`, for heavy tails and outliers.
     rng
         Source of randomness: the same generator and readings give the same choices.
     goal
-        The posterior sd that is asked for, by parameter: `{"centre_hz": 0.5}`. Then readings are chosen for it, and
-        `settled` tells when it is reached. Without, readings are chosen for the information about all parameters.
+        Target posterior sd by parameter: `{"centre_hz": 0.5}`. Readings are then chosen to reach it, and `settled`
+        turns True. Without it, readings are chosen for the information about all parameters.
     cost_s
         Seconds that a reading takes at each setting, (n_settings,); or a function of the last setting (None at first)
-        that returns them. Then worth is counted per second.
+        that returns them. `worth` is then per second.
     n_samples
         Posterior samples.
     n_live
-        Live points of nested sampling, which starts anew where the samples cannot follow a surprising reading.
+        Live points of nested sampling, which starts anew if the samples cannot follow a surprising reading.
 
     Raises
     ------
@@ -114,15 +113,15 @@ class Inquiry(ShowsItself):
 
     @property
     def readings(self) -> tuple[tuple[Any, float], ...]:
-        """Settings and readings so far; told to a new inquiry, one after the other, they are taken in again."""
+        """Settings and readings so far; to resume, pass them to `tell` of a new inquiry, one after the other."""
         return tuple(self._taken)
 
     @property
     def worth(self) -> FloatArray:
-        """What a reading at each setting promises, (n_settings,), per second where seconds are known.
+        """Acquisition function of each setting, (n_settings,), per second if the costs in seconds are given.
 
-        Expected information, until every sd that the goal names is within three times its goal: then by how much the
-        sum of ln(sd / goal) is expected to fall. Once the goal is reached, information again.
+        It is the expected information until every sd that the goal names is within three times its goal; from then on
+        the expected decrease of the sum of ln(sd / goal); and once the goal is reached, information again.
         """
         if self._worth is None:
             self._worth = self._valued(self._posterior.weight) / self._costs()
@@ -131,20 +130,20 @@ class Inquiry(ShowsItself):
 
     @property
     def worth_label(self) -> str:
-        """What the worth is, with its unit, for an axis."""
+        """Axis label of the acquisition function, with its unit."""
         per_second = "" if self._cost_s is None else " per second"
         return f"{_NEARER if self._near else _BITS}{per_second}"
 
     @property
     def settled(self) -> bool:
-        """Whether every sd that the goal names is reached."""
+        """Whether the posterior sd of every parameter in the goal is at most its goal."""
         if not self._goal:
             raise ParameterError("goal", None, 'the sds that are asked for, by parameter: goal={"centre_hz": 0.5}')
         return self._times_goal <= 1.0
 
     @property
     def doubt(self) -> str | None:
-        """What speaks against the model: no hypothesis explains the readings (p < 1e-6); None where nothing does."""
+        """A warning if no hypothesis explains the readings (p < 1e-6), with the worst reading; otherwise None."""
         if self._readings is None:
             return None
         best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
@@ -159,30 +158,30 @@ class Inquiry(ShowsItself):
         )
 
     def next(self) -> Any:
-        """Return the setting whose reading promises most, in the form of `settings`; ties are broken at random."""
+        """Return the setting with the largest acquisition function, in the form of `settings`; ties break at random."""
         if self._next is None:
             row = choose(self.worth, np.ones(len(self._settings), dtype=np.bool_), rng=self._rng)
             self._next = self._settings[row]
         return self._next
 
     def tell(self, reading: float, setting: Any = None) -> None:
-        """Take in a reading.
+        """Update the posterior by a reading.
 
         Parameters
         ----------
         reading
-            What was read.
+            The value read.
         setting
-            Where, if elsewhere than `next()` said; it need not be one of the settings.
+            Its setting, by default that of `next()`; it need not be one of the settings.
 
         Raises
         ------
         ParameterError
-            If the reading is not a finite number. Nothing is taken in.
+            If the reading is not a finite number. The posterior is unchanged.
         NotConvergedError
-            If no hypothesis could have given these readings. Nothing is taken in.
+            If no hypothesis could have given these readings. The posterior is unchanged.
         """
-        value = require_finite_number("reading", reading, "a finite number; a reading that did not come is not told")
+        value = require_finite_number("reading", reading, "a finite number; leave out a missing reading")
         at = self._settings.one(self.next() if setting is None else setting)
         readings = _with(self._readings, self._model, at, value)
         theta = self._posterior.theta
@@ -193,10 +192,10 @@ class Inquiry(ShowsItself):
         self._worth, self._next = None, None
 
     def several(self, n: int) -> list[Any]:
-        """Choose settings of readings that are to be taken together, before any of them is known; best first.
+        """Choose the settings of several readings to be taken before any of them is known; best first.
 
-        Each is the best beside those before it, on average over imagined results of those: greedy on the joint
-        information (Nemhauser, Wolsey & Fisher 1978). Told one by one: `tell(reading, setting)`.
+        Greedy on the joint information (Nemhauser, Wolsey & Fisher 1978): each is the best addition to those before
+        it, averaged over simulated readings there. Pass the results one by one to `tell(reading, setting)`.
         """
         require_whole("n", n)
         everywhere = np.ones(len(self._settings), dtype=np.bool_)
@@ -216,7 +215,7 @@ class Inquiry(ShowsItself):
         return [self._settings[row] for row in rows]
 
     def summary(self) -> str:
-        """Describe what is known, in plain text."""
+        """Describe the posterior in plain text."""
         found = self._posterior
         width = max(9, *(len(name) for name in found.names))
         low, high = found.interval(0.95)
@@ -232,7 +231,7 @@ class Inquiry(ShowsItself):
 
     @property
     def _times_goal(self) -> float:
-        """How many times as wide as its goal the widest sd is."""
+        """Largest ratio of a posterior sd to its goal."""
         sd = dict(zip(self._posterior.names, self._posterior.sd(), strict=True))
         return float(max(sd[name] / goal for name, goal in self._goal.items()))
 

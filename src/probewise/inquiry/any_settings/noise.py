@@ -40,7 +40,7 @@ class ReadingNoise:
     dof
         Degrees of freedom of a Student-t distribution; infinity is the Gaussian.
     outliers
-        Share of the readings that have nothing to do with the prediction, 0 or more, below 1.
+        Share of the readings that do not depend on the prediction, 0 or more, below 1.
     between
         Least and greatest outlier; they are uniform in between. Required if there are outliers.
     """
@@ -69,7 +69,7 @@ class ReadingNoise:
 
     @classmethod
     def of(cls, given: AnyNoise) -> ReadingNoise:
-        """Make a noise of any of its forms: a sd, a function of the prediction, the prior of a sd, or a noise."""
+        """Build the noise from a sd, a function of the prediction, the prior of a sd, or a ReadingNoise."""
         return given if isinstance(given, ReadingNoise) else cls(given)
 
     @property

@@ -1,4 +1,4 @@
-"""The settings that an instrument has, as a person gives them: one knob, several, or knobs by name."""
+"""The settings of an instrument as a user gives them: one knob, several, or knobs by name."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _ALLOWED = (
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """Settings as columns, and the form in which they were given: so are they handed to the model and to a person.
+    """Settings as columns, and the form in which they were given, in which the model and the user get them back.
 
     `form`: "one" knob, an array (n,); "several" knobs, an array (n, n_knobs); or knobs by "name", a dict of columns.
     """
@@ -64,7 +64,7 @@ class Settings:
         return Settings({n: np.concatenate([c, other.columns[n]]) for n, c in self.columns.items()}, self.form)
 
     def given(self, columns: Mapping[str, Column]) -> Any:
-        """Hand columns to the model in the form of the settings; several knobs as (n_knobs, n), to be unpacked."""
+        """Return the settings in the model's form; several knobs as (n_knobs, n), to be unpacked."""
         if self.form == "one":
             return columns["setting"]
         return np.stack(list(columns.values())) if self.form == "several" else dict(columns)
@@ -77,7 +77,7 @@ class Settings:
         return np.array(list(own.values())) if self.form == "several" else own
 
     def one(self, setting: Any) -> Settings:
-        """Read one setting as a person gives it, of the form that `self[row]` has; it need not be one of these."""
+        """Parse one setting given in the form of `self[row]`; it need not be one of these."""
         if self.form == "name":
             if not isinstance(setting, Mapping) or setting.keys() != self.columns.keys():
                 raise ParameterError("setting", setting, f"a dict of {', '.join(self.columns)}")

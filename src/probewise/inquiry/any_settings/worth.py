@@ -1,9 +1,9 @@
-"""What a reading at each setting promises: information, and how near it brings the sds that are asked for.
+"""Acquisition functions of a setting: expected information, and expected distance of the sds from a goal.
 
-At each setting the samples of the posterior are sorted by the reading that they predict and put into groups. The
-predictive density is the mixture of the groups, each as wide as its noise and its own spread together; means over it
-are sums over samples of each group and nodes of a quadrature over the noise. Nothing is binned, so a reading that
-tells a hundredth of a bit is valued as surely as one that tells ten.
+At each setting the posterior samples are sorted by the reading that they predict, and divided into groups. The
+predictive density is a mixture with one component per group, whose variance is that of the noise plus that within the
+group; means over it are sums over samples of each group and nodes of a quadrature over the noise. Nothing is binned, so
+a hundredth of a bit is resolved as well as ten bits.
 """
 
 from __future__ import annotations
@@ -49,11 +49,11 @@ class Predictive:
         self._read = self._sampled(grouped, noise.nodes[1])
 
     def _sampled(self, grouped: FloatArray, weight: FloatArray) -> FloatArray:
-        """Choose the sample of each group that each node of the noise is added to, (n_groups, n_nodes, n_settings).
+        """Choose the sample of each group to which each noise node is added, (n_groups, n_nodes, n_settings).
 
-        A group may hold samples far apart, and its middle lie where nothing is predicted. Each pair of nodes, above and
-        below, stands at another sample, by turns from group to group. Where noise hides the spread of a group, they are
-        shifted and stretched to its mean and variance.
+        A group may hold samples far apart, with no sample near its mean. So each pair of nodes, above and below, is
+        added to another sample, in turn from group to group. If the noise is wider than the group, the nodes are
+        shifted and scaled to its mean and variance.
         """
         n_groups, size = self._shape
         n_pairs = (len(weight) + 1) // 2
@@ -69,7 +69,7 @@ class Predictive:
         return np.where(hidden, self._centre[:, None] + (read - mean) * stretch, read)
 
     def information(self) -> FloatArray:
-        """Give the expected information about all parameters together, bits, (n_settings,)."""
+        """Return the expected information about all parameters jointly, bits, (n_settings,)."""
         node, weight = self.noise.nodes
         alone = self._centre[:, None, :] + self._scale[:, None, :] * node[:, None]
         log_own = self.noise.log_density(alone, self._centre[:, None, :], self._scale[:, None, :])
@@ -83,12 +83,12 @@ class Predictive:
         return np.asarray(np.maximum(given - mixed, 0.0) / math.log(2))
 
     def distance(self, values: FloatArray, goal: FloatArray) -> FloatArray:
-        """Give the distance from the goal expected after a reading, (n_settings,): the sum of ln(sd / goal) above 0.
+        """Return the expected distance from the goal after a reading, (n_settings,): the sum of ln(sd / goal) above 0.
 
         Parameters
         ----------
         values
-            What is to be known, (n_samples, n_values).
+            Posterior samples of the quantities in the goal, (n_samples, n_values).
         goal
             The sd of each that is asked for, (n_values,).
         """
@@ -109,9 +109,9 @@ class Predictive:
         return out
 
     def _regressed(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Predict a value from the reading within each group: level, slope and variance left, (n_groups, n_settings).
+        """Regress a value on the reading within each group: level, slope, residual variance, (n_groups, n_settings).
 
-        Within a group value and reading are taken for jointly Gaussian.
+        Within a group, value and reading are assumed jointly Gaussian.
         """
         own = value[self._order].reshape(*self._shape, -1)
         mean = own.mean(axis=1)
@@ -120,7 +120,7 @@ class Predictive:
         return mean - slope * self._centre, slope, own.var(axis=1) - slope * together
 
     def _blocks(self) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
-        """Yield settings by settings: rows, nodes (n_rows, n_nodes), density of each, and each group's part of it."""
+        """Yield blocks of settings: rows, nodes (n_rows, n_nodes), density at each, and each group's part of it."""
         n_groups, n_settings = self._centre.shape
         node = self.noise.nodes[0]
         outliers = self.noise.outlier_nodes(_N_OUTLIERS)

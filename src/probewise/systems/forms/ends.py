@@ -1,4 +1,4 @@
-"""Where something that is cut off may end: a ceiling in the upper part of its range, a floor in the lower."""
+"""Levels at which a quantity may be clipped: a ceiling in the upper part of its range, a floor in the lower."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _N_LEVELS = 10  # of either
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Levels between `low` and `high`: what lies above `middle` is a ceiling, what does not, a floor."""
+    """Clipping levels between `low` and `high`: above `middle` a ceiling, otherwise a floor."""
 
     low: float
     high: float
 
     @property
     def middle(self) -> float:
-        """Where ceilings begin."""
+        """Level above which the clipping is a ceiling."""
         return self.low + _LOWER_PART * (self.high - self.low)
 
     @property
@@ -42,10 +42,10 @@ class Ends:
 
     @property
     def nowhere(self) -> float:
-        """A level that nothing reaches."""
+        """A level out of reach, which has no effect."""
         return self.high + (self.high - self.low)
 
 
 def ends_of(low: float, high: float) -> Ends | None:
-    """Take a range; None where there is none."""
+    """Build from a range of values; None if they are constant."""
     return Ends(low, high) if low < high else None

@@ -1,4 +1,4 @@
-"""All forms that are bound to a system."""
+"""Every effect of the vocabulary, built for one system."""
 
 from __future__ import annotations
 

@@ -156,7 +156,7 @@ def updated(
 ) -> Weighted:
     """Update the posterior by the last of the readings.
 
-    Samples are reweighted; if too few keep weight, `nested.update` draws `n` anew from a density fitted to them, against
+    Samples are reweighted. If too few keep weight, `nested.update` draws `n` from a density fitted to them, against
     all readings; if those are not reliable either, nested sampling starts from the prior.
 
     Parameters

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import EffectAudit
-from probewise.diagnosis.audit.plan_audit import Smallest
+from probewise.diagnosis.audit.plan_audit import DetectableSize
 from probewise.report.audit_table import audit_table
 from probewise.report.plots import audit_matrix
 
@@ -36,14 +36,14 @@ def test_the_matrix_takes_its_statuses_by_their_old_name_with_a_warning():
 @pytest.mark.parametrize(
     ("size", "said"),
     [
-        (Smallest("per_volt", "1/V", 0.069), "relative change 0.069 per V"),
-        (Smallest("per_mm_x", "LEGO/mm", 0.014), "along X 0.014 LEGO units per mm"),
-        (Smallest("amp", "LEGO", 0.55), "amplitude 0.55 LEGO units"),
-        (Smallest("mm_per_mm", "mm/mm", 0.0015), "slope 0.0015 mm per mm"),
-        (Smallest("ceiling_v", "V", None), "ceiling v at no size"),
-        (Smallest("gain", "W/m2", 3.0), "gain 3 W/m2"),
+        (DetectableSize("per_volt", "1/V", 0.069), "relative change 0.069 per V"),
+        (DetectableSize("per_mm_x", "LEGO/mm", 0.014), "along X 0.014 LEGO units per mm"),
+        (DetectableSize("amp", "LEGO", 0.55), "amplitude 0.55 LEGO units"),
+        (DetectableSize("mm_per_mm", "mm/mm", 0.0015), "slope 0.0015 mm per mm"),
+        (DetectableSize("ceiling_v", "V", None), "ceiling v at no size"),
+        (DetectableSize("gain", "W/m2", 3.0), "gain 3 W/m2"),
     ],
-    ids=lambda value: value.parameter if isinstance(value, Smallest) else "",
+    ids=lambda value: value.parameter if isinstance(value, DetectableSize) else "",
 )
 def test_a_size_is_in_words_with_its_unit(size, said):
     assert f">{said}<" in audit_table([EffectAudit("lag", "fine", 0.9, smallest=(size,))])

@@ -8,7 +8,14 @@ the gain on held-out readings.
 from probewise.diagnosis.advice.aliases import Alias
 from probewise.diagnosis.advice.next_scans import NextMeasurement
 from probewise.diagnosis.audit.document import CURE_PLAN, audit_json
-from probewise.diagnosis.audit.plan_audit import Cure, EffectAudit, PlanAudit, Smallest, audit_plan, audit_recorded
+from probewise.diagnosis.audit.plan_audit import (
+    Cure,
+    DetectableSize,
+    EffectAudit,
+    PlanAudit,
+    audit_plan,
+    audit_recorded,
+)
 from probewise.diagnosis.engine import Thorough, diagnose
 from probewise.diagnosis.fitting.earlier import SensorPrior
 from probewise.diagnosis.fitting.null import Null
@@ -44,6 +51,7 @@ __all__ = [
     "TO_SEPARATE",
     "Alias",
     "Cure",
+    "DetectableSize",
     "Diagnosis",
     "EffectAudit",
     "EffectFound",
@@ -67,7 +75,6 @@ __all__ = [
     "Repair",
     "SensorAndShape",
     "SensorPrior",
-    "Smallest",
     "SystemFit",
     "Thorough",
     "Verdict",
@@ -91,3 +98,6 @@ __all__ = [
     "repaired_of",
     "weigh_thoroughly",
 ]
+
+Smallest = DetectableSize
+"""The old name of `DetectableSize`."""

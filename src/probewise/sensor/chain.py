@@ -95,7 +95,7 @@ class FixedLevels:
         return ()
 
     def values(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the two numbers, each (1, 1)."""
+        """Return I_min and I_max, each (1, 1); theta is ignored."""
         return np.array([[self.i_min]]), np.array([[self.i_max]])
 
 

@@ -35,7 +35,16 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_described, require_plan
 from probewise.sensor import Stage, is_free_form
 
-__all__ = ["Cure", "Detectability", "EffectAudit", "PlanAudit", "Smallest", "audit_plan", "audit_recorded", "judged"]
+__all__ = [
+    "Cure",
+    "Detectability",
+    "DetectableSize",
+    "EffectAudit",
+    "PlanAudit",
+    "audit_plan",
+    "audit_recorded",
+    "judged",
+]
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
@@ -53,7 +62,7 @@ _TYPICAL = np.array([-0.6, 0.15, 0.2, -0.6, -0.3, 0.3, -0.2, -0.1, 0.4, 0.7, -0.
 
 
 @dataclass(frozen=True)
-class Smallest:
+class DetectableSize:
     """The value of one parameter at which an effect has lambda 8; None if it never has."""
 
     parameter: str
@@ -88,7 +97,7 @@ class EffectAudit:
     detectability: Detectability
     share: float
     alike: tuple[tuple[str, float], ...] = ()
-    smallest: tuple[Smallest, ...] = ()
+    smallest: tuple[DetectableSize, ...] = ()
     reason: str = ""
     rows: int | None = None
 
@@ -384,7 +393,7 @@ def _seen(
         return EffectAudit(effect.name, "invisible", share, reason=reason)
     alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
     smallest = tuple(
-        Smallest(effect.prior.names[k], unit_in_words(effect.units[k], unit), amount)
+        DetectableSize(effect.prior.names[k], unit_in_words(effect.units[k], unit), amount)
         for k, amount in zip(effect.amplitudes, amounts, strict=True)
     )
     return EffectAudit(effect.name, "aliased" if alike else "fine", share, tuple(alike), smallest)

@@ -54,12 +54,12 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
     for name in driving_columns(about):
         values = table.covariates[name]
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
-        says = partial(_said, f"{name} is {{}} more than it says")
+        says = partial(_said, f"the true {name} is the recorded {name} plus {{}}")
         yield from _linear(about, f"input_offset:{name}", _on(name, _raised), 1e-4 * spread, name, says, name)
-        says = partial(_said, f"{name} is {{}} more than it says, for each unit of it")
+        says = partial(_said, f"the true {name} is the recorded {name} times (1 + a), a = {{}}")
         yield from _linear(about, f"input_gain:{name}", _on(name, _scaled), 1e-4, "1", says, name)
         yield from _cut_off(about, name, low, high)
-        says = partial(_said, f"{name} does nothing within {{}} of 0")
+        says = partial(_said, f"{name} has no effect within {{}} of 0")
         if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # if larger, it is an offset
             yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name, says, name)
         if _turns_back(values, table):
@@ -69,7 +69,7 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
             )
         yield from _wave(about, name)
         if table.has_time:
-            says = partial(_said, f"{name} acts {{}} {about.time_unit} late")
+            says = partial(_said, f"{name} acts with a delay of {{}} {about.time_unit}")
             yield from _sized(
                 about,
                 f"input_delay:{name}",
@@ -82,7 +82,7 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
                 name,
             )
     if time is not None:
-        says = partial(_said, "the clock gains {} for each unit of time that it says")
+        says = partial(_said, "the true time is the recorded time times (1 + a), a = {}")
         yield from _linear(about, "clock_drift", _on(time, _scaled), 1e-5, "1", says, "time")
 
 
@@ -189,7 +189,8 @@ def _wave(about: About, name: str) -> Iterator[Form]:
         entries(typical),
         (0,),
         lambda m, s: (
-            f"{name} is off by up to {with_unit(m[0], s[0], '')} again and again, every {with_unit(m[1], s[1], '')}"
+            f"{name} has a periodic error with an amplitude of {with_unit(m[0], s[0], '')} "
+            f"and a period of {with_unit(m[1], s[1], '')}, both in units of {name}"
         ),
         joined=wave_joined,
     )

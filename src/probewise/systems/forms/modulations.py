@@ -174,7 +174,8 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
         entries=entries,
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
-            f"{what} swings by {with_unit(mean[0], sd[0], unit)} either way, once in {1 / mean[1]:.4g} {time_unit}"
+            f"{what} oscillates with an amplitude of {with_unit(mean[0], sd[0], unit)} and a period of "
+            f"{1 / mean[1]:.4g} {time_unit}"
         ),
         covariates=("time",),
         joined=wave_joined,

@@ -31,12 +31,12 @@ def forms_on_rates(about: About) -> Iterator[Form]:
     for state, values in about.states.items():
         size = float(np.nanmax(np.abs(values))) or 1.0
         own = f"{state} per {about.time_unit}"
-        yield from _term(about, f"damping:{state}", state, state, lambda r: -r, size, f"a force -a {state}")
+        yield from _term(about, f"damping:{state}", state, state, lambda r: -r, size, f"a damping term -a {state}")
         yield from _term(
-            about, f"drag:{state}", state, state, lambda r: -np.abs(r) * r, size**2, f"a drag -a |{state}| {state}"
+            about, f"drag:{state}", state, state, lambda r: -np.abs(r) * r, size**2, f"a drag term -a |{state}| {state}"
         )
         yield from _term(
-            about, f"forcing:{state}", state, state, lambda r: 1.0 + 0.0 * r, 1.0, "a constant force a", unit=own
+            about, f"forcing:{state}", state, state, lambda r: 1.0 + 0.0 * r, 1.0, "a constant term a", unit=own
         )
         yield from _friction(about, state, own)
         yield from _wave(about, state, own)
@@ -104,7 +104,7 @@ def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
             entries,
             (),
             lambda mean, sd: (
-                f"dry friction of {with_unit(mean[0], sd[0], '')} slows {state} down, and holds it where it rests"
+                f"dry friction slows {state} by {with_unit(mean[0], sd[0], '')} per {about.time_unit}, and holds it at rest"
             ),
             absent={0: 0.0},
         )
@@ -143,8 +143,8 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
         entries(typical),
         (0,),
         lambda mean, sd: (
-            f"the rate of {state} lacks a force that swings by {with_unit(mean[0], sd[0], '')}, "
-            f"once in {1 / mean[1]:.4g} {about.time_unit}"
+            f"the rate of {state} lacks a sinusoidal term with an amplitude of {with_unit(mean[0], sd[0], '')} "
+            f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
         ),
         joined=wave_joined,
     )

@@ -127,7 +127,7 @@ def _settling(about: About) -> Iterator[Form]:
         entries,
         (0,),
         lambda mean, sd: (
-            f"{reading} starts each run {with_unit(mean[0], sd[0], unit)} off and settles "
+            f"{reading} is off by {with_unit(mean[0], sd[0], unit)} at the start of each run, and settles "
             f"with a time constant of {with_unit(mean[1], sd[1], time_unit)}"
         ),
     )
@@ -158,7 +158,7 @@ def _lag(about: About) -> Iterator[Form]:
             _between(prior),
             (),
             lambda mean, sd: (
-                f"{about.system.simulator.reading} follows with a lag of {with_unit(mean[0], sd[0], time_unit)}"
+                f"{about.system.simulator.reading} lags with a time constant of {with_unit(mean[0], sd[0], time_unit)}"
             ),
             absent={0: 0.0},
         )
@@ -183,7 +183,7 @@ def _delay(about: About) -> Iterator[Form]:
             act,
             _between(prior),
             (),
-            lambda mean, sd: f"{about.system.simulator.reading} comes {with_unit(mean[0], sd[0], time_unit)} late",
+            lambda mean, sd: f"{about.system.simulator.reading} is delayed by {with_unit(mean[0], sd[0], time_unit)}",
             absent={0: 0.0},
         )
 
@@ -238,7 +238,8 @@ def _hysteresis(about: About) -> Iterator[Form]:
         np.full((1, 1, 1), about.sd),
         (0,),
         lambda mean, sd: (
-            f"{reading} reads {with_unit(2 * mean[0], 2 * sd[0], unit)} more on its way up than on its way down"
+            f"{reading} reads {with_unit(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} while "
+            "it rises than while it falls"
         ),
     )
 
@@ -272,8 +273,8 @@ def _bend(about: About) -> Iterator[Form]:
         entries,
         (0,),
         lambda mean, sd: (
-            f"{reading} is bent: y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at {high:.4g} {unit}, "
-            f"a {with_unit(mean[0], sd[0], '')}, power {with_unit(mean[1], sd[1], '')}"
+            f"{reading} has a bent response, y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at "
+            f"{high:.4g} {unit}, a = {with_unit(mean[0], sd[0], '')}, power = {with_unit(mean[1], sd[1], '')}"
         ),
     )
 

@@ -42,8 +42,8 @@ class PredictiveMixture:
     def add(self, mean: FloatArray, level: NoiseLevel, between: FloatArray | None = None) -> None:
         """Add noise-free predictions, (n_samples, n_points), and the noise about them.
 
-        `between` (n_points,) is the sd by which each sample stands for what lies between it and the next, where samples
-        lie farther apart than the noise is wide: the density alone is smoothed by it.
+        `between` (n_points,) is an additional smoothing sd of the density, for samples whose predictions lie farther
+        apart than the noise; mean and sd are unaffected.
         """
         if self._center is None:
             self._center = mean.mean(axis=0)  # sums about a nearby value keep their precision

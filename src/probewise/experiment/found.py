@@ -30,7 +30,7 @@ _POLYGONS = {3: "triangle", 4: "square", 5: "pentagon", 6: "hexagon", 8: "octago
 class FoundParameter:
     """A parameter of the shape: its name, which ends in its unit, and its posterior.
 
-    `arm_sd` is that part of the sd which comes from the arm's own error; None: it is not known, and no part of it.
+    `arm_sd` is the part of the sd that is due to the arm's own error; None if that is unknown and not included.
     """
 
     name: str

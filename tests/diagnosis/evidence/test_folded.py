@@ -34,8 +34,8 @@ def test_another_order_is_the_same_sensor(n_gaussians):
     sensor = default_sensor(EXTENT, n_gaussians)
     model, z = Model(sensor, (), PLAN), np.random.default_rng(2).standard_normal((5, sensor.n_params))
     for order in itertools.permutations(range(n_gaussians)):
-        np.testing.assert_allclose(model.predict(sensor.renamed(z, order)), model.predict(z), rtol=1e-9)
-    np.testing.assert_allclose(sensor.renamed(z, range(n_gaussians)), z, atol=1e-12)
+        np.testing.assert_allclose(model.predict(sensor.permuted(z, order)), model.predict(z), rtol=1e-9)
+    np.testing.assert_allclose(sensor.permuted(z, range(n_gaussians)), z, atol=1e-12)
 
 
 @pytest.mark.parametrize("n_gaussians", [2, 3])
@@ -47,7 +47,7 @@ def test_all_orders_fold_to_one_where_the_density_is(n_gaussians):
     assert np.isfinite(prior.log_prob(once)).all()
     np.testing.assert_array_equal(once[:, n_own:], z[:, n_own:])
     for order in itertools.permutations(range(n_gaussians)):
-        other = np.concatenate([prior.sensor.renamed(z[:, :n_own], order), z[:, n_own:]], axis=1)
+        other = np.concatenate([prior.sensor.permuted(z[:, :n_own], order), z[:, n_own:]], axis=1)
         np.testing.assert_allclose(prior.fold(other), once, atol=1e-9)
 
 

@@ -47,8 +47,8 @@ class FoldedNormal(StandardNormal):
         """Every other order's coordinates as z @ turn + shift: (n_others, n_own, n_own), (n_others, 1, n_own)."""
         n_own = self.sensor.n_params
         orders = list(itertools.permutations(range(self.sensor.n_gaussians)))[1:]
-        shift = np.stack([self.sensor.renamed(np.zeros((1, n_own)), order) for order in orders])
-        return np.stack([self.sensor.renamed(np.eye(n_own), order) for order in orders]) - shift, shift
+        shift = np.stack([self.sensor.permuted(np.zeros((1, n_own)), order) for order in orders])
+        return np.stack([self.sensor.permuted(np.eye(n_own), order) for order in orders]) - shift, shift
 
     def _images(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return every order's coordinates, (n_orders, n_samples, n_params), and their distances from the point."""

@@ -172,7 +172,7 @@ class SensorCoordinates(CalibratedSensor):
         """Invert `from_natural`."""
         return theta_to_natural(theta, self.n_gaussians)
 
-    def renamed(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
+    def permuted(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
         """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians permuted."""
         n, natural = self.n_gaussians, self._natural(z)
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]

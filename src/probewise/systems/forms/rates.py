@@ -104,7 +104,8 @@ def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
             entries,
             (),
             lambda mean, sd: (
-                f"dry friction slows {state} by {with_unit(mean[0], sd[0], '')} per {about.time_unit}, and holds it at rest"
+                f"dry friction slows {state} by {with_unit(mean[0], sd[0], '')} per {about.time_unit}, "
+                "and holds it at rest"
             ),
             absent={0: 0.0},
         )

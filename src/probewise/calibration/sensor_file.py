@@ -328,7 +328,7 @@ class FittedSensor(ShowsItself):
 
     def _noise_in_words(self) -> str:
         known = [name.replace("_", " ") for name in self.effects if cast(Stage, EFFECTS[name].stage) == Stage.NOISE]
-        plain = "Gaussian, one sd pooled over scans; one value a sample"
+        plain = "Gaussian, one sd pooled over scans; one value per sample"
         return f"{plain}; with {' and '.join(known)}" if known else f"independent {plain}"
 
     @classmethod

@@ -168,7 +168,7 @@ def read_journal(path: str | Path) -> Journal:
     for row, entry in enumerate(entries, start=2):
         if entry.index != row - 1:
             raise FileError(
-                path, f"index {shown(entry.index)}", f"{row - 1}: one line a measurement, in order", row=row
+                path, f"index {shown(entry.index)}", f"{row - 1}: one line per measurement, in order", row=row
             )
     notes: list[str] = []
     n_torn = 0

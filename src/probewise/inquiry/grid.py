@@ -56,7 +56,7 @@ class Grid:
     def image(self, values: FloatArray) -> FloatArray:
         """Arrange one value per place as an image, (n_places,) -> (n_y, n_x), lower row first."""
         if values.shape != (self.n_places,):
-            raise ShapeError(f"values have shape {values.shape}; allowed: ({self.n_places},), one a place")
+            raise ShapeError(f"values have shape {values.shape}; allowed: ({self.n_places},), one per place")
         return values.reshape(self.n_y, self.n_x)
 
     def plan(self, pattern_name: str, *, orientation_rad: float = 0.0, time_s: float = 0.0) -> Plan:

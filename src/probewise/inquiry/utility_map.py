@@ -89,7 +89,7 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
     worth, label = utility.measure(prospect) if isinstance(utility, Finishing) else (utility(prospect), utility.label)
     found = np.asarray(worth, dtype=np.float64)
     if found.shape != prospect.rows.shape:
-        raise ShapeError(f"the utility gives {found.shape} values; allowed: {prospect.rows.shape}, one a design")
+        raise ShapeError(f"the utility gives {found.shape} values; allowed: {prospect.rows.shape}, one per design")
     values = np.zeros(len(prospect.designs))
     reachable = np.zeros(len(prospect.designs), dtype=np.bool_)
     values[prospect.rows], reachable[prospect.rows] = found, True
@@ -141,7 +141,7 @@ def entropy_map(
 def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1) -> IntArray:
     """Return the indices of the designs at reachable places, (n_places,) -> (n,)."""
     if reachable.shape != (n_places,):
-        raise ShapeError(f"reachable has shape {reachable.shape}; allowed: ({n_places},), one a place")
+        raise ShapeError(f"reachable has shape {reachable.shape}; allowed: ({n_places},), one per place")
     if not reachable.any():
         raise ReachError(
             "reachable places",

@@ -153,7 +153,7 @@ class Given:
 
 
 def test_a_utility_of_the_wrong_size_or_not_finite_is_refused(made):
-    with pytest.raises(ShapeError, match="one a design"):
+    with pytest.raises(ShapeError, match="one per design"):
         utility_map(made.listed(APART), Given(np.zeros(2)))
     with pytest.raises(ParameterError, match="finite"):
         utility_map(made.listed(APART), Given(np.full(3, np.nan)))

@@ -48,7 +48,7 @@ class Caller:
     by_row
         Parameters that it takes as arrays (n_points,) when called for one sample; ignored where it broadcasts.
     name
-        What a person calls the function, for messages.
+        The name of the function in messages.
 
     `cut_short` is set if work was skipped because of too many calls.
     """

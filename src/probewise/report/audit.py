@@ -46,6 +46,8 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
     """Write the whole page."""
     shown = figure(
         drawn["audit.png"],
+        "Fine: these readings detect the effect and tell it from every other. Aliased: they detect it, but another "
+        "effect can imitate it. Invisible: they cannot detect it. "
         "Left: share of each effect's change in the readings that "
         f"{audit.words.null}'s own parameters cannot absorb. "
         "Right: the effect of the row is present, at typical parameters; the cosine measures how well the effect of "
@@ -104,7 +106,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     left = [spoken_name(e.name) for e in audit.after if e.detectability != "fine"]
     return (
         table(
-            ("step", "what to do", "readings", "effects for which it is then fine"),
+            ("step", "what to do", "readings", "effects that are then fine"),
             (
                 (
                     str(k),

@@ -356,7 +356,9 @@ def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) ->
     sd = _NOISE * (high - low) if noise_sd is None else noise_sd
     if not sd > 0:
         raise ParameterError("noise_sd", sd, "greater than 0")
-    return Expected(null, z, (low, high), sd), f"{said}, noise {sd:.3g} {plan.instrumentation.unit}".rstrip()
+    return Expected(
+        null, z, (low, high), sd
+    ), f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
 
 
 def judged(

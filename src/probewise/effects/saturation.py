@@ -76,7 +76,8 @@ class Saturation(NamedEffect[FloatArray]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say above which reading nothing is reported, and how gently that limit sets in."""
+        softness = f"{mean[1]:.2g} {self.unit}".rstrip()
         return (
             f"no reading rises above {give_or_take(mean[0], sd[0], self.unit)}: the electronics saturate, "
-            f"from about {mean[1]:.2g} {self.unit} below that limit".replace("  ", " ")
+            f"from about {softness} below that limit"
         )

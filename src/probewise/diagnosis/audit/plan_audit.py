@@ -52,9 +52,8 @@ _MOST_READINGS = 4000  # readings of a recording that are used; of a longer one 
 _SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis
 _LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
 _READING_GUIDE = (
-    "(fine: these readings detect the effect and tell it from every other. aliased (with X, c): they detect it, but X",
-    " can imitate it, up to a cosine c (1: exactly); if X is the true effect, they may still tell it from this one.",
-    " invisible: they cannot detect it.)",
+    "(fine: detected, and told from every other effect. aliased (X c): detected, but X can imitate it, with a cosine",
+    " of c; the reverse need not hold. invisible: not detected.)",
 )
 _NOISE = 0.01  # noise as a share of the span between the levels, likewise
 # Two Gaussians, a core and a faint halo, off-centre and not round, so that no effect is invisible by symmetry.
@@ -211,7 +210,7 @@ def count_of(names: Sequence[str], noun: str) -> str:
 
 
 def _with_aliases(effect: EffectAudit) -> str:
-    return f"{effect.name} (with {effect.alike[0][0]}, {effect.alike[0][1]:.2f})"
+    return f"{effect.name} ({effect.alike[0][0]} {effect.alike[0][1]:.2f})"
 
 
 def _listed(label: str, names: Sequence[str], width: int = 100) -> list[str]:

@@ -1,6 +1,6 @@
-"""Climb from the posterior of N - 1 Gaussians to that of N by sequential Monte Carlo (Del Moral, Doucet & Jasra 2006).
+"""Climb to the posterior of N Gaussians by sequential Monte Carlo (Del Moral, Doucet & Jasra 2006).
 
-Particles drawn from a `Reference` are carried in small changes of temperature to the posterior of N: weighed,
+Particles drawn from a density that is known, made from the posterior of N - 1 or about a peak, are carried in small changes of temperature to the posterior of N: weighed,
 resampled, and moved by Metropolis steps. They form clouds that are weighed and resampled each by itself, so that
 the scatter of the clouds' evidences is an honest error: it holds what one cloud found and another missed.
 """
@@ -10,25 +10,29 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
 
 import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
-from probewise.calibration.reference import Reference
+from probewise.calibration.priors import SSFPrior
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["Climb", "Rung", "climb"]
+__all__ = ["Climb", "KnownDensity", "Rung", "climb"]
 
-# Effective share of the particles that a change of temperature leaves.
+# A change of temperature leaves at least this share of the particles effective.
 _KEPT = 0.5
 _N_STEPS = 5
 _BISECTIONS = 40
 _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: one costs as much as a move.
-_DRAWS = 6
+_DRAWS = 4
+# Moves of each particle once the posterior is reached, and how many of them lie between two samples that are kept.
+_N_MORE, _APART = 12, 4
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 6
 # A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.
@@ -39,6 +43,27 @@ _JITTER = 1e-5
 _MOST_ERROR = 0.5
 _LEAST_CLOUDS = 0.3
 _LEAST_ACCEPTED = 0.02
+
+
+class KnownDensity(Protocol):
+    """A normalised density of N Gaussians that particles start from."""
+
+    @property
+    def prior(self) -> SSFPrior:
+        """Of N Gaussians."""
+        ...
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log of the density over the prior's sorted one, up to what `log_z_below` counts; (n, 6 N + 2) -> (n,)."""
+        ...
+
+    def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw one for each sample of the order below, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
+        ...
+
+    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Propose afresh, (n, 6 N + 2); and log density of the old over that of the new, over the prior's, (n,)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -72,6 +97,8 @@ class Climb(ShowsItself):
         Share of the moves accepted at the last temperature.
     n_calls
         Likelihood evaluations, those of the order below included.
+    doubts
+        What else speaks against it.
     """
 
     names: tuple[str, ...]
@@ -83,6 +110,7 @@ class Climb(ShowsItself):
     temperatures: FloatArray
     accepted: float
     n_calls: int
+    doubts: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("theta", "log_likelihood", "log_weight", "log_z_of_clouds", "temperatures"):
@@ -115,7 +143,7 @@ class Climb(ShowsItself):
             (not share >= _LEAST_CLOUDS, f"{len(self.log_z_of_clouds)} clouds are worth {share:.0%} of them"),
             (not self.accepted >= _LEAST_ACCEPTED, f"{self.accepted:.1%} of the moves were accepted"),
         )
-        return tuple(words for so, words in told if so)
+        return (*(words for so, words in told if so), *self.doubts)
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order."""
@@ -159,7 +187,7 @@ class _Cloud:
 
 def climb(
     problem: SensorProblem,
-    reference: Reference,
+    reference: KnownDensity,
     rest: FloatArray,
     *,
     log_z_below: FloatArray,
@@ -195,16 +223,18 @@ def climb(
     space = reference.prior.coordinates
     n_calls = n_calls_below
 
-    def known(x: FloatArray) -> _Cloud:
+    def known(x: FloatArray, beta: float = 0.0) -> _Cloud:
         nonlocal n_calls
         theta, log_prior = space.leave(x)
         # What is impossible weighs nothing, but was drawn.
         log_likelihood, log_reference = np.full(len(x), -np.inf), np.zeros(len(x))
         possible = np.flatnonzero(np.isfinite(log_prior))
         if possible.size:
-            n_calls += 2 * possible.size
+            n_calls += possible.size
             log_likelihood[possible] = problem.log_likelihood(theta[possible])
-            log_reference[possible] = reference.log_likelihood(theta[possible])
+            if beta < 1.0:
+                n_calls += possible.size
+                log_reference[possible] = reference.log_likelihood(theta[possible])
         return _Cloud(x, log_prior, log_likelihood, log_reference)
 
     n_clouds = len(log_z_below)
@@ -215,7 +245,7 @@ def climb(
     temperatures, accepted = [0.0], 0.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
         rise = now.rise
-        beta = _next(rise, temperatures[-1])
+        beta = _next(rise, temperatures[-1], _KEPT * len(rest))
         width = beta - temperatures[-1]
         log_weight = (width * rise).reshape(n_clouds, -1)
         if not np.isfinite(log_weight.max(axis=1)).all():
@@ -229,18 +259,28 @@ def climb(
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):
-            now, share = _moved(now, known, reference, beta, rng)
+            now, share = _moved(now, partial(known, beta=beta), reference, beta, rng)
             shares.append(share)
         accepted = float(np.mean(shares))
+        if beta == 1.0:
+            now = known(now.x)
         log_z += _log_ratio(log_weight, (width * now.rise).reshape(n_clouds, n))
         if told is not None:
             told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
-    theta, _ = space.leave(now.x)
+    kept = [now]
+    if temperatures[-1] == 1.0:
+        for k in range(1, _N_MORE + 1):
+            now, _ = _moved(now, partial(known, beta=1.0), reference, 1.0, rng)
+            if k % _APART == 0:
+                kept.append(now)
+    x = np.stack([cloud.x.reshape(n_clouds, n, -1) for cloud in kept], axis=1)
+    theta, _ = space.leave(x.reshape(-1, x.shape[-1]))
+    log_likelihood = np.stack([cloud.log_likelihood.reshape(n_clouds, n) for cloud in kept], axis=1)
     return Climb(
         names=reference.prior.names,
         theta=theta,
-        log_likelihood=now.log_likelihood,
-        log_weight=np.repeat(log_z - float(logsumexp(log_z)) - math.log(n), n),
+        log_likelihood=log_likelihood.ravel(),
+        log_weight=np.full(len(theta), -math.log(len(theta))),
         log_z_of_clouds=log_z,
         start_error=error_below,
         temperatures=np.array(temperatures),
@@ -264,12 +304,12 @@ def _log_ratio(before: FloatArray, after: FloatArray) -> FloatArray:
     return np.asarray(log_ratio)
 
 
-def _next(rise: FloatArray, beta: float) -> float:
-    """Find the next temperature: that whose weights leave `_KEPT` of the particles."""
-    if n_effective((1.0 - beta) * rise) >= _KEPT * len(rise):
-        return 1.0
+def _next(rise: FloatArray, beta: float, least: float) -> float:
+    """Find the next temperature: that whose weights leave so many of the particles effective."""
     # What is impossible is lost at any temperature.
-    least = _KEPT * float(np.isfinite(rise).sum())
+    least = min(least, _KEPT * float(np.isfinite(rise).sum()))
+    if n_effective((1.0 - beta) * rise) >= least:
+        return 1.0
     low, high = beta, 1.0
     for _ in range(_BISECTIONS):
         middle = 0.5 * (low + high)
@@ -278,7 +318,7 @@ def _next(rise: FloatArray, beta: float) -> float:
 
 
 def _moved(
-    now: _Cloud, known: Callable[[FloatArray], _Cloud], reference: Reference, beta: float, rng: np.random.Generator
+    now: _Cloud, known: Callable[[FloatArray], _Cloud], reference: KnownDensity, beta: float, rng: np.random.Generator
 ) -> tuple[_Cloud, float]:
     """Move each particle once, one half after the other; tell the share of moves accepted.
 
@@ -306,7 +346,7 @@ def _moved(
         x = old.x + np.where(by_block[:, None] & ~in_block, 0.0, step)
         fresh = np.flatnonzero(kind > _FRESH_FROM)
         here, _ = space.leave(old.x[fresh])
-        there, log_drawn = _redrawn(here, reference, rng)
+        there, log_drawn = reference.redrawn(here, rng=rng)
         with np.errstate(invalid="ignore"):
             x[fresh] = space.enter(there)
             new = known(x)
@@ -317,26 +357,3 @@ def _moved(
         n_accepted += int(better.sum())
         now = now.put(own[better], new.take(np.flatnonzero(better)))
     return now, n_accepted / n
-
-
-def _redrawn(here: FloatArray, reference: Reference, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Take away a Gaussian and draw another one, each by one way of the reference.
-
-    Returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new, both over the
-    prior's, (n,); -inf where the move is impossible.
-    """
-    there, log_drawn = np.full(here.shape, np.nan), np.full(len(here), -np.inf)
-    which = rng.choice(len(reference.ways), size=len(here), p=[way.share for way in reference.ways])
-    for k, way in enumerate(reference.ways):
-        rows = np.flatnonzero(which == k)
-        rest, log_here = way.back(here[rows])
-        possible = np.isfinite(log_here)
-        rows, log_here = rows[possible], log_here[possible]
-        if not rows.size:
-            continue
-        there[rows] = way.draw(rest[possible], rng=rng)
-        possible = np.isfinite(there[rows]).all(axis=1)
-        rows, log_here = rows[possible], log_here[possible]
-        log_there = way.back(there[rows])[1]
-        log_drawn[rows] = np.where(np.isfinite(log_there), log_here - log_there, -np.inf)
-    return there, log_drawn

@@ -1,9 +1,9 @@
-"""Fit one order after another: search the prior of one Gaussian, and climb from each order to the next.
+"""Fit one order after another: from the peak of its likelihood, or from the posterior of the order below.
 
-The steps take a tenth of the evaluations of nested sampling of every order. What they cannot see is a peak that is
-far from every posterior of the order below. So one short nested search of a whole prior stands beside them, that of the
-order after the one with the greatest evidence: where its evidence, or its best likelihood, lies above what the climb
-found, no climb is believed.
+Where one Gaussian more raises the likelihood much, its posterior lies about the highest peak, and particles start from
+a density fitted there. Where it does not, they start from the posterior below with one more Gaussian added, and the two
+evidences are bridged by taking Gaussians away and adding them. At every order ascents from all over the prior look for
+a peak that the particles missed.
 """
 
 from __future__ import annotations
@@ -15,24 +15,30 @@ from functools import partial
 
 import numpy as np
 
+from probewise._arrays import FloatArray
+from probewise.calibration.around_peak import around_peak, evidence_about
 from probewise.calibration.climb import Climb, Rung, climb
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_search import Found, Progress, search_order
+from probewise.calibration.peaks import Peak, find_peak
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
-from probewise.nested import NestedResult, least_live
-from probewise.nested.sampler import search
+from probewise.calibration.removal import Removal, bridged
 
 __all__ = ["climb_orders", "next_order"]
 
 _N_CLOUDS = 8
 _N_PARTICLES = 1000
-# Live points of the searches that no evidence is read from.
-_FEW_LIVE = 100
-_VOUCHING_LIVE = 60
-# A peak was missed where the search is this many errors above in ln Z, or this far in ln L, beyond its own scatter.
-_ABOVE = 3.0
-_BETTER = 6.0
+_N_STARTS = 24
+# Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
+_NEEDED = 20.0
+# Least effective share of the samples in a bridge.
+_LEAST_SHARE = 0.05
+# Two evidences this many errors apart disagree.
+_DISAGREE = 4.0
+# A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
+_HIGHER, _MISSED = 2.0, 0.2
+_N_WEIGHED = 1000
 
 
 def climb_orders(
@@ -53,18 +59,16 @@ def climb_orders(
     unlike = _unlike(posing, highest)
     if unlike:
         return {}, (unlike,)
-    climbing, vouching = rng.spawn(2)
-    found = {1: search_order(posing, 1, climbing, n_live=min(n_live, _FEW_LIVE), progress=progress)}
-    if found[1].evidence is found[1].result:
-        found[1] = search_order(posing, 1, climbing, n_live=n_live, progress=progress)
-    for n in range(2, highest + 1):
-        found[n] = next_order(posing, n, found[n - 1], climbing, n_live=n_live, progress=progress)
-    if highest > 1:
-        best = max(found, key=lambda n: found[n].evidence.log_z)
-        vouched = min(best + 1, highest)
-        missed = _missed(found[vouched], _vouch(posing, vouched, vouching, progress), vouched)
-        if missed:
-            return {1: found[1]}, (missed,)
+    climbing = rng.spawn(1)[0]
+    found: dict[int, Found] = {}
+    below: Peak | None = None
+    for n in range(1, highest + 1):
+        peak = find_peak(posing.problem(n), n_starts=_N_STARTS, rng=climbing)
+        needed = below is None or peak.highest - below.highest > _NEEDED
+        found[n] = next_order(
+            posing, n, found.get(n - 1), peak, climbing, needed=needed, n_live=n_live, progress=progress
+        )
+        below = peak
     return {n: found[n] for n in orders}, ()
 
 
@@ -79,43 +83,109 @@ def _unlike(posing: Posing, highest: int) -> str:
 
 
 def next_order(
-    posing: Posing, n: int, below: Found, rng: np.random.Generator, *, n_live: int, progress: Progress | None
+    posing: Posing,
+    n: int,
+    below: Found | None,
+    peak: Peak,
+    rng: np.random.Generator,
+    *,
+    needed: bool,
+    n_live: int,
+    progress: Progress | None,
 ) -> Found:
-    """Climb to an order; search it in full where the climb is doubtful."""
-    prior, problem, problem_below = posing.belief(n), posing.problem(n), posing.problem(n - 1)
+    """Climb to an order; search it in full where the climb is doubtful.
+
+    Parameters
+    ----------
+    posing
+        Of the recording.
+    n
+        Number of Gaussians.
+    below
+        What was found for n - 1; None for the first order.
+    peak
+        Highest peak of the likelihood.
+    rng
+        Source of randomness.
+    needed
+        Whether the readings need the last Gaussian, so that the posterior lies about the peak.
+    n_live
+        Live points where it is searched in full.
+    progress
+        Told of each temperature.
+    """
+    told: Callable[[Rung], None] | None = None if progress is None else partial(progress, n)
+    about = partial(_about_peak, posing, n, peak, rng, told)
+    from_below = None if below is None else partial(_from_below, posing, n, below, rng, told)
+    ways = [about, from_below] if needed else [from_below, about]
+    notes: list[str] = []
+    for way in ways:
+        if way is None:
+            continue
+        made = _vouched(posing, n, way(), peak, rng)
+        if not made.warnings:
+            return Found(made, None)
+        notes.extend(made.warnings)
+    full = search_order(posing, n, rng, n_live=n_live, progress=progress)
+    note = f"order {n} was searched in full, since the climb to it is doubtful: {'; '.join(dict.fromkeys(notes))}"
+    return replace(full, notes=(*full.notes, note))
+
+
+def _about_peak(
+    posing: Posing, n: int, peak: Peak, rng: np.random.Generator, told: Callable[[Rung], None] | None
+) -> Climb:
+    """Carry particles from a density about the peak to the posterior."""
+    problem = posing.problem(n)
+    density, n_calls = around_peak(problem, peak.theta, rng=rng)
+    nothing = np.empty((_N_PARTICLES, 0))
+    clouds = np.zeros(_N_CLOUDS)
+    return climb(
+        problem, density, nothing, log_z_below=clouds, error_below=0.0, n_calls_below=n_calls, rng=rng, told=told
+    )
+
+
+def _from_below(
+    posing: Posing, n: int, below: Found, rng: np.random.Generator, told: Callable[[Rung], None] | None
+) -> Climb:
+    """Carry particles from the posterior of n - 1 to that of n, and bridge the two."""
+    problem_below, alone = posing.problem(n - 1), posing.problem(1)
     coordinates = posing.belief(n - 1).coordinates
     start = below.evidence
     if isinstance(start, Climb):
         rest, log_z, error = start.theta, start.log_z_of_clouds, start.start_error
     else:
-        rest, _ = coordinates.leave(coordinates.enter(start.samples(_N_PARTICLES, rng=rng)))
+        rest, _ = coordinates.leave(coordinates.enter(start.samples(4 * _N_PARTICLES, rng=rng)))
         log_z, error = np.full(_N_CLOUDS, start.log_z), start.log_z_error
-    compensation = Compensation.of(problem_below, coordinates, posing.problem(1), rest, rng=rng)
-    reference = Reference(prior, problem_below, compensation)
-    told: Callable[[Rung], None] | None = None if progress is None else partial(progress, n)
-    made = climb(problem, reference, rest, log_z_below=log_z, error_below=error, rng=rng, told=told)
-    if not made.warnings:
-        return Found(made, None)
-    full = search_order(posing, n, rng, n_live=n_live, progress=progress)
-    note = f"order {n} was searched in full, since the climb to it is doubtful: {'; '.join(made.warnings)}"
-    return replace(full, notes=(*full.notes, note))
+    few = rest[:: len(rest) // _N_PARTICLES]
+    compensation = Compensation.of(problem_below, coordinates, alone, few, rng=rng)
+    reference = Reference(posing.belief(n), problem_below, compensation)
+    made = climb(posing.problem(n), reference, few, log_z_below=log_z, error_below=error, rng=rng, told=told)
+    removal = Removal(posing.belief(n), alone)
+    gaussian = posing.belief(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
+    return _bridged(made, log_z, removal.added(rest, gaussian), removal.taken(made.theta))
 
 
-def _vouch(posing: Posing, n: int, rng: np.random.Generator, progress: Progress | None) -> NestedResult:
-    """Search an order's prior with few live points."""
-    report = None if progress is None else partial(progress, n)
+def _bridged(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> Climb:
+    """Take the evidence from a bridge, where enough samples lie on it; doubt where it disagrees with the climb's."""
+    if bridged(added, taken)[1] < _LEAST_SHARE:
+        return made
+    each = zip(np.split(added, _N_CLOUDS), np.split(taken, _N_CLOUDS), strict=True)
+    found = replace(made, log_z_of_clouds=log_z + np.array([bridged(*both)[0] for both in each]))
+    apart = abs(found.log_z - made.log_z) / math.hypot(found.log_z_error, made.log_z_error)
+    if not apart > _DISAGREE:
+        return found
+    words = f"{made.log_z:.2f} ± {made.log_z_error:.2f} by temperatures, {found.log_z:.2f} ± {found.log_z_error:.2f}"
+    return replace(found, doubts=(f"two estimates of ln Z disagree: {words} by taking Gaussians away",))
+
+
+def _vouched(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Generator) -> Climb:
+    """Doubt a climb that missed a peak which holds a part of the evidence."""
+    if made.warnings or peak.highest - made.log_likelihood.max() < _HIGHER:
+        return made
     problem = posing.problem(n)
-    n_live = max(_VOUCHING_LIVE, least_live(len(problem.prior.names)))
-    return search(problem, rng=rng, n_live=n_live, progress=report, return_interrupted=False)
-
-
-def _missed(found: Found, seen: NestedResult, n: int) -> str:
-    """Say what a search of the whole prior saw that the climb did not, if anything."""
-    evidence = found.evidence
-    more = seen.log_z - evidence.log_z
-    if more > _ABOVE * math.hypot(seen.log_z_error, evidence.log_z_error):
-        return f"searched in full: a short search of {n} Gaussians finds ln Z higher by {more:.1f} than the climb"
-    better = float(seen.log_likelihood.max() - found.result.log_likelihood.max())
-    if better > _BETTER:
-        return f"searched in full: a short search of {n} Gaussians finds ln L higher by {better:.1f} than the climb"
-    return ""
+    density, _ = around_peak(problem, peak.theta, rng=rng)
+    log_z, n_eff = evidence_about(problem, density, n_draws=_N_WEIGHED, rng=rng)
+    share = math.exp(min(log_z - made.log_z, 0.0))
+    if share < _MISSED:
+        return made
+    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {peak.highest - made.log_likelihood.max():.1f} may hold {share:.0%} of Z"))

@@ -136,6 +136,28 @@ class Reference:
             out[which == k] = way.draw(rest[which == k], rng=rng)
         return out
 
+    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Take away a Gaussian and draw another one, each by one way.
+
+        Returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new, both over
+        the prior's, (n,); -inf where the move is impossible.
+        """
+        there, log_drawn = np.full(here.shape, np.nan), np.full(len(here), -np.inf)
+        which = rng.choice(len(self.ways), size=len(here), p=[way.share for way in self.ways])
+        for k, way in enumerate(self.ways):
+            rows = np.flatnonzero(which == k)
+            rest, log_here = way.back(here[rows])
+            possible = np.isfinite(log_here)
+            rows, log_here = rows[possible], log_here[possible]
+            if not rows.size:
+                continue
+            there[rows] = way.draw(rest[possible], rng=rng)
+            possible = np.isfinite(there[rows]).all(axis=1)
+            rows, log_here = rows[possible], log_here[possible]
+            log_there = way.back(there[rows])[1]
+            log_drawn[rows] = np.where(np.isfinite(log_there), log_here - log_there, -np.inf)
+        return there, log_drawn
+
     def without_last(self, theta: FloatArray) -> FloatArray:
         """Leave out the last Gaussian, (n, 6 N + 2) -> (n, 6 N - 4)."""
         return np.concatenate([theta[:, :-8], theta[:, -2:]], axis=1)

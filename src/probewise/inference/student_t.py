@@ -151,17 +151,18 @@ class StudentT:
     def _starts(self) -> IntArray | None:
         """First reading of each data set, where these are many and each is in one piece."""
         starts = np.flatnonzero(np.diff(self.groups, prepend=self.groups[:1] - 1))
-        in_one_piece = starts.size == self._sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
+        in_one_piece = starts.size == self.sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
         return starts if in_one_piece and starts.size > _MANY_GROUPS else None
 
-    def _sums(self, square: FloatArray) -> FloatArray:
+    def sums(self, square: FloatArray) -> FloatArray:
         """Sum over each data set, (n_samples, n_points) -> (n_samples, n_groups)."""
         if self._starts is None:
             return square @ self._membership
         return np.asarray(np.add.reduceat(square, self._starts, axis=1))
 
     @cached_property
-    def _sizes(self) -> FloatArray:
+    def sizes(self) -> FloatArray:
+        """Number of readings of each data set, in the order of their labels, (n_groups,)."""
         return np.asarray(self._membership.sum(axis=0))
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
@@ -169,12 +170,21 @@ class StudentT:
         residual = residuals(readings, predicted)
         if residual.shape[1] != self.groups.size:
             raise ShapeError(f"{residual.shape[1]} readings against {self.groups.size} groups; allowed: one each")
-        square = self._sums(np.square(residual, out=residual))
-        integral = log_sigma_integral(square, self._sizes, self.sd_floor, self.sd_ceiling)
-        constant = 0.5 * self.groups.size * _LOG_2PI + self._sizes.size * math.log(
+        square = self.sums(np.square(residual, out=residual))
+        integral = log_sigma_integral(square, self.sizes, self.sd_floor, self.sd_ceiling)
+        constant = 0.5 * self.groups.size * _LOG_2PI + self.sizes.size * math.log(
             math.log(self.sd_ceiling / self.sd_floor)
         )
         return np.asarray(integral.sum(axis=1) - constant)
+
+    def weights(self, residual: FloatArray) -> FloatArray:
+        """One over the noise variance of each reading as its data set's residuals tell it, both (n_samples, n_points).
+
+        The gradient of `log_prob` by the predictions is the residual times this, but near the bounds of the sd.
+        """
+        variance = self.sums(np.square(residual)) / self.sizes
+        per_set = 1.0 / variance.clip(self.sd_floor**2, self.sd_ceiling**2)
+        return np.asarray(per_set[:, np.unique(self.groups, return_inverse=True)[1]])
 
     def pooled(self, readings: FloatArray, predicted: FloatArray) -> PooledSigma:
         """Posterior of one sigma shared by all data sets, for predicting a new one."""

@@ -1,0 +1,99 @@
+"""Coordinates of a mixture in which Gaussians have no order: they change their labels without a change of volume.
+
+Each Gaussian has the log of its light, its centre, the log variances along x' and y' and the inverse hyperbolic tangent
+of its correlation; then the levels. Readings depend on ratios of light alone, so the sum of the logs is left out and
+drawn from its prior: of the logs, N - 1 orthonormal contrasts are kept, and 6 N + 1 coordinates in all.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.calibration.priors import SSFPrior
+
+__all__ = ["PeakCoordinates"]
+
+_MOST_LOG = 60.0
+
+
+@dataclass(frozen=True)
+class PeakCoordinates:
+    """Coordinates of N Gaussians whose light is uniform from 0 to a unit; see `has_reference`."""
+
+    prior: SSFPrior
+
+    @cached_property
+    def _contrasts(self) -> FloatArray:
+        """Orthonormal contrasts of N logs, (N - 1, N)."""
+        n = self.prior.n_gaussians
+        rows = [np.r_[np.ones(k), -float(k), np.zeros(n - k - 1)] / math.sqrt(k * (k + 1)) for k in range(1, n)]
+        return np.array(rows).reshape(n - 1, n)
+
+    @cached_property
+    def relabelled(self) -> tuple[tuple[IntArray, FloatArray], ...]:
+        """The N! changes of labels: columns of the shapes and levels, and matrix of the contrasts."""
+        n, c = self.prior.n_gaussians, self._contrasts
+        found = []
+        for order in itertools.permutations(range(n)):
+            columns = np.concatenate([*(np.arange(5 * k, 5 * k + 5) for k in order), [5 * n, 5 * n + 1]])
+            found.append((columns, c[:, list(order)] @ c.T))
+        return tuple(found)
+
+    def relabel(self, y: FloatArray, change: tuple[IntArray, FloatArray]) -> FloatArray:
+        """Change the labels, (n, 6 N + 1) both ways."""
+        columns, matrix = change
+        k = self.prior.n_gaussians - 1
+        return np.concatenate([y[:, :k] @ matrix.T, y[:, k:][:, columns]], axis=1)
+
+    def enter(self, theta: FloatArray) -> FloatArray:
+        """Map parameters, (n, 6 N + 2), to coordinates, (n, 6 N + 1)."""
+        n = self.prior.n_gaussians
+        g = theta[:, :-2].reshape(len(theta), n, 6)
+        det = g[..., 3] * g[..., 4] - g[..., 5] ** 2
+        log_light = np.log(g[..., 0]) - 0.5 * np.log(det)
+        shape = np.empty((len(theta), n, 5))
+        shape[..., :2] = g[..., 1:3]
+        shape[..., 2] = np.log(0.5 * g[..., 4] / det)
+        shape[..., 3] = np.log(0.5 * g[..., 3] / det)
+        shape[..., 4] = np.arctanh(-g[..., 5] / np.sqrt(g[..., 3] * g[..., 4]))
+        return np.concatenate([log_light @ self._contrasts.T, shape.reshape(len(theta), -1), theta[:, -2:]], axis=1)
+
+    def leave(self, y: FloatArray, sum_of_logs: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates to parameters; also return the prior's log density there, labels counted apart.
+
+        Parameters
+        ----------
+        y
+            Coordinates, (n, 6 N + 1).
+        sum_of_logs
+            Uniform numbers, (n,), by which the light of all is drawn; default: the heaviest holds a unit.
+
+        Returns
+        -------
+        Parameters, (n, 6 N + 2), and log density, (n,); -inf outside the prior's support.
+        """
+        n = self.prior.n_gaussians
+        log_light = (y[:, : n - 1] @ self._contrasts).clip(-_MOST_LOG, _MOST_LOG)
+        most = log_light.max(axis=1)
+        shape = y[:, n - 1 : -2].reshape(len(y), n, 5)
+        log_variance = shape[..., 2:4].clip(-_MOST_LOG, _MOST_LOG)
+        r = np.tanh(shape[..., 4])
+        rest = np.maximum(1.0 - r * r, 1e-12)
+        g = np.empty((len(y), n, 6))
+        g[..., 1:3] = shape[..., :2]
+        g[..., 3:5] = 0.5 * np.exp(-log_variance) / rest[..., None]
+        g[..., 5] = -r * np.sqrt(g[..., 3] * g[..., 4])
+        scale = self.prior.amplitude_scale(g[..., 3] * g[..., 4] * rest)
+        g[..., 0] = scale * np.exp(log_light - most[:, None]) * (1.0 - 1e-12)
+        theta = np.concatenate([g.reshape(len(y), 6 * n), y[:, -2:]], axis=1)
+        jacobian = np.log(g[..., 0]) - 1.5 * log_variance.sum(axis=-1) - 2.0 * np.log(rest) - 3.0 * math.log(2.0)
+        log_density = self.prior.log_prob(theta) + jacobian.sum(axis=1) - 0.5 * math.log(n)
+        if sum_of_logs is not None:
+            theta[:, : 6 * n : 6] *= sum_of_logs[:, None] ** (1.0 / n)
+        return theta, np.where(np.isfinite(log_density), log_density, -np.inf)

@@ -1,0 +1,188 @@
+"""The evidence of N Gaussians over that of N - 1, by taking one of the N away or adding one.
+
+With one Gaussian's light at nothing, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
+posterior tell of the other's evidence: from N, take one Gaussian away; from N - 1, add one drawn from the prior.
+Its light is integrated out, which one predicted curve allows, since the residuals are linear in its share of the light.
+Both kinds of samples meet in a bridge (Bennett 1976).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.calibration.priors import SSFPrior
+from probewise.errors import ParameterError
+from probewise.inference import SensorProblem, StudentT, log_sigma_integral
+from probewise.nested.weights import n_effective
+
+__all__ = ["Removal", "bridged"]
+
+_AT_ONCE = 400_000
+_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
+_REACH = 7.0
+_N_NEWTON = 4
+_N_TABLE = 1024
+_BRIDGE_STEPS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Removal:
+    """Mean likelihood over the light of one Gaussian, over the likelihood without it.
+
+    Parameters
+    ----------
+    prior
+        Of N Gaussians, 2 or more, light uniform; see `has_reference`.
+    alone
+        Problem of one Gaussian over the same recording.
+    """
+
+    prior: SSFPrior
+    alone: SensorProblem
+
+    def taken(self, theta: FloatArray) -> FloatArray:
+        """Log of that ratio for each Gaussian of samples of N, (n, 6 N + 2) -> (n, N)."""
+        n = self.prior.n_gaussians
+        at_once = max(1, _AT_ONCE // (n * self._readings.size))
+        blocks = [theta[at : at + at_once] for at in range(0, len(theta), at_once)]
+        return np.concatenate([self._taken(block) for block in blocks]) if blocks else np.empty((0, n))
+
+    def added(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
+        """Log of that ratio for a Gaussian more, (n, 6), of any light, beside samples of N - 1, (n, 6 N - 4)."""
+        if not len(rest):
+            return np.empty(0)
+        at_once = max(1, _AT_ONCE // (self.prior.n_gaussians * self._readings.size))
+        found = []
+        for at in range(0, len(rest), at_once):
+            part = rest[at : at + at_once]
+            seen, light = self._seen(part)
+            one = self._lone(gaussian[at : at + at_once])
+            found.append(self._log_gain(_mixed(seen, light), one, light, part[:, -2:]))
+        return np.concatenate(found)
+
+    def _taken(self, theta: FloatArray) -> FloatArray:
+        seen, light = self._seen(theta)
+        out = np.empty(light.shape)
+        for k in range(light.shape[1]):
+            others = np.delete(light, k, axis=1)
+            out[:, k] = self._log_gain(_mixed(np.delete(seen, k, axis=1), others), seen[:, k], others, theta[:, -2:])
+        return out
+
+    def _seen(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Responses to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
+        g = theta[:, :-2].reshape(len(theta), -1, 6)
+        light = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
+        return self._lone(g.reshape(-1, 6)).reshape(*light.shape, -1), light
+
+    def _lone(self, gaussian: FloatArray) -> FloatArray:
+        levels = np.broadcast_to([0.0, 1.0], (len(gaussian), 2))
+        lone = np.concatenate([np.ones((len(gaussian), 1)), gaussian[:, 1:], levels], axis=1)
+        seen = self.alone.model.predict(lone, self.alone.recording.plan)
+        usable = self.alone.recording.usable
+        return seen if usable.all() else seen[:, usable]
+
+    def _log_gain(self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray) -> FloatArray:
+        """Integrate over the light of one Gaussian beside others.
+
+        With t the light over that of the brightest of the others, whose own scale is integrated out, the ratio is
+        (N - 1) / N times the integral of the likelihood over t from 0, times min(1, t^-N), over that at t = 0.
+        """
+        n = self.prior.n_gaussians
+        span = levels[:, 1:] - levels[:, :1]
+        off = self._readings - levels[:, :1] - span * others
+        change = span * (one - others)
+        square, both, own = (
+            self._likelihood.sums(off * off),
+            self._likelihood.sums(off * change),
+            self._likelihood.sums(change * change),
+        )
+        whole = (light.sum(axis=1) / light.max(axis=1))[:, None]
+        low, high = self._bounds(square, both, own)
+        share = (low[:, None] + (high - low)[:, None] * 0.5 * (_NODES + 1.0)).clip(1e-14, 1.0 - 1e-12)
+        t = whole * share / (1.0 - share)
+        q = share[..., None]
+        log_likelihood = self._log_likelihood(square[:, None] - 2.0 * q * both[:, None] + q * q * own[:, None])
+        log_measure = np.log(whole) - 2.0 * np.log1p(-share) - n * np.log(np.maximum(t, 1.0))
+        summed = logsumexp(log_likelihood + log_measure + np.log(0.5 * _NODE_WEIGHTS), axis=1) + np.log(high - low)
+        return np.asarray(summed + math.log((n - 1) / n) - self._log_likelihood(square))
+
+    def _bounds(self, square: FloatArray, both: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Shares of light between which the likelihood is not negligible, (n,) each."""
+        share = np.zeros(len(square))
+        for _ in range(_N_NEWTON):
+            q = share[:, None]
+            left = np.maximum(square - 2.0 * q * both + q * q * own, 1e-300)
+            per_variance = np.minimum(self._likelihood.sizes / left, 1.0 / self._likelihood.sd_floor**2)
+            told = (per_variance * own).sum(axis=1) + 1e-12
+            best = (per_variance * both).sum(axis=1) / told
+            share = best.clip(0.0, 1.0)
+        sd = 1.0 / np.sqrt(told)
+        # Where less than nothing would be best, the likelihood falls from 0 by an exponential.
+        reach = np.where(best < 0.0, 2.0 * _REACH**2 * sd / (_REACH + np.abs(best) / sd), _REACH * sd)
+        low = (share - reach).clip(0.0, 1.0)
+        return low, np.maximum((share + reach).clip(0.0, 1.0), low + 1e-12)
+
+    def _log_likelihood(self, square: FloatArray) -> FloatArray:
+        """Log likelihood up to a constant from sums of squares, (..., n_sets) -> (...)."""
+        x = np.log(np.maximum(square, 1e-300))
+        out = np.zeros(x.shape[:-1])
+        for columns, grid, values in self._tables:
+            out += np.interp(x[..., columns], grid, values).sum(axis=-1)
+        return out
+
+    @cached_property
+    def _tables(self) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        """For data sets of each size: their columns, and log integrals over sigma by the log of the sum of squares.
+
+        They are a straight line but near the bounds of sigma, so that linear interpolation serves.
+        """
+        likelihood, found = self._likelihood, []
+        for size in np.unique(likelihood.sizes):
+            low, high = likelihood.sd_floor**2 * size * 1e-3, likelihood.sd_ceiling**2 * size * 1e3
+            grid = np.linspace(math.log(low), math.log(high), _N_TABLE)
+            values = log_sigma_integral(np.exp(grid), size, likelihood.sd_floor, likelihood.sd_ceiling)
+            found.append((np.flatnonzero(likelihood.sizes == size), grid, values))
+        return found
+
+    @cached_property
+    def _readings(self) -> FloatArray:
+        recording = self.alone.recording
+        return np.asarray(recording.readings[recording.usable])
+
+    @cached_property
+    def _likelihood(self) -> StudentT:
+        if not isinstance(self.alone.likelihood, StudentT):
+            raise ParameterError("alone.likelihood", self.alone.likelihood, "a StudentT")
+        return self.alone.likelihood
+
+
+def _mixed(seen: FloatArray, light: FloatArray) -> FloatArray:
+    """Response to a mixture, (n, n_used), from its Gaussians', (n, N, n_used), and their light, (n, N)."""
+    return np.asarray(((light / light.sum(axis=1, keepdims=True))[:, None, :] @ seen)[:, 0])
+
+
+def bridged(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
+    """Bridge N - 1 and N Gaussians: log of the ratio of evidences, and the effective share of the samples.
+
+    Parameters
+    ----------
+    added
+        `Removal.added` at samples of N - 1, (n_below,).
+    taken
+        `Removal.taken` at samples of N, (n, N).
+    """
+    each = taken.ravel()
+    found = float(logsumexp(added)) - math.log(added.size)
+    for _ in range(_BRIDGE_STEPS):
+        up = added - np.logaddexp(added, found)
+        down = -np.logaddexp(each, found)
+        found = float(logsumexp(up) - math.log(added.size) - logsumexp(down) + math.log(each.size))
+    samples = logsumexp(-np.logaddexp(taken, found), axis=1)
+    share = min(n_effective(up) / added.size, n_effective(samples) / len(taken))
+    return found, share

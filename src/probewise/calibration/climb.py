@@ -32,7 +32,7 @@ _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: one costs as much as a move.
 _DRAWS = 4
 # Moves of each particle once the posterior is reached, and how many of them lie between two samples that are kept.
-_N_MORE, _APART = 12, 4
+_N_MORE, _APART, _EXCHANGE = 12, 4, 4
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 6
 # A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.
@@ -43,6 +43,7 @@ _JITTER = 1e-5
 _MOST_ERROR = 0.5
 _LEAST_CLOUDS = 0.3
 _LEAST_ACCEPTED = 0.02
+_LEAST_OVERLAP = 0.02
 
 
 class KnownDensity(Protocol):
@@ -195,6 +196,8 @@ def climb(
     n_calls_below: int = 0,
     rng: np.random.Generator,
     n_steps: int = _N_STEPS,
+    least_kept: float = _KEPT,
+    exchange: Callable[[FloatArray], FloatArray] | None = None,
     told: Callable[[Rung], None] | None = None,
 ) -> Climb:
     """Climb to the posterior of N Gaussians.
@@ -217,6 +220,10 @@ def climb(
         Source of randomness.
     n_steps
         Moves of each particle at each temperature.
+    least_kept
+        Effective share of the particles that a change of temperature leaves.
+    exchange
+        Moves parameters, (n, 6 N + 2), and leaves the posterior as it is.
     told
         Called after every temperature.
     """
@@ -242,10 +249,10 @@ def climb(
     log_z = np.array(log_z_below)
     with np.errstate(invalid="ignore"):
         now = known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
-    temperatures, accepted = [0.0], 0.0
+    temperatures, accepted, overlap = [0.0], 0.0, 1.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
         rise = now.rise
-        beta = _next(rise, temperatures[-1], _KEPT * len(rest))
+        beta = _next(rise, temperatures[-1], least_kept * len(rest))
         width = beta - temperatures[-1]
         log_weight = (width * rise).reshape(n_clouds, -1)
         if not np.isfinite(log_weight.max(axis=1)).all():
@@ -264,13 +271,17 @@ def climb(
         accepted = float(np.mean(shares))
         if beta == 1.0:
             now = known(now.x)
-        log_z += _log_ratio(log_weight, (width * now.rise).reshape(n_clouds, n))
+        log_ratio, share = _log_ratio(log_weight, (width * now.rise).reshape(n_clouds, n))
+        log_z += log_ratio
+        overlap = min(overlap, share)
         if told is not None:
             told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
     kept = [now]
     if temperatures[-1] == 1.0:
         for k in range(1, _N_MORE + 1):
             now, _ = _moved(now, partial(known, beta=1.0), reference, 1.0, rng)
+            if exchange is not None and k % _EXCHANGE == 0:
+                now = known(space.enter(exchange(space.leave(now.x)[0])), 1.0)
             if k % _APART == 0:
                 kept.append(now)
     x = np.stack([cloud.x.reshape(n_clouds, n, -1) for cloud in kept], axis=1)
@@ -286,13 +297,15 @@ def climb(
         temperatures=np.array(temperatures),
         accepted=accepted,
         n_calls=n_calls,
+        doubts=() if overlap >= _LEAST_OVERLAP else (f"two temperatures have {overlap:.1%} of the particles in common",),
     )
 
 
-def _log_ratio(before: FloatArray, after: FloatArray) -> FloatArray:
+def _log_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
     """Bridge two temperatures in each cloud (Bennett 1976): log of the ratio of their evidences, (n_clouds,).
 
-    `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each.
+    `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each. Also the
+    effective share of the particles that the bridge stands on.
     """
     log_before, log_after = math.log(before.shape[1]), math.log(after.shape[1])
     log_ratio = logsumexp(before, axis=1) - log_before
@@ -301,7 +314,8 @@ def _log_ratio(before: FloatArray, after: FloatArray) -> FloatArray:
         forward = logsumexp(before - np.logaddexp(before, level), axis=1) - log_before
         backward = logsumexp(-np.logaddexp(after, level), axis=1) - log_after
         log_ratio = forward - backward
-    return np.asarray(log_ratio)
+    down, up = before - np.logaddexp(before, level), -np.logaddexp(after, level)
+    return np.asarray(log_ratio), min(n_effective(down.ravel()) / before.size, n_effective(up.ravel()) / after.size)
 
 
 def _next(rise: FloatArray, beta: float, least: float) -> float:

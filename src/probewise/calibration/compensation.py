@@ -21,7 +21,7 @@ from probewise.nested.weights import resampled
 
 __all__ = ["Answer", "Compensation"]
 
-_N_POOL = 20_000
+_N_POOL = 6_000
 _AT_ONCE = 500
 # First-order evidences are tempered, and a share of the shapes does without: far from the mean they mislead.
 _TEMPERED, _PLAIN = 0.8, 0.1

@@ -29,9 +29,13 @@ __all__ = ["climb_orders", "next_order"]
 
 _N_CLOUDS = 8
 _N_PARTICLES = 1000
-_N_STARTS = 24
+_N_STARTS = 16
 # Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
 _NEEDED = 20.0
+# Where the evidence comes from a bridge, a change of temperature may leave so few of the particles effective.
+_BRIDGED_KEPT = 0.2
+# Gaussians of the prior that each sample may exchange one of its own for.
+_N_TRIES = 4
 # Least effective share of the samples in a bridge.
 _LEAST_SHARE = 0.05
 # Two evidences this many errors apart disagree.
@@ -159,8 +163,18 @@ def _from_below(
     few = rest[:: len(rest) // _N_PARTICLES]
     compensation = Compensation.of(problem_below, coordinates, alone, few, rng=rng)
     reference = Reference(posing.belief(n), problem_below, compensation)
-    made = climb(posing.problem(n), reference, few, log_z_below=log_z, error_below=error, rng=rng, told=told)
     removal = Removal(posing.belief(n), alone)
+    made = climb(
+        posing.problem(n),
+        reference,
+        few,
+        log_z_below=log_z,
+        error_below=error,
+        least_kept=_BRIDGED_KEPT,
+        exchange=partial(removal.exchanged, n_tries=_N_TRIES, rng=rng),
+        rng=rng,
+        told=told,
+    )
     gaussian = posing.belief(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
     return _bridged(made, log_z, removal.added(rest, gaussian), removal.taken(made.theta))
 

@@ -3,7 +3,8 @@
 With one Gaussian's light at nothing, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
 posterior tell of the other's evidence: from N, take one Gaussian away; from N - 1, add one drawn from the prior.
 Its light is integrated out, which one predicted curve allows, since the residuals are linear in its share of the light.
-Both kinds of samples meet in a bridge (Bennett 1976).
+Both kinds of samples meet in a bridge (Bennett 1976). The same integral moves a sample far: it exchanges one Gaussian for
+one of several drawn from the prior (Barker's choice among many, Tjelmeland 2004).
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from probewise.nested.weights import n_effective
 __all__ = ["Removal", "bridged"]
 
 _AT_ONCE = 400_000
-_NODES, _NODE_WEIGHTS = np.polynomial.legendre.leggauss(24)
+_NODES, _FEW_NODES = np.polynomial.legendre.leggauss(24), np.polynomial.legendre.leggauss(16)
+_N_GRID = 48
 _REACH = 7.0
 _N_NEWTON = 4
 _N_TABLE = 1024
@@ -66,6 +68,55 @@ class Removal:
             found.append(self._log_gain(_mixed(seen, light), one, light, part[:, -2:]))
         return np.concatenate(found)
 
+    def exchanged(self, theta: FloatArray, *, n_tries: int, rng: np.random.Generator) -> FloatArray:
+        """Exchange one Gaussian of each sample, for one of so many of the prior, or for itself with other light.
+
+        The posterior of N stays as it is, but for the grid of shares, 0.3 sd apart, that the light is drawn from.
+        Both (n, 6 N + 2); the Gaussians in no order.
+        """
+        n = self.prior.n_gaussians
+        at_once = max(1, _AT_ONCE // ((n + 2 * n_tries) * self._readings.size))
+        blocks = [theta[at : at + at_once] for at in range(0, len(theta), at_once)]
+        return np.concatenate([self._exchanged(block, n_tries, rng) for block in blocks])
+
+    def _exchanged(self, theta: FloatArray, n_tries: int, rng: np.random.Generator) -> FloatArray:
+        n, m = self.prior.n_gaussians, len(theta)
+        rows = np.arange(m)
+        seen, light = self._seen(theta)
+        label = rng.integers(n, size=m)
+        beside = np.arange(n) != label[:, None]
+        others = light[beside].reshape(m, n - 1)
+        rest = _mixed(seen[beside].reshape(m, n - 1, -1), others)
+        own = theta[:, :-2].reshape(m, n, 6)[rows, label]
+        drawn = self.prior.from_unit_cube(rng.random((m * n_tries, 6 * n + 2)))[:, :6].reshape(m, n_tries, 6)
+        gaussian = np.concatenate([own[:, None], drawn], axis=1)
+        one = np.concatenate([seen[rows, label][:, None], self._lone(drawn.reshape(-1, 6)).reshape(m, n_tries, -1)], 1)
+        sums = self._sums(rest[:, None], one, theta[:, None, -2:])
+        whole = (others.sum(axis=1) / others.max(axis=1))[:, None]
+        log_gain = self._integrated(*sums, np.broadcast_to(whole, (m, n_tries + 1)), _FEW_NODES)
+        chosen = (log_gain + rng.gumbel(size=log_gain.shape)).argmax(axis=1)
+        t = self._drawn_light(*(part[rows, chosen] for part in sums), whole[:, 0], rng)
+        scale = np.minimum(1.0, 1.0 / t) * rng.random(m) ** (1.0 / n)
+        masses = np.empty((m, n))
+        masses[beside] = (others / others.max(axis=1, keepdims=True) * scale[:, None]).ravel()
+        masses[rows, label] = t * scale
+        out = theta.copy()
+        g = out[:, :-2].reshape(m, n, 6)
+        g[rows, label] = gaussian[rows, chosen]
+        g[..., 0] = masses * self.prior.amplitude_scale(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
+        return out
+
+    def _drawn_light(
+        self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """Draw light over that of the brightest of the others, (n,), by its density on a grid."""
+        low, high = self._bounds(square, both, own)
+        share = low[:, None] + (high - low)[:, None] * (np.arange(_N_GRID) + 0.5) / _N_GRID
+        log_density = self._log_density(square, both, own, whole, share)
+        cell = (log_density + rng.gumbel(size=share.shape)).argmax(axis=1)
+        drawn = (low + (high - low) * (cell + rng.random(len(low))) / _N_GRID).clip(1e-14, 1.0 - 1e-12)
+        return np.asarray(whole * drawn / (1.0 - drawn))
+
     def _taken(self, theta: FloatArray) -> FloatArray:
         seen, light = self._seen(theta)
         out = np.empty(light.shape)
@@ -93,34 +144,61 @@ class Removal:
         With t the light over that of the brightest of the others, whose own scale is integrated out, the ratio is
         (N - 1) / N times the integral of the likelihood over t from 0, times min(1, t^-N), over that at t = 0.
         """
-        n = self.prior.n_gaussians
-        span = levels[:, 1:] - levels[:, :1]
-        off = self._readings - levels[:, :1] - span * others
+        sums = self._sums(others, one, levels)
+        return self._integrated(*sums, light.sum(axis=-1) / light.max(axis=-1), _NODES)
+
+    def _sums(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Sums over data sets of residual squared, residual times change, change squared, (..., n_sets) each.
+
+        The residual is that of the others alone; the change, of a Gaussian that takes their place.
+        """
+        span = levels[..., 1:] - levels[..., :1]
+        off = self._readings - levels[..., :1] - span * others
         change = span * (one - others)
-        square, both, own = (
-            self._likelihood.sums(off * off),
-            self._likelihood.sums(off * change),
-            self._likelihood.sums(change * change),
-        )
-        whole = (light.sum(axis=1) / light.max(axis=1))[:, None]
+        parts = [off * off, off * change, change * change]
+        shapes = [(*part.shape[:-1], -1) for part in parts]
+        sums = [self._likelihood.sums(part.reshape(-1, part.shape[-1])) for part in parts]
+        square, both, own = (part.reshape(shape) for part, shape in zip(sums, shapes, strict=True))
+        return np.broadcast_to(square, own.shape), both, own
+
+    def _integrated(
+        self,
+        square: FloatArray,
+        both: FloatArray,
+        own: FloatArray,
+        whole: FloatArray,
+        nodes: tuple[FloatArray, FloatArray],
+    ) -> FloatArray:
+        """Log of the integral over t, over the likelihood at t = 0; `whole` is the others' light over the brightest's."""
+        n = self.prior.n_gaussians
         low, high = self._bounds(square, both, own)
-        share = (low[:, None] + (high - low)[:, None] * 0.5 * (_NODES + 1.0)).clip(1e-14, 1.0 - 1e-12)
-        t = whole * share / (1.0 - share)
-        q = share[..., None]
-        log_likelihood = self._log_likelihood(square[:, None] - 2.0 * q * both[:, None] + q * q * own[:, None])
-        log_measure = np.log(whole) - 2.0 * np.log1p(-share) - n * np.log(np.maximum(t, 1.0))
-        summed = logsumexp(log_likelihood + log_measure + np.log(0.5 * _NODE_WEIGHTS), axis=1) + np.log(high - low)
+        place, weight = nodes
+        share = (low[..., None] + (high - low)[..., None] * 0.5 * (place + 1.0)).clip(1e-14, 1.0 - 1e-12)
+        log_density = self._log_density(square, both, own, whole, share)
+        most = log_density.max(axis=-1)
+        summed = most + np.log(np.exp(log_density - most[..., None]) @ (0.5 * weight)) + np.log(high - low)
         return np.asarray(summed + math.log((n - 1) / n) - self._log_likelihood(square))
 
+    def _log_density(
+        self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray, share: FloatArray
+    ) -> FloatArray:
+        """Log of likelihood times prior of shares of the light, (..., n_shares)."""
+        q = share[..., None]
+        left = square[..., None, :] - 2.0 * q * both[..., None, :] + q * q * own[..., None, :]
+        whole = whole[..., None]
+        t = whole * share / (1.0 - share)
+        log_measure = np.log(whole) - 2.0 * np.log1p(-share) - self.prior.n_gaussians * np.log(np.maximum(t, 1.0))
+        return np.asarray(self._log_likelihood(left) + log_measure)
+
     def _bounds(self, square: FloatArray, both: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Shares of light between which the likelihood is not negligible, (n,) each."""
-        share = np.zeros(len(square))
+        """Shares of light between which the likelihood is not negligible, (...,) each."""
+        share = np.zeros(square.shape[:-1])
         for _ in range(_N_NEWTON):
-            q = share[:, None]
+            q = share[..., None]
             left = np.maximum(square - 2.0 * q * both + q * q * own, 1e-300)
             per_variance = np.minimum(self._likelihood.sizes / left, 1.0 / self._likelihood.sd_floor**2)
-            told = (per_variance * own).sum(axis=1) + 1e-12
-            best = (per_variance * both).sum(axis=1) / told
+            told = (per_variance * own).sum(axis=-1) + 1e-12
+            best = (per_variance * both).sum(axis=-1) / told
             share = best.clip(0.0, 1.0)
         sd = 1.0 / np.sqrt(told)
         # Where less than nothing would be best, the likelihood falls from 0 by an exponential.

@@ -93,7 +93,9 @@ class PeakDensity:
         return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
 
 
-def around_peak(problem: SensorProblem, peak: FloatArray, *, rng: np.random.Generator) -> tuple[PeakDensity, int]:
+def around_peak(
+    problem: SensorProblem, peak: FloatArray, *, rng: np.random.Generator, n_pilots: int = _N_PILOTS
+) -> tuple[PeakDensity, int]:
     """Shape a density to the posterior about a peak.
 
     Parameters
@@ -104,6 +106,8 @@ def around_peak(problem: SensorProblem, peak: FloatArray, *, rng: np.random.Gene
         Where the likelihood is greatest, (6 N + 2,).
     rng
         Source of randomness.
+    n_pilots
+        Draws of each round that shapes it.
 
     Returns
     -------
@@ -115,7 +119,7 @@ def around_peak(problem: SensorProblem, peak: FloatArray, *, rng: np.random.Gene
     space = PeakCoordinates(prior)
     density, n_calls = _laplace(problem, space, peak), 0
     for _ in range(_N_ROUNDS):
-        y, theta, log_density = PeakDensity(space, density).drawn(_N_PILOTS, rng=rng)
+        y, theta, log_density = PeakDensity(space, density).drawn(n_pilots, rng=rng)
         n_calls += len(y)
         if len(y) < 2 * y.shape[1]:
             density = StudentTDensity(density.mean, 0.5 * density.root)

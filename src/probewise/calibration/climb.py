@@ -14,7 +14,7 @@ from functools import partial
 from typing import Protocol
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
@@ -32,7 +32,7 @@ _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: one costs as much as a move.
 _DRAWS = 4
 # Moves of each particle once the posterior is reached, and how many of them lie between two samples that are kept.
-_N_MORE, _APART, _EXCHANGE = 12, 4, 4
+_N_MORE, _APART, _EXCHANGE = 12, 4, 2
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 6
 # A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.
@@ -279,7 +279,7 @@ def climb(
     kept = [now]
     if temperatures[-1] == 1.0:
         for k in range(1, _N_MORE + 1):
-            now, _ = _moved(now, partial(known, beta=1.0), reference, 1.0, rng)
+            now, _ = _moved(now, partial(known, beta=1.0), reference, 1.0, rng, fresh=exchange is None)
             if exchange is not None and k % _EXCHANGE == 0:
                 now = known(space.enter(exchange(space.leave(now.x)[0])), 1.0)
             if k % _APART == 0:
@@ -307,15 +307,15 @@ def _log_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float
     `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each. Also the
     effective share of the particles that the bridge stands on.
     """
-    log_before, log_after = math.log(before.shape[1]), math.log(after.shape[1])
-    log_ratio = logsumexp(before, axis=1) - log_before
+    size = math.log(before.shape[1]) - math.log(after.shape[1])
+    log_ratio = logsumexp(before, axis=1) - math.log(before.shape[1])
     for _ in range(_BRIDGE_STEPS):
-        level = log_ratio[:, None] + (log_before - log_after)
-        forward = logsumexp(before - np.logaddexp(before, level), axis=1) - log_before
-        backward = logsumexp(-np.logaddexp(after, level), axis=1) - log_after
-        log_ratio = forward - backward
-    down, up = before - np.logaddexp(before, level), -np.logaddexp(after, level)
-    return np.asarray(log_ratio), min(n_effective(down.ravel()) / before.size, n_effective(up.ravel()) / after.size)
+        level = (log_ratio + size)[:, None]
+        down, up = expit(before - level), expit(level - after)
+        with np.errstate(divide="ignore"):
+            log_ratio = level[:, 0] + np.log(down.mean(axis=1)) - np.log(up.mean(axis=1))
+    shares = [part.sum() ** 2 / max((part**2).sum(), 1e-300) / part.size for part in (down, up)]
+    return np.asarray(log_ratio), float(min(shares))
 
 
 def _next(rise: FloatArray, beta: float, least: float) -> float:
@@ -332,7 +332,13 @@ def _next(rise: FloatArray, beta: float, least: float) -> float:
 
 
 def _moved(
-    now: _Cloud, known: Callable[[FloatArray], _Cloud], reference: KnownDensity, beta: float, rng: np.random.Generator
+    now: _Cloud,
+    known: Callable[[FloatArray], _Cloud],
+    reference: KnownDensity,
+    beta: float,
+    rng: np.random.Generator,
+    *,
+    fresh: bool = True,
 ) -> tuple[_Cloud, float]:
     """Move each particle once, one half after the other; tell the share of moves accepted.
 
@@ -358,15 +364,15 @@ def _moved(
         one, two = rng.choice(other, (2, m))
         step = scale[:, None] * (now.x[one] - now.x[two]) + jitter * rng.standard_normal((m, d))
         x = old.x + np.where(by_block[:, None] & ~in_block, 0.0, step)
-        fresh = np.flatnonzero(kind > _FRESH_FROM)
-        here, _ = space.leave(old.x[fresh])
-        there, log_drawn = reference.redrawn(here, rng=rng)
+        anew = np.flatnonzero(kind > _FRESH_FROM) if fresh else np.empty(0, dtype=np.int64)
+        here, _ = space.leave(old.x[anew])
+        there, log_drawn = reference.redrawn(here, rng=rng) if anew.size else (here, np.empty(0))
         with np.errstate(invalid="ignore"):
-            x[fresh] = space.enter(there)
+            x[anew] = space.enter(there)
             new = known(x)
             log_accept = new.tempered(beta) - old.tempered(beta)
             # A fresh Gaussian comes from the reference's density: only the rest of the target counts.
-            log_accept[fresh] += log_drawn + old.log_prior[fresh] - new.log_prior[fresh]
+            log_accept[anew] += log_drawn + old.log_prior[anew] - new.log_prior[anew]
             better = np.log(rng.random(m)) < log_accept
         n_accepted += int(better.sum())
         now = now.put(own[better], new.take(np.flatnonzero(better)))

@@ -42,7 +42,7 @@ _LEAST_SHARE = 0.05
 _DISAGREE = 4.0
 # A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
 _HIGHER, _MISSED = 2.0, 0.2
-_N_WEIGHED = 1000
+_N_WEIGHED = 400
 
 
 def climb_orders(
@@ -197,7 +197,7 @@ def _vouched(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Gen
     if made.warnings or peak.highest - made.log_likelihood.max() < _HIGHER:
         return made
     problem = posing.problem(n)
-    density, _ = around_peak(problem, peak.theta, rng=rng)
+    density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_WEIGHED)
     log_z, n_eff = evidence_about(problem, density, n_draws=_N_WEIGHED, rng=rng)
     share = math.exp(min(log_z - made.log_z, 0.0))
     if share < _MISSED:

@@ -18,13 +18,13 @@ from probewise.inference import SensorProblem, StudentT
 
 __all__ = ["Peak", "find_peak"]
 
-_N_DRAWS = 2000
-_N_STEPS = 40
+_N_DRAWS = 1500
+_N_STEPS = 25
 _DIFFERENCE = 1e-5
 _MOST_Z = 14.0
 _FIRST_DAMPING, _LOOSER, _TIGHTER = 1e-2, 0.2, 5.0
 _LONGEST = 2.0
-_SETTLED = 1e-4
+_SETTLED = 1e-2
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ def find_peak(problem: SensorProblem, *, n_starts: int, rng: np.random.Generator
     problem
         With an `SSFPrior` and a `StudentT` likelihood.
     n_starts
-        Ascents, from the best of 2,000 draws.
+        Ascents, from the best of 1,500 draws.
     rng
         Source of randomness.
     """

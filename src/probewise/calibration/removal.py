@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
+from scipy.optimize import brentq
+from scipy.special import expit
 
 from probewise._arrays import FloatArray
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT, log_sigma_integral
-from probewise.nested.weights import n_effective
 
 __all__ = ["Removal", "bridged"]
 
@@ -30,7 +30,6 @@ _N_GRID = 48
 _REACH = 7.0
 _N_NEWTON = 4
 _N_TABLE = 1024
-_BRIDGE_STEPS = 60
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,11 +255,17 @@ def bridged(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
         `Removal.taken` at samples of N, (n, N).
     """
     each = taken.ravel()
-    found = float(logsumexp(added)) - math.log(added.size)
-    for _ in range(_BRIDGE_STEPS):
-        up = added - np.logaddexp(added, found)
-        down = -np.logaddexp(each, found)
-        found = float(logsumexp(up) - math.log(added.size) - logsumexp(down) + math.log(each.size))
-    samples = logsumexp(-np.logaddexp(taken, found), axis=1)
-    share = min(n_effective(up) / added.size, n_effective(samples) / len(taken))
-    return found, share
+
+    def uneven(log_ratio: float) -> float:
+        return float(expit(added - log_ratio).mean() - expit(log_ratio - each).mean())
+
+    low, high = min(added.min(), each.min()) - 1.0, max(added.max(), each.max()) + 1.0
+    found = float(brentq(uneven, low, high, xtol=1e-6))
+    samples = expit(found - taken).sum(axis=1)
+    up = expit(added - found)
+    return found, min(_share(up), _share(samples))
+
+
+def _share(weight: FloatArray) -> float:
+    """Effective share of weighted samples, (n,)."""
+    return float(weight.sum() ** 2 / (weight @ weight) / len(weight)) if weight.any() else 0.0

@@ -75,6 +75,15 @@ class PeakDensity:
         theta[~np.isfinite(log_prior)] = np.nan
         return theta
 
+    def fitted_to(self, theta: FloatArray) -> PeakDensity:
+        """Fit a density to samples, (n, 6 N + 2), each with the labels that this one gives them."""
+        y = self.space.enter(theta)
+        labelled = np.stack([self.space.relabel(y, change) for change in self.space.relabelled])
+        best = np.argmax([self.one.log_density(each) for each in labelled], axis=0)
+        own = labelled[best, np.arange(len(y))]
+        root = np.linalg.cholesky(_WIDENED**2 * np.cov(own, rowvar=False))
+        return PeakDensity(self.space, StudentTDensity(own.mean(axis=0), root))
+
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log density over the prior's, (n, 6 N + 2) -> (n,)."""
         y = self.space.enter(theta)

@@ -283,6 +283,8 @@ def _fitted(
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
     pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
+    # Samples of a climb weigh alike, so that those that are kept serve for the field.
+    theta, weight = (samples, None) if isinstance(result, Climb) else (result.theta, result.weight)
     blind = blind_axis_rad(recording)
     silent = _uninformed(samples, prior, rng)
     if blind is not None:
@@ -301,7 +303,7 @@ def _fitted(
         samples=samples,
         n_gaussians=n_gaussians,
         noise_sd=pooled_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
-        field=mean_field(result.theta, n_gaussians, pixel_mm=pixel, weight=result.weight),
+        field=mean_field(theta, n_gaussians, pixel_mm=pixel, weight=weight),
         instrumentation=plan.instrumentation,
         scan_noise=noise_by_scan(
             residuals, plan.scan[usable], plan.scan_names, sd_floor=floor, sd_ceiling=ceiling, rng=rng

@@ -20,7 +20,7 @@ from probewise.calibration.around_peak import around_peak, evidence_about
 from probewise.calibration.climb import Climb, Rung, climb
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_search import Found, Progress, search_order
-from probewise.calibration.peaks import Peak, find_peak
+from probewise.calibration.peaks import Peak, find_peaks
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.calibration.removal import Removal, bridged
@@ -29,7 +29,6 @@ __all__ = ["climb_orders", "next_order"]
 
 _N_CLOUDS = 8
 _N_PARTICLES = 1000
-_N_STARTS = 16
 # Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
 _NEEDED = 20.0
 # Where the evidence comes from a bridge, a change of temperature may leave so few of the particles effective.
@@ -38,6 +37,8 @@ _BRIDGED_KEPT = 0.2
 _N_TRIES = 4
 # Least effective share of the samples in a bridge.
 _LEAST_SHARE = 0.05
+# Draws of a density fitted to the samples about a peak.
+_N_FITTED = 6000
 # Two evidences this many errors apart disagree.
 _DISAGREE = 4.0
 # A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
@@ -65,14 +66,12 @@ def climb_orders(
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
     found: dict[int, Found] = {}
-    below: Peak | None = None
+    peaks = find_peaks(posing.problem, highest, rng=climbing)
     for n in range(1, highest + 1):
-        peak = find_peak(posing.problem(n), n_starts=_N_STARTS, rng=climbing)
-        needed = below is None or peak.highest - below.highest > _NEEDED
+        needed = n == 1 or peaks[n].log_likelihood - peaks[n - 1].log_likelihood > _NEEDED
         found[n] = next_order(
-            posing, n, found.get(n - 1), peak, climbing, needed=needed, n_live=n_live, progress=progress
+            posing, n, found.get(n - 1), peaks[n], climbing, needed=needed, n_live=n_live, progress=progress
         )
-        below = peak
     return {n: found[n] for n in orders}, ()
 
 
@@ -143,9 +142,17 @@ def _about_peak(
     density, n_calls = around_peak(problem, peak.theta, rng=rng)
     nothing = np.empty((_N_PARTICLES, 0))
     clouds = np.zeros(_N_CLOUDS)
-    return climb(
+    made = climb(
         problem, density, nothing, log_z_below=clouds, error_below=0.0, n_calls_below=n_calls, rng=rng, told=told
     )
+    if made.warnings:
+        return made
+    fitted = density.fitted_to(made.theta)
+    drawn = fitted.draw(np.empty((_N_FITTED, 0)), rng=rng)
+    log_weight = np.full(_N_FITTED, -np.inf)
+    inside = np.flatnonzero(np.isfinite(drawn).all(axis=1))
+    log_weight[inside] = problem.log_likelihood(drawn[inside]) - fitted.log_likelihood(drawn[inside])
+    return _bridged(made, clouds, log_weight, (made.log_likelihood - fitted.log_likelihood(made.theta))[:, None])
 
 
 def _from_below(
@@ -189,12 +196,12 @@ def _bridged(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArra
     if not apart > _DISAGREE:
         return found
     words = f"{made.log_z:.2f} ± {made.log_z_error:.2f} by temperatures, {found.log_z:.2f} ± {found.log_z_error:.2f}"
-    return replace(found, doubts=(f"two estimates of ln Z disagree: {words} by taking Gaussians away",))
+    return replace(found, doubts=(f"two estimates of ln Z disagree: {words} by a bridge",))
 
 
 def _vouched(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Generator) -> Climb:
     """Doubt a climb that missed a peak which holds a part of the evidence."""
-    if made.warnings or peak.highest - made.log_likelihood.max() < _HIGHER:
+    if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:
         return made
     problem = posing.problem(n)
     density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_WEIGHED)
@@ -202,4 +209,4 @@ def _vouched(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Gen
     share = math.exp(min(log_z - made.log_z, 0.0))
     if share < _MISSED:
         return made
-    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {peak.highest - made.log_likelihood.max():.1f} may hold {share:.0%} of Z"))
+    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {peak.log_likelihood - made.log_likelihood.max():.1f} may hold {share:.0%} of Z"))

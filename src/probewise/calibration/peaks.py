@@ -1,11 +1,13 @@
 """Find the peaks of a likelihood by least squares from many starts (Levenberg 1944, Marquardt 1963).
 
-The starts are spread over the prior, and all of them take their steps together. Each data set's noise sd is that of its
+The starts are spread over the prior, and made from the peaks of the orders below and above: a Gaussian split, added, taken
+away. All of them take their steps together. Each data set's noise sd is that of its
 residuals, so that the steps follow the Student-t likelihood.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,45 +18,104 @@ from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
 
-__all__ = ["Peak", "find_peak"]
+__all__ = ["Peak", "find_peaks"]
 
 _N_DRAWS = 1500
-_N_STEPS = 25
+# Starts to two Gaussians, and to more; by the prior, by a split of the peak below, by one added to it.
+_STARTS, _FEWER_STARTS = (12, 14, 6), (7, 8, 3)
+_N_STEPS, _N_TRIED = 30, 8
 _DIFFERENCE = 1e-5
 _MOST_Z = 14.0
 _FIRST_DAMPING, _LOOSER, _TIGHTER = 1e-2, 0.2, 5.0
 _LONGEST = 2.0
-_SETTLED = 1e-2
+_PRIOR_CURVATURE = 0.1
+_EDGE = 1e-6
+_STUCK = 1e6
+_SETTLED = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Peak:
-    """Where many ascents ended: the highest place, (n_params,), and ln L of each, (n_starts,), greatest first."""
+    """The highest place found, (n_params,), and ln L there."""
 
     theta: FloatArray
-    log_likelihood: FloatArray
-
-    @property
-    def highest(self) -> float:
-        """Greatest ln L."""
-        return float(self.log_likelihood[0])
+    log_likelihood: float
 
 
-def find_peak(problem: SensorProblem, *, n_starts: int, rng: np.random.Generator) -> Peak:
-    """Climb from the best of many draws of the prior.
+def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np.random.Generator) -> dict[int, Peak]:
+    """Find the highest peak of each order from 1.
 
     Parameters
     ----------
     problem
-        With an `SSFPrior` and a `StudentT` likelihood.
-    n_starts
-        Ascents, from the best of 1,500 draws.
+        Gives that of an order, with an `SSFPrior` of uniform light and a `StudentT` likelihood.
+    highest
+        Number of Gaussians to go to.
     rng
         Source of randomness.
     """
-    prior, likelihood, recording = problem.prior, problem.likelihood, problem.recording
-    if not isinstance(prior, SSFPrior) or not isinstance(likelihood, StudentT):
-        raise ParameterError("problem", problem, "one of an SSFPrior and a StudentT likelihood")
+    found: dict[int, Peak] = {}
+    for n in range(1, highest + 1):
+        prior = _prior(problem(n))
+        drawn = prior.from_unit_cube(rng.random((_N_DRAWS, len(prior.names))))
+        n_free, n_split, n_added = _STARTS if n <= 2 else _FEWER_STARTS
+        starts = [drawn[np.argsort(-problem(n).log_likelihood(drawn))[:n_free]]]
+        if n > 1:
+            below = np.repeat(found[n - 1].theta[None], n_split + n_added, axis=0)
+            lone = drawn[:n_added, :6]
+            starts += [_split(below[:n_split], rng), _joined(prior, below[n_split:], lone, rng)]
+        found[n] = _ascended(problem(n), np.concatenate(starts))
+    for n in range(highest - 1, 0, -1):
+        above = found[n + 1].theta
+        lacking = [np.delete(above, slice(6 * k, 6 * k + 6)) for k in range(n + 1)]
+        again = _ascended(problem(n), np.array(lacking))
+        found[n] = max(found[n], again, key=lambda peak: peak.log_likelihood)
+    return found
+
+
+def _prior(problem: SensorProblem) -> SSFPrior:
+    if not isinstance(problem.prior, SSFPrior):
+        raise ParameterError("problem.prior", problem.prior, "an SSFPrior")
+    return problem.prior
+
+
+def _split(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Split one Gaussian of each into two that keep its light, centre and covariance, (n, 6 N) -> (n, 6 N + 6)."""
+    m = len(theta)
+    g = theta[:, :-2].reshape(m, -1, 6)
+    rows, which = np.arange(m), rng.integers(g.shape[1], size=m)
+    whole = g[rows, which]
+    half = np.array([[2.0 * whole[:, 3], 2.0 * whole[:, 5]], [2.0 * whole[:, 5], 2.0 * whole[:, 4]]]).transpose(2, 0, 1)
+    covariance = np.linalg.inv(half)
+    share = rng.uniform(0.2, 0.8, m)
+    angle, reach = rng.uniform(0.0, 2.0 * np.pi, m), rng.uniform(0.4, 0.97, m)
+    root = np.linalg.cholesky(covariance)
+    apart = np.einsum("nij,nj->ni", root, (reach * np.stack([np.cos(angle), np.sin(angle)])).T)
+    left = 0.5 * np.linalg.inv(covariance - apart[:, :, None] * apart[:, None, :])
+    scale = np.sqrt((left[:, 0, 0] * left[:, 1, 1] - left[:, 0, 1] ** 2) / (whole[:, 3] * whole[:, 4] - whole[:, 5] ** 2))
+    parts = []
+    for own, side in ((share, np.sqrt((1.0 - share) / share)), (1.0 - share, -np.sqrt(share / (1.0 - share)))):
+        centre = whole[:, 1:3] + side[:, None] * apart
+        moments = np.stack([left[:, 0, 0], left[:, 1, 1], left[:, 0, 1]], axis=1)
+        parts.append(np.column_stack([whole[:, 0] * own * scale, centre, moments]))
+    out = theta.copy()
+    out[:, :-2].reshape(m, -1, 6)[rows, which] = parts[0]
+    return np.concatenate([out[:, :-2], parts[1], out[:, -2:]], axis=1)
+
+
+def _joined(prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Add a Gaussian that holds a fifth of the light of the first, or less, (n, 6 N), (n, 6) -> (n, 6 N + 6)."""
+    one, first = lone.copy(), theta[:, :6]
+    light = first[:, 0] / prior.amplitude_scale(first[:, 3] * first[:, 4] - first[:, 5] ** 2)
+    one[:, 0] = light * rng.uniform(0.01, 0.2, len(one)) * prior.amplitude_scale(one[:, 3] * one[:, 4] - one[:, 5] ** 2)
+    return np.concatenate([theta[:, :-2], one, theta[:, -2:]], axis=1)
+
+
+def _ascended(problem: SensorProblem, starts: FloatArray) -> Peak:
+    """Ascend from each start, (n_starts, n_params); the worse half gives up after some steps."""
+    prior, likelihood, recording = _prior(problem), problem.likelihood, problem.recording
+    if not isinstance(likelihood, StudentT):
+        raise ParameterError("problem.likelihood", likelihood, "a StudentT")
     usable = recording.usable
     readings = recording.readings[usable]
 
@@ -62,40 +123,36 @@ def find_peak(problem: SensorProblem, *, n_starts: int, rng: np.random.Generator
         theta = prior.from_unit_cube(expit(z))
         return np.asarray(readings - problem.model.predict(theta, recording.plan)[:, usable])
 
-    def height(off: FloatArray) -> FloatArray:
-        return likelihood.log_prob(readings, readings - off)
-
-    drawn = rng.random((_N_DRAWS, len(prior.names)))
-    started = problem.log_likelihood(prior.from_unit_cube(drawn))
-    z = logit(drawn[np.argsort(-started)[:n_starts]])
+    z = logit(prior.to_unit_cube(starts).clip(_EDGE, 1.0 - _EDGE))
     n, d = z.shape
     damping = np.full(n, _FIRST_DAMPING)
     off = residual(z)
-    high = height(off)
+    high = likelihood.log_prob(readings, readings - off)
     going = np.ones(n, dtype=np.bool_)
-    for _ in range(_N_STEPS):
+    for k in range(_N_STEPS):
+        if k == _N_TRIED:
+            going &= high >= np.median(high)
         rows = np.flatnonzero(going)
         if not rows.size:
             break
         here, own = z[rows], off[rows]
         shifted = (here[:, None, :] + _DIFFERENCE * np.eye(d)).reshape(-1, d)
         slope = (residual(shifted).reshape(len(rows), d, -1) - own[:, None, :]) / -_DIFFERENCE
-        weight = likelihood.weights(own)
-        weighted = slope * weight[:, None, :]
+        weighted = slope * likelihood.weights(own)[:, None, :]
         curvature = weighted @ slope.transpose(0, 2, 1)
         gradient = np.einsum("ndp,np->nd", weighted, own)
-        # Where the readings say nothing, the unit curvature of a logistic prior holds the step.
-        scale = np.einsum("ndd->nd", curvature) + 0.1
-        damped = curvature + np.einsum("n,nd,de->nde", damping[rows], scale, np.eye(d)) + 1e-3 * np.eye(d)
+        # Where the readings say nothing, about the curvature of the logistic prior holds the step.
+        scale = np.einsum("ndd->nd", curvature) + _PRIOR_CURVATURE
+        damped = curvature + (damping[rows, None] * scale)[:, None, :] * np.eye(d) + 0.01 * _PRIOR_CURVATURE * np.eye(d)
         step = np.linalg.solve(damped, gradient[..., None])[..., 0].clip(-_LONGEST, _LONGEST)
         to = (here + step).clip(-_MOST_Z, _MOST_Z)
         there = residual(to)
-        reached = height(there)
+        reached = likelihood.log_prob(readings, readings - there)
         gain = reached - high[rows]
         better = gain > 0.0
         up = rows[better]
         z[up], off[up], high[up] = to[better], there[better], reached[better]
         damping[rows] = (damping[rows] * np.where(better, _LOOSER, _TIGHTER)).clip(1e-9, 1e9)
-        going[rows] = (gain > _SETTLED) | (~better & (damping[rows] < 1e6))
-    order = np.argsort(-high)
-    return Peak(prior.from_unit_cube(expit(z[order[:1]]))[0], high[order])
+        going[rows] = (gain > _SETTLED) | (~better & (damping[rows] < _STUCK))
+    best = int(np.argmax(high))
+    return Peak(prior.from_unit_cube(expit(z[best : best + 1]))[0], float(high[best]))

@@ -26,8 +26,8 @@ __all__ = ["Removal", "bridged"]
 
 _AT_ONCE = 400_000
 _NODES, _FEW_NODES = np.polynomial.legendre.leggauss(24), np.polynomial.legendre.leggauss(16)
-_N_GRID = 48
-_REACH = 7.0
+_N_GRID = 60
+_REACH = 6.0
 _N_NEWTON = 4
 _N_TABLE = 1024
 
@@ -70,7 +70,7 @@ class Removal:
     def exchanged(self, theta: FloatArray, *, n_tries: int, rng: np.random.Generator) -> FloatArray:
         """Exchange one Gaussian of each sample, for one of so many of the prior, or for itself with other light.
 
-        The posterior of N stays as it is, but for the grid of shares, 0.3 sd apart, that the light is drawn from.
+        The posterior of N stays as it is, but for the grid of shares, 0.2 sd apart, that the light is drawn from.
         Both (n, 6 N + 2); the Gaussians in no order.
         """
         n = self.prior.n_gaussians
@@ -200,8 +200,9 @@ class Removal:
             best = (per_variance * both).sum(axis=-1) / told
             share = best.clip(0.0, 1.0)
         sd = 1.0 / np.sqrt(told)
-        # Where less than nothing would be best, the likelihood falls from 0 by an exponential.
-        reach = np.where(best < 0.0, 2.0 * _REACH**2 * sd / (_REACH + np.abs(best) / sd), _REACH * sd)
+        # Where less than nothing would be best, the likelihood falls from 0 almost by an exponential.
+        below = np.abs(best) / sd
+        reach = np.where(best < 0.0, _REACH**2 * sd / (below + np.hypot(below, _REACH)), _REACH * sd)
         low = (share - reach).clip(0.0, 1.0)
         return low, np.maximum((share + reach).clip(0.0, 1.0), low + 1e-12)
 
@@ -259,7 +260,8 @@ def bridged(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
     def uneven(log_ratio: float) -> float:
         return float(expit(added - log_ratio).mean() - expit(log_ratio - each).mean())
 
-    low, high = min(added.min(), each.min()) - 1.0, max(added.max(), each.max()) + 1.0
+    added = np.where(added > -np.inf, added, -1e300)
+    low, high = min(added[added > -1e300].min(initial=each.min()), each.min()) - 1.0, max(added.max(), each.max()) + 1.0
     found = float(brentq(uneven, low, high, xtol=1e-6))
     samples = expit(found - taken).sum(axis=1)
     up = expit(added - found)

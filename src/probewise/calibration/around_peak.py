@@ -75,6 +75,10 @@ class PeakDensity:
         theta[~np.isfinite(log_prior)] = np.nan
         return theta
 
+    def widened(self, factor: float) -> PeakDensity:
+        """Widen it by a factor."""
+        return PeakDensity(self.space, StudentTDensity(self.one.mean, factor * self.one.root))
+
     def fitted_to(self, theta: FloatArray) -> PeakDensity:
         """Fit a density to samples, (n, 6 N + 2), each with the labels that this one gives them."""
         y = self.space.enter(theta)
@@ -138,15 +142,13 @@ def around_peak(
     return PeakDensity(space, density), n_calls
 
 
-def evidence_about(
-    problem: SensorProblem, density: PeakDensity, *, n_draws: int, rng: np.random.Generator
-) -> tuple[float, float]:
-    """Estimate ln Z of what lies about a peak by importance sampling; also the effective number of draws."""
+def evidence_about(problem: SensorProblem, density: PeakDensity, *, n_draws: int, rng: np.random.Generator) -> float:
+    """Estimate ln Z of what lies about a peak by importance sampling."""
     _, theta, log_density = density.drawn(n_draws, rng=rng)
     log_weight = problem.log_likelihood(theta) - log_density if len(theta) else np.empty(0)
     if not np.isfinite(log_weight).any():
-        return -math.inf, 0.0
-    return float(logsumexp(log_weight)) - math.log(n_draws), n_effective(log_weight)
+        return -math.inf
+    return float(logsumexp(log_weight)) - math.log(n_draws)
 
 
 def _laplace(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -> StudentTDensity:

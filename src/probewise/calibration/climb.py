@@ -1,8 +1,9 @@
 """Climb to the posterior of N Gaussians by sequential Monte Carlo (Del Moral, Doucet & Jasra 2006).
 
-Particles drawn from a density that is known, made from the posterior of N - 1 or about a peak, are carried in small changes of temperature to the posterior of N: weighed,
-resampled, and moved by Metropolis steps. They form clouds that are weighed and resampled each by itself, so that
-the scatter of the clouds' evidences is an honest error: it holds what one cloud found and another missed.
+Particles drawn from a density that is known, made from the posterior of N - 1 or about a peak, are carried in small
+changes of temperature to the posterior of N: weighed, resampled, and moved by Metropolis steps. They form clouds that
+are weighed and resampled each by itself, so that the scatter of the clouds' evidences is an honest error: it holds
+what one cloud found and another missed.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from probewise.calibration.priors import SSFPrior
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["Climb", "KnownDensity", "Rung", "climb"]
+__all__ = ["N_SNAPSHOTS", "Climb", "KnownDensity", "Rung", "climb"]
 
 # A change of temperature leaves at least this share of the particles effective.
 _KEPT = 0.5
@@ -31,8 +32,9 @@ _BISECTIONS = 40
 _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: one costs as much as a move.
 _DRAWS = 4
-# Moves of each particle once the posterior is reached, and how many of them lie between two samples that are kept.
-_N_MORE, _APART, _EXCHANGE = 12, 4, 2
+# Times that the posterior's samples are kept; moves of each particle once it is reached, and between two exchanges.
+N_SNAPSHOTS = 4
+_N_MORE, _EXCHANGE = 12, 2
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 6
 # A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.
@@ -85,13 +87,13 @@ class Climb(ShowsItself):
     names
         Parameters, one a column of theta.
     theta
-        Samples, (n, n_params), cloud after cloud, the Gaussians sorted by mass.
+        Samples, (n, n_params), cloud after cloud, early ones first, the Gaussians sorted by mass.
     log_likelihood, log_weight
         Of each, (n,); the weights sum to one.
     log_z_of_clouds
         Natural log of the evidence from each cloud, (n_clouds,).
     start_error
-        Standard error of ln Z of the order that the first climb began with.
+        Standard error of ln Z that the clouds have in common: of the order that the first climb began with, and drift.
     temperatures
         From 0, the reference, to 1, the posterior, (n_temperatures,).
     accepted
@@ -197,6 +199,7 @@ def climb(
     rng: np.random.Generator,
     n_steps: int = _N_STEPS,
     least_kept: float = _KEPT,
+    n_more: int = _N_MORE,
     exchange: Callable[[FloatArray], FloatArray] | None = None,
     told: Callable[[Rung], None] | None = None,
 ) -> Climb:
@@ -222,6 +225,8 @@ def climb(
         Moves of each particle at each temperature.
     least_kept
         Effective share of the particles that a change of temperature leaves.
+    n_more
+        Moves of each particle once the posterior is reached; samples are kept from the last half of them.
     exchange
         Moves parameters, (n, 6 N + 2), and leaves the posterior as it is.
     told
@@ -276,14 +281,16 @@ def climb(
         overlap = min(overlap, share)
         if told is not None:
             told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
-    kept = [now]
+    kept = []
+    keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     if temperatures[-1] == 1.0:
-        for k in range(1, _N_MORE + 1):
+        for k in range(1, n_more + 1):
             now, _ = _moved(now, partial(known, beta=1.0), reference, 1.0, rng, fresh=exchange is None)
             if exchange is not None and k % _EXCHANGE == 0:
                 now = known(space.enter(exchange(space.leave(now.x)[0])), 1.0)
-            if k % _APART == 0:
+            if k in keep:
                 kept.append(now)
+    kept = kept or [now]
     x = np.stack([cloud.x.reshape(n_clouds, n, -1) for cloud in kept], axis=1)
     theta, _ = space.leave(x.reshape(-1, x.shape[-1]))
     log_likelihood = np.stack([cloud.log_likelihood.reshape(n_clouds, n) for cloud in kept], axis=1)
@@ -297,7 +304,9 @@ def climb(
         temperatures=np.array(temperatures),
         accepted=accepted,
         n_calls=n_calls,
-        doubts=() if overlap >= _LEAST_OVERLAP else (f"two temperatures have {overlap:.1%} of the particles in common",),
+        doubts=()
+        if overlap >= _LEAST_OVERLAP
+        else (f"two temperatures have {overlap:.1%} of the particles in common",),
     )
 
 

@@ -94,6 +94,7 @@ def coverage(
     *,
     rng: np.random.Generator,
     n_live: int = 300,
+    quick: bool = False,
     executor: Executor | None = None,
     progress: Callable[[Coverage], None] | None = None,
 ) -> Coverage:
@@ -107,6 +108,8 @@ def coverage(
         Source of randomness for truths, noise and fits; spawned for each recording.
     n_live
         Live points of each fit.
+    quick
+        Whether to calibrate the quick way; see `calibrate`.
     executor
         Runs the fits; by default they run here, one by one. The counts do not depend on it.
     progress
@@ -116,17 +119,18 @@ def coverage(
         raise ParameterError("n_recordings", n_recordings, "1 or more")
     held: dict[str, int] = {}
     each = map if executor is None else executor.map
-    for k, one in enumerate(each(_held, rng.spawn(n_recordings), [n_live] * n_recordings)):
+    for k, one in enumerate(each(_held, rng.spawn(n_recordings), [n_live] * n_recordings, [quick] * n_recordings)):
         held = {name: held.get(name, 0) + int(inside) for name, inside in one.items()}
         if progress is not None:
             progress(Coverage(k + 1, held, n_live))
     return Coverage(n_recordings, held, n_live)
 
 
-def _held(rng: np.random.Generator, n_live: int) -> dict[str, bool]:
+def _held(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:
     """Simulate and calibrate one recording; return for each quantity whether its interval holds the truth."""
     truth = draw_truth(rng=rng)
-    samples = calibrate(simulate_truth(truth, rng=rng), orders=(1,), n_live=n_live, rng=rng).sensor.samples
+    recording = simulate_truth(truth, rng=rng)
+    samples = calibrate(recording, orders=(1,), n_live=n_live, quick=quick, rng=rng).sensor.samples
     found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
     held = {}
     for name, value in _quantities(truth).items():
@@ -135,14 +139,17 @@ def _held(rng: np.random.Generator, n_live: int) -> dict[str, bool]:
     return held
 
 
-def order_lead(truth: Truth, *, rng: np.random.Generator, n_live: int = 300) -> tuple[float, float]:
+def order_lead(
+    truth: Truth, *, rng: np.random.Generator, n_live: int = 300, quick: bool = False
+) -> tuple[float, float]:
     """Simulate a single-Gaussian recording; return log Z of one Gaussian minus that of two, and its error."""
-    one, two = calibrate(simulate_truth(truth, rng=rng), orders=(1, 2), n_live=n_live, rng=rng).orders
+    recording = simulate_truth(truth, rng=rng)
+    one, two = calibrate(recording, orders=(1, 2), n_live=n_live, quick=quick, rng=rng).orders
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
 
 
-def _drawn_lead(rng: np.random.Generator, n_live: int) -> tuple[float, float]:
-    return order_lead(draw_truth(rng=rng), rng=rng, n_live=n_live)
+def _drawn_lead(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
+    return order_lead(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
 
 
 def main() -> None:
@@ -155,13 +162,14 @@ def main() -> None:
     )
     parser.add_argument("--recordings", type=int, required=True, help="how many recordings are simulated")
     parser.add_argument("--live", type=int, default=300, help="live points (default 300)")
+    parser.add_argument("--quick", action="store_true", help="calibrate the quick way")
     parser.add_argument("--seed", type=int, default=20, help="seed (default 20)")
     parser.add_argument("--workers", type=int, default=2, help="processes; they change no result (default 2)")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="JSON file to write")
     asked = parser.parse_args()
     about = {
         "command": f"{parser.prog} {asked.campaign} --recordings {asked.recordings} --live {asked.live} "
-        f"--seed {asked.seed} --out {asked.out.name}",
+        f"{'--quick ' if asked.quick else ''}--seed {asked.seed} --out {asked.out.name}",
         "seed": asked.seed,
         "date": datetime.date.today().isoformat(),
     }
@@ -175,11 +183,14 @@ def main() -> None:
             def count(_: Coverage) -> None:
                 bar.update()
 
-            counts = coverage(asked.recordings, rng=rng, n_live=asked.live, executor=executor, progress=count)
+            counts = coverage(
+                asked.recordings, rng=rng, n_live=asked.live, quick=asked.quick, executor=executor, progress=count
+            )
             counts.save(asked.out, **about)
             return
         leads = []
-        for lead, error in executor.map(_drawn_lead, rng.spawn(asked.recordings), [asked.live] * asked.recordings):
+        each = rng.spawn(asked.recordings), [asked.live] * asked.recordings, [asked.quick] * asked.recordings
+        for lead, error in executor.map(_drawn_lead, *each):
             leads.append((round(lead, 3), round(error, 3)))
             bar.update()
     preferred = sum(lead > 0 for lead, _ in leads)

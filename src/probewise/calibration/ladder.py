@@ -17,7 +17,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.calibration.around_peak import around_peak, evidence_about
-from probewise.calibration.climb import Climb, Rung, climb
+from probewise.calibration.climb import N_SNAPSHOTS, Climb, Rung, climb
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_search import Found, Progress, search_order
 from probewise.calibration.peaks import Peak, find_peaks
@@ -37,10 +37,14 @@ _BRIDGED_KEPT = 0.2
 _N_TRIES = 4
 # Least effective share of the samples in a bridge.
 _LEAST_SHARE = 0.05
+# The first climb from a peak starts from a density so much wider: particles gather more easily than they spread.
+_WIDENED = 1.6
+# Moves once the posterior is reached, at the first climb from a peak and at the second.
+_FEW_MOVES, _MANY_MOVES = 6, 60
 # Draws of a density fitted to the samples about a peak.
 _N_FITTED = 6000
-# Two evidences this many errors apart disagree.
-_DISAGREE = 4.0
+# Two evidences this many errors apart disagree, if it is this far: few clouds tell their own scatter roughly.
+_DISAGREE, _APART = 4.0, 1.0
 # A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
 _HIGHER, _MISSED = 2.0, 0.2
 _N_WEIGHED = 400
@@ -140,14 +144,26 @@ def _about_peak(
     """Carry particles from a density about the peak to the posterior."""
     problem = posing.problem(n)
     density, n_calls = around_peak(problem, peak.theta, rng=rng)
+    density = density.widened(_WIDENED)
     nothing = np.empty((_N_PARTICLES, 0))
     clouds = np.zeros(_N_CLOUDS)
-    made = climb(
-        problem, density, nothing, log_z_below=clouds, error_below=0.0, n_calls_below=n_calls, rng=rng, told=told
-    )
+    # Once more from a density fitted to the samples: it is nearer, and proposes moves that are accepted.
+    for n_more in (_FEW_MOVES, _FEW_MOVES if n == 1 else _MANY_MOVES):
+        made = climb(
+            problem,
+            density,
+            nothing,
+            log_z_below=clouds,
+            error_below=0.0,
+            n_calls_below=n_calls,
+            n_more=n_more,
+            rng=rng,
+            told=told,
+        )
+        density, n_calls = density.fitted_to(made.theta), made.n_calls
     if made.warnings:
         return made
-    fitted = density.fitted_to(made.theta)
+    fitted = density
     drawn = fitted.draw(np.empty((_N_FITTED, 0)), rng=rng)
     log_weight = np.full(_N_FITTED, -np.inf)
     inside = np.flatnonzero(np.isfinite(drawn).all(axis=1))
@@ -191,12 +207,20 @@ def _bridged(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArra
     if bridged(added, taken)[1] < _LEAST_SHARE:
         return made
     each = zip(np.split(added, _N_CLOUDS), np.split(taken, _N_CLOUDS), strict=True)
-    found = replace(made, log_z_of_clouds=log_z + np.array([bridged(*both)[0] for both in each]))
-    apart = abs(found.log_z - made.log_z) / math.hypot(found.log_z_error, made.log_z_error)
-    if not apart > _DISAGREE:
+    # Samples of the posterior that still drift tell another evidence late than early.
+    by_time = taken.reshape(_N_CLOUDS, N_SNAPSHOTS, -1, taken.shape[1])
+    early, late = (half.reshape(-1, taken.shape[1]) for half in np.split(by_time, 2, axis=1))
+    drift = bridged(added, late)[0] - bridged(added, early)[0]
+    found = replace(
+        made,
+        log_z_of_clouds=log_z + np.array([bridged(*both)[0] for both in each]),
+        start_error=math.hypot(made.start_error, drift),
+    )
+    apart = abs(found.log_z - made.log_z)
+    if not apart > max(_DISAGREE * math.hypot(found.log_z_error, made.log_z_error), _APART):
         return found
     words = f"{made.log_z:.2f} ± {made.log_z_error:.2f} by temperatures, {found.log_z:.2f} ± {found.log_z_error:.2f}"
-    return replace(found, doubts=(f"two estimates of ln Z disagree: {words} by a bridge",))
+    return replace(found, doubts=(*found.doubts, f"two estimates of ln Z disagree: {words} by a bridge"))
 
 
 def _vouched(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Generator) -> Climb:
@@ -205,8 +229,9 @@ def _vouched(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Gen
         return made
     problem = posing.problem(n)
     density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_WEIGHED)
-    log_z, n_eff = evidence_about(problem, density, n_draws=_N_WEIGHED, rng=rng)
+    log_z = evidence_about(problem, density, n_draws=_N_WEIGHED, rng=rng)
     share = math.exp(min(log_z - made.log_z, 0.0))
     if share < _MISSED:
         return made
-    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {peak.log_likelihood - made.log_likelihood.max():.1f} may hold {share:.0%} of Z"))
+    higher = peak.log_likelihood - float(made.log_likelihood.max())
+    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {higher:.1f} may hold {share:.0%} of Z"))

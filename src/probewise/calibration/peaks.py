@@ -92,7 +92,9 @@ def _split(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
     root = np.linalg.cholesky(covariance)
     apart = np.einsum("nij,nj->ni", root, (reach * np.stack([np.cos(angle), np.sin(angle)])).T)
     left = 0.5 * np.linalg.inv(covariance - apart[:, :, None] * apart[:, None, :])
-    scale = np.sqrt((left[:, 0, 0] * left[:, 1, 1] - left[:, 0, 1] ** 2) / (whole[:, 3] * whole[:, 4] - whole[:, 5] ** 2))
+    scale = np.sqrt(
+        (left[:, 0, 0] * left[:, 1, 1] - left[:, 0, 1] ** 2) / (whole[:, 3] * whole[:, 4] - whole[:, 5] ** 2)
+    )
     parts = []
     for own, side in ((share, np.sqrt((1.0 - share) / share)), (1.0 - share, -np.sqrt(share / (1.0 - share)))):
         centre = whole[:, 1:3] + side[:, None] * apart

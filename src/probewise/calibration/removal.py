@@ -146,7 +146,9 @@ class Removal:
         sums = self._sums(others, one, levels)
         return self._integrated(*sums, light.sum(axis=-1) / light.max(axis=-1), _NODES)
 
-    def _sums(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _sums(
+        self, others: FloatArray, one: FloatArray, levels: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Sums over data sets of residual squared, residual times change, change squared, (..., n_sets) each.
 
         The residual is that of the others alone; the change, of a Gaussian that takes their place.

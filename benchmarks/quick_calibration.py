@@ -2,9 +2,9 @@
 
 python benchmarks/quick_calibration.py --seeds 12 --sensors 2 --seed 28 --out docs/results/quick_calibration.json
 
-`--seeds` quick calibrations of the shipped paper recording, or of `--recording`, tell whether the stated errors cover the scatter: chi-square a
-run, about the log of the mean evidence. `--sensors` concealed sensors of one Gaussian, and as many of two, are
-calibrated both ways: differences in units of both errors, the chosen orders, and cpu seconds.
+`--seeds` quick calibrations of the shipped paper recording, or of `--recording`, tell whether the stated errors cover
+the scatter: chi-square a run, about the log of the mean evidence. `--sensors` concealed sensors of one Gaussian, and
+as many of two, are calibrated both ways: differences in units of both errors, the chosen orders, and cpu seconds.
 """
 
 from __future__ import annotations

@@ -53,7 +53,8 @@ def test_a_climb_finds_no_gain_where_there_is_none(recording: Recording) -> None
     assert not found.warnings
     assert found.weight.sum() == pytest.approx(1.0)
     assert [rung.temperature for rung in rungs] == list(found.temperatures[1:])
-    assert rungs[-1] == Rung(1.0, found.log_z, found.n_calls)
+    assert (rungs[-1].temperature, rungs[-1].log_z) == (1.0, found.log_z)
+    assert rungs[-1].n_calls < found.n_calls
     assert "no doubt" not in found.summary()
     assert found.samples(500, rng=np.random.default_rng(1)).shape == (500, 14)
 

@@ -86,7 +86,7 @@ class PeakDensity:
         best = np.argmax([self.one.log_density(each) for each in labelled], axis=0)
         own = labelled[best, np.arange(len(y))]
         root = np.linalg.cholesky(_WIDENED**2 * np.cov(own, rowvar=False))
-        return PeakDensity(self.space, StudentTDensity(own.mean(axis=0), root))
+        return PeakDensity(self.space, StudentTDensity(own.mean(axis=0), np.asarray(root, dtype=np.float64)))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log density over the prior's, (n, 6 N + 2) -> (n,)."""
@@ -164,7 +164,7 @@ def _laplace(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -
     slope = (predicted[1:] - predicted[0]) / _DIFFERENCE
     weight = likelihood.weights(recording.readings[recording.usable] - predicted[:1])[0]
     covariance = np.linalg.inv((slope * weight) @ slope.T + np.diag(1.0 / wide))
-    return StudentTDensity(at, np.linalg.cholesky(_WIDENED**2 * covariance))
+    return StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance), dtype=np.float64))
 
 
 def _tempered(log_weight: FloatArray, least: float) -> FloatArray:

@@ -42,7 +42,7 @@ class PeakCoordinates:
         found = []
         for order in itertools.permutations(range(n)):
             columns = np.concatenate([*(np.arange(5 * k, 5 * k + 5) for k in order), [5 * n, 5 * n + 1]])
-            found.append((columns, c[:, list(order)] @ c.T))
+            found.append((columns, c[:, np.argsort(order)] @ c.T))
         return tuple(found)
 
     def relabel(self, y: FloatArray, change: tuple[IntArray, FloatArray]) -> FloatArray:

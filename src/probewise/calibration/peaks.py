@@ -1,8 +1,8 @@
 """Find the peaks of a likelihood by least squares from many starts (Levenberg 1944, Marquardt 1963).
 
-The starts are spread over the prior, and made from the peaks of the orders below and above: a Gaussian split, added, taken
-away. All of them take their steps together. Each data set's noise sd is that of its
-residuals, so that the steps follow the Student-t likelihood.
+The starts are spread over the prior, and made from the peaks of the orders below and above: a Gaussian split, added,
+taken away. All of them take their steps together. Each data set's noise sd is that of its residuals, so that the
+steps follow the Student-t likelihood.
 """
 
 from __future__ import annotations

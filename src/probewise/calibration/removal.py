@@ -1,10 +1,10 @@
 """The evidence of N Gaussians over that of N - 1, by taking one of the N away or adding one.
 
 With one Gaussian's light at nothing, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
-posterior tell of the other's evidence: from N, take one Gaussian away; from N - 1, add one drawn from the prior.
-Its light is integrated out, which one predicted curve allows, since the residuals are linear in its share of the light.
-Both kinds of samples meet in a bridge (Bennett 1976). The same integral moves a sample far: it exchanges one Gaussian for
-one of several drawn from the prior (Barker's choice among many, Tjelmeland 2004).
+posterior tell of the other's evidence: from N, take one Gaussian away; from N - 1, add one drawn from the prior. Its
+light is integrated out, which one predicted curve allows: residuals are linear in its share of the light. Both kinds
+of samples meet in a bridge (Bennett 1976). The same integral moves a sample far: it exchanges one Gaussian for one of
+several drawn from the prior (Barker's choice among many, Tjelmeland 2004).
 """
 
 from __future__ import annotations
@@ -12,17 +12,20 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TypeAlias
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT, log_sigma_integral
 
 __all__ = ["Removal", "bridged"]
+
+_Sums: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 _AT_ONCE = 400_000
 _NODES, _FEW_NODES = np.polynomial.legendre.leggauss(24), np.polynomial.legendre.leggauss(16)
@@ -94,7 +97,8 @@ class Removal:
         whole = (others.sum(axis=1) / others.max(axis=1))[:, None]
         log_gain = self._integrated(*sums, np.broadcast_to(whole, (m, n_tries + 1)), _FEW_NODES)
         chosen = (log_gain + rng.gumbel(size=log_gain.shape)).argmax(axis=1)
-        t = self._drawn_light(*(part[rows, chosen] for part in sums), whole[:, 0], rng)
+        square, both, change = (part[rows, chosen] for part in sums)
+        t = self._drawn_light(square, both, change, whole[:, 0], rng)
         scale = np.minimum(1.0, 1.0 / t) * rng.random(m) ** (1.0 / n)
         masses = np.empty((m, n))
         masses[beside] = (others / others.max(axis=1, keepdims=True) * scale[:, None]).ravel()
@@ -146,10 +150,8 @@ class Removal:
         sums = self._sums(others, one, levels)
         return self._integrated(*sums, light.sum(axis=-1) / light.max(axis=-1), _NODES)
 
-    def _sums(
-        self, others: FloatArray, one: FloatArray, levels: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Sums over data sets of residual squared, residual times change, change squared, (..., n_sets) each.
+    def _sums(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> _Sums:
+        """Sum residual squared, residual times change, change squared over data sets, (..., n_sets) each.
 
         The residual is that of the others alone; the change, of a Gaussian that takes their place.
         """
@@ -170,7 +172,7 @@ class Removal:
         whole: FloatArray,
         nodes: tuple[FloatArray, FloatArray],
     ) -> FloatArray:
-        """Log of the integral over t, over the likelihood at t = 0; `whole` is the others' light over the brightest's."""
+        """Log of the integral over t, over the likelihood at t = 0; `whole`: the others' light over the brightest's."""
         n = self.prior.n_gaussians
         low, high = self._bounds(square, both, own)
         place, weight = nodes
@@ -217,12 +219,13 @@ class Removal:
         return out
 
     @cached_property
-    def _tables(self) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+    def _tables(self) -> list[tuple[IntArray, FloatArray, FloatArray]]:
         """For data sets of each size: their columns, and log integrals over sigma by the log of the sum of squares.
 
         They are a straight line but near the bounds of sigma, so that linear interpolation serves.
         """
-        likelihood, found = self._likelihood, []
+        likelihood = self._likelihood
+        found: list[tuple[IntArray, FloatArray, FloatArray]] = []
         for size in np.unique(likelihood.sizes):
             low, high = likelihood.sd_floor**2 * size * 1e-3, likelihood.sd_ceiling**2 * size * 1e3
             grid = np.linspace(math.log(low), math.log(high), _N_TABLE)

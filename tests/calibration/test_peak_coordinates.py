@@ -1,0 +1,61 @@
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+import pytest
+
+from probewise._arrays import FloatArray
+from probewise.calibration import default_prior
+from probewise.calibration.around_peak import PeakDensity, StudentTDensity, evidence_about
+from probewise.calibration.peak_coordinates import PeakCoordinates
+from probewise.inference import SensorProblem
+from probewise.recordings import Recording
+
+
+class _Silent:
+    """A recording that says nothing: the evidence is one."""
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        return np.zeros(len(theta))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_parameters_come_back_but_for_the_light_of_all(recording: Recording, n: int) -> None:
+    """Readings depend on ratios of light alone, so that the sum of its logs may differ."""
+    prior = default_prior(recording, n)
+    space = PeakCoordinates(prior)
+    theta = prior.from_unit_cube(np.random.default_rng(1).uniform(0.02, 0.98, (50, 6 * n + 2)))
+    back, log_density = space.leave(space.enter(theta))
+    assert np.isfinite(log_density).all()
+    ratio = (back / theta)[:, :-2:6]
+    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1], ratio.shape), rtol=1e-6)
+    shapes = np.setdiff1d(np.arange(6 * n + 2), np.arange(0, 6 * n, 6))
+    np.testing.assert_allclose(back[:, shapes], theta[:, shapes], rtol=1e-6)
+    np.testing.assert_allclose(prior.to_unit_cube(back)[:, : 6 * n : 6].max(axis=1), 1.0, rtol=1e-9)
+
+
+def test_a_change_of_labels_changes_neither_density_nor_readings(recording: Recording) -> None:
+    prior = default_prior(recording, 3)
+    space = PeakCoordinates(prior)
+    y = space.enter(prior.from_unit_cube(np.random.default_rng(2).uniform(0.02, 0.98, (20, 20))))
+    theta, log_density = space.leave(y)
+    assert len(space.relabelled) == 6
+    for change in space.relabelled:
+        other, log_other = space.leave(space.relabel(y, change))
+        np.testing.assert_allclose(log_other, log_density, rtol=1e-9)
+        np.testing.assert_allclose(np.sort(other[:, 1:-2:6]), np.sort(theta[:, 1:-2:6]), rtol=1e-9)
+        np.testing.assert_allclose(np.sort(other[:, :-2:6]), np.sort(theta[:, :-2:6]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_prior_integrates_to_one_in_these_coordinates(recording: Recording, n: int) -> None:
+    """Draws of a Student-t that is fitted to the prior weigh one on average; five errors."""
+    prior = default_prior(recording, n)
+    space, rng = PeakCoordinates(prior), np.random.default_rng(3)
+    y = space.enter(prior.from_unit_cube(rng.random((4000, 6 * n + 2))))
+    density = PeakDensity(space, StudentTDensity(y.mean(axis=0), np.linalg.cholesky(np.cov(y, rowvar=False))))
+    _, _, log_density = density.drawn(40_000, rng=rng)
+    error = np.exp(-log_density).std() * np.sqrt(len(log_density)) / 40_000
+    log_z = evidence_about(cast("SensorProblem", _Silent()), density, n_draws=40_000, rng=rng)
+    assert abs(np.exp(log_z) - 1.0) < 5 * error < 0.15

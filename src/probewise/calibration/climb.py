@@ -198,7 +198,6 @@ def climb(
     n_calls_below: int = 0,
     rng: np.random.Generator,
     n_steps: int = _N_STEPS,
-    least_kept: float = _KEPT,
     n_more: int = _N_MORE,
     exchange: Callable[[FloatArray], FloatArray] | None = None,
     told: Callable[[Rung], None] | None = None,
@@ -223,8 +222,6 @@ def climb(
         Source of randomness.
     n_steps
         Moves of each particle at each temperature.
-    least_kept
-        Effective share of the particles that a change of temperature leaves.
     n_more
         Moves of each particle once the posterior is reached; samples are kept from the last half of them.
     exchange
@@ -257,7 +254,7 @@ def climb(
     temperatures, accepted, overlap = [0.0], 0.0, 1.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
         rise = now.rise
-        beta = _next(rise, temperatures[-1], least_kept * len(rest))
+        beta = _next(rise, temperatures[-1], _KEPT * len(rest))
         width = beta - temperatures[-1]
         log_weight = (width * rise).reshape(n_clouds, -1)
         if not np.isfinite(log_weight.max(axis=1)).all():

@@ -31,8 +31,6 @@ _N_CLOUDS = 8
 _N_PARTICLES = 1000
 # Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
 _NEEDED = 20.0
-# Where the evidence comes from a bridge, a change of temperature may leave so few of the particles effective.
-_BRIDGED_KEPT = 0.2
 # Gaussians of the prior that each sample may exchange one of its own for.
 _N_TRIES = 4
 # Least effective share of the samples in a bridge.
@@ -193,7 +191,6 @@ def _from_below(
         few,
         log_z_below=log_z,
         error_below=error,
-        least_kept=_BRIDGED_KEPT,
         exchange=partial(removal.exchanged, n_tries=_N_TRIES, rng=rng),
         rng=rng,
         told=told,

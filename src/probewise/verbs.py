@@ -75,8 +75,8 @@ def calibrate(
         Live points of nested sampling: fewer are faster but make the evidences less precise.
     method
         "refined": widths evenly probable over orders of magnitude, each evidence refined by importance sampling.
-        "quick": the same prior; only that of one Gaussian is searched, and each further number of Gaussians is
-        reached from the one below by sequential Monte Carlo; what is doubtful is searched all the same.
+        "quick": the same prior; each number of Gaussians is reached by sequential Monte Carlo, from the peak of its
+        likelihood or from the number below; what is doubtful is searched all the same.
         "paper": uniform priors, and the evidence of nested sampling alone. Both have the Student-t likelihood.
     nested_stop
         Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or

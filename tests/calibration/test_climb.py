@@ -92,6 +92,13 @@ def test_other_priors_of_light_are_searched_in_full(recording: Recording) -> Non
         assert why in notes[0]
 
 
+def test_few_readings_are_searched_in_full(recording: Recording) -> None:
+    few = Recording(recording.plan.take(np.arange(0, 135, 2)), recording.readings[::2])
+    found, notes = climb_orders(Posing(few, default_prior), (1, 2), n_live=50, rng=np.random.default_rng(0))
+    assert not found
+    assert "68 usable readings" in notes[0]
+
+
 def test_quick_is_yes_or_no(recording: Recording) -> None:
     with pytest.raises(ParameterError, match="quick"):
         calibrate(recording, quick="yes", rng=np.random.default_rng(0))  # type: ignore[arg-type]

@@ -145,8 +145,8 @@ def calibrate(
     rng
         Source of randomness; spawned for each order.
     quick
-        Whether to search the prior of one Gaussian alone and climb from each order to the next by sequential Monte
-        Carlo. An order whose climb is doubtful is searched by nested sampling, and a note says so.
+        Whether to reach each order by sequential Monte Carlo, from the peak of its likelihood or from the order
+        below. An order whose climb is doubtful is searched by nested sampling, and a note says so.
     progress
         Called with the order and a `RoundSummary` after every round, or a `Rung` after every temperature of a climb;
         not with a process pool.

@@ -27,6 +27,8 @@ from probewise.calibration.removal import Removal, bridged
 
 __all__ = ["climb_orders", "next_order"]
 
+# With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
+_LEAST_READINGS = 80
 _N_CLOUDS = 8
 _N_PARTICLES = 1000
 # Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
@@ -63,6 +65,9 @@ def climb_orders(
     What was found, by order; and why an order that is lacking must be searched in full.
     """
     highest = max(orders)
+    n_usable = int(posing.recording.usable.sum())
+    if n_usable < _LEAST_READINGS:
+        return {}, (f"searched in full: {n_usable} usable readings, fewer than {_LEAST_READINGS}",)
     unlike = _unlike(posing, highest)
     if unlike:
         return {}, (unlike,)

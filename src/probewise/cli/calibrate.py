@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=("refined", "quick", "paper"),
         default=CALIBRATION,
         help="refined (default): log-uniform priors of widths, each evidence refined by importance sampling; quick: "
-        "the same priors, nested sampling for one Gaussian only, sequential Monte Carlo for more; paper: uniform "
+        "the same priors, sequential Monte Carlo from the peaks of the likelihood; paper: uniform "
         "priors, evidence by nested sampling alone",
     )
     parser.add_argument(

@@ -23,7 +23,7 @@ from probewise import __version__
 from probewise.calibration import Calibration, calibrate
 from probewise.calibration.coverage import draw_truth, simulate_truth
 from probewise.errors import DoubtfulResultWarning
-from probewise.recordings import Recording, paper_plan, read_recording, shipped, write_text_atomically
+from probewise.recordings import Recording, paper_plan, read_recording, shipped, two_way_plan, write_text_atomically
 from probewise.world import Blob, World, gaussian_spot
 
 
@@ -59,16 +59,21 @@ def main() -> None:
     parser.add_argument("--orders", type=int, nargs="+", default=[1, 2, 3, 4], help="of the sensors")
     parser.add_argument("--seed", type=int, default=28)
     parser.add_argument("--recording", type=Path, help="CSV file in place of the shipped one")
+    parser.add_argument("--two-way", action="store_true", help="961 simulated readings in place of the shipped ones")
     parser.add_argument("--out", type=Path, required=True)
     asked = parser.parse_args()
     warnings.simplefilter("ignore", DoubtfulResultWarning)
     rng = np.random.default_rng(asked.seed)
     paper = read_recording(asked.recording or shipped("paper"))
+    if asked.two_way:
+        spot = gaussian_spot([Blob(1.0, (0.5, 1.5), (4.0, 2.5), 0.1)])
+        paper = World(spot, noise_sd=0.5).simulate(two_way_plan(), rng=rng)
     orders = tuple(asked.orders)
     document: dict[str, object] = {
         "command": f"benchmarks/quick_calibration.py --seeds {asked.seeds} --sensors {asked.sensors} "
         f"--orders {' '.join(map(str, orders))} --seed {asked.seed}"
-        + (f" --recording {asked.recording.name}" if asked.recording else ""),
+        + (f" --recording {asked.recording.name}" if asked.recording else "")
+        + (" --two-way" if asked.two_way else ""),
         "n_readings": len(paper),
         "date": datetime.date.today().isoformat(),
         "version": __version__,

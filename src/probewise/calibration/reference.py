@@ -212,7 +212,8 @@ class Reference:
         log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_ratio_density(ratio), math.log(_TOLD) + log_share)
         near = self._log_near_one(last, np.where(np.isfinite(log_before)[:, None], before, rest))
         log_shape = np.logaddexp(math.log(1.0 - _NEAR) + self._compensation.log_tilt(answer), math.log(_NEAR) + near)
-        found = log_shape + log_ratio - np.log(least) + log_before - log_after
+        with np.errstate(invalid="ignore"):  # where both are impossible
+            found = log_shape + log_ratio - np.log(least) + log_before - log_after
         return before, np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
 
     @property

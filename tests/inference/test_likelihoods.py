@@ -225,3 +225,17 @@ def test_shapes_and_bounds_are_checked() -> None:
         GaussianKnown(1.0).log_prob(np.zeros(4), np.zeros((2, 3)))
     with pytest.raises(ParameterError, match="sd"):
         GaussianKnown(0.0)
+
+
+def test_weights_tell_the_gradient_by_the_predictions() -> None:
+    """Far from the bounds of sigma: central differences of the log likelihood, data sets of 5 and 3 readings."""
+    rng = np.random.default_rng(21)
+    likelihood = StudentT(np.array([0, 0, 7, 0, 7, 7, 0, 0]), sd_floor=1e-4, sd_ceiling=1e4)
+    readings, predicted = rng.normal(size=8), rng.normal(size=(3, 8))
+    gradient = np.empty_like(predicted)
+    for k in range(8):
+        shift = 1e-5 * np.eye(8)[k]
+        up, down = (likelihood.log_prob(readings, predicted + side * shift) for side in (1, -1))
+        gradient[:, k] = (up - down) / 2e-5
+    off = readings - predicted
+    np.testing.assert_allclose(off * likelihood.weights(off), gradient, rtol=1e-5, atol=1e-7)

@@ -40,7 +40,7 @@ def exchanged(device: str, sent: bytes, expected: int, *, limit_s: float = 10.0)
 
 
 def _made_ns(device: str) -> int | None:
-    """Return when a pseudo-terminal was made, None if there is none; the number of one that is gone may be taken again."""
+    """Return when a pseudo-terminal was made, None if there is none; numbers are used again."""
     with contextlib.suppress(FileNotFoundError):
         return os.stat(device).st_ctime_ns
     return None

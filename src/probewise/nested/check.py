@@ -34,7 +34,6 @@ DISAGREE = 2.5
 
 # Above this many errors the second estimate is repeated with more live points.
 _APART = 2.0
-_MOST_MEMORY = 10.0
 _N_SAMPLES = 2000
 # The repartitioned run is used only if it needs less than this share of the first run's nats.
 _GAIN = 0.8
@@ -96,7 +95,7 @@ def checked(
     -------
     NestedResult
         The first run, or one with longer chains if only that agrees with the second estimate. `check` holds the second
-        estimate; a warning is added if the two still disagree.
+        estimate; a warning is added if the two still disagree, or if the second estimate does not end within the limits.
     """
     budget = max_cost * first.n_calls
     if max_calls is not None:
@@ -104,7 +103,7 @@ def checked(
     spent = first.n_calls
 
     def estimated(route: _Route) -> NestedResult | None:
-        """Run a second estimate; None where it would exceed the budget."""
+        """Run a second estimate; None where it exceeds the budget."""
         nonlocal spent
         left = int(budget - spent)
         if left < 2 * route.n_live:
@@ -124,10 +123,15 @@ def checked(
         route = _second_route(now, problem, move, least_live, rng)
         estimates = [] if (found := estimated(route)) is None else [found]
         if not estimates:
-            return _with_peak(replace(first, n_calls=spent), above)
+            # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
+            note = (
+                f"{route.name}, which checks the evidence, did not end within max_cost and max_calls "
+                f"({int(budget)} evaluations in all); use a greater limit, or max_cost=1 for no check"
+            )
+            return _with_peak(replace(first, n_calls=spent, warnings=(*first.warnings, note)), above)
         sharper = replace(route, n_live=max(route.n_live, now.n_live))
         if _suspicious(now, estimates, _APART) and (found := estimated(sharper)) is not None:
-            estimates = [found] if _doubtful(estimates[0]) else [*estimates, found]
+            estimates = [found] if estimates[0].warnings else [*estimates, found]
         if _suspicious(now, estimates, DISAGREE):
             again = estimated(_Route(problem, now.n_live, _longer(move), "the run again"))
             if again is not None and not again.warnings and not _suspicious(again, estimates, DISAGREE):
@@ -201,10 +205,6 @@ def _longer(move: Move) -> Move:
     return move.longer() if isinstance(move, SliceMove) else SliceMove().longer()
 
 
-def _doubtful(estimate: NestedResult) -> bool:
-    return bool(estimate.warnings) or estimate.memory > _MOST_MEMORY
-
-
 def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
     """Return the inverse-variance weighted mean of independent estimates of log Z, and its error."""
     weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
@@ -222,7 +222,7 @@ def _distance(run: NestedResult, estimates: list[NestedResult]) -> float:
 
 
 def _suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -> bool:
-    return abs(_distance(run, estimates)) > most or _doubtful(estimates[-1])
+    return abs(_distance(run, estimates)) > most or bool(estimates[-1].warnings)
 
 
 def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_check: int, spent: int) -> NestedResult:
@@ -238,8 +238,8 @@ def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_c
             f"{abs(distance):.1f} errors apart; chains are too short or a part of the posterior was lost; "
             "use a greater steps_per_param, more n_live, or a greater max_cost",
         )
-    elif _doubtful(estimates[-1]):
-        why = estimates[-1].warnings[0] if estimates[-1].warnings else f"its memory is {estimates[-1].memory:.1f}"
+    elif estimates[-1].warnings:
+        why = estimates[-1].warnings[0]
         warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
         # A poorly known share of possible hypotheses no longer matters once a second estimate agrees.

@@ -43,6 +43,8 @@ _PRIOR_VOLUME = 0.05
 _DOUBTFUL_P_VALUE = 1e-4
 _FEW_EFFECTIVE = 30.0
 _STUCK_SHARE = 0.02
+# Lineage variance above which the run descends from too few lineages to estimate its own error.
+_MOST_MEMORY = 10.0
 
 
 def least_live(n_params: int) -> int:
@@ -344,6 +346,12 @@ def _result(
         notes = (
             *notes,
             f"insertion ranks are not uniform (p = {p_value:.1g}): chains are too short or a mode was lost; "
+            "use more steps_per_param or more n_live",
+        )
+    if remembered > _MOST_MEMORY:
+        notes = (
+            *notes,
+            f"memory is {remembered:.0f}: so few lineages lead to the posterior that the error is itself uncertain; "
             "use more steps_per_param or more n_live",
         )
     if evidence.n_eff < _FEW_EFFECTIVE:

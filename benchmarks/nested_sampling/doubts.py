@@ -1,10 +1,12 @@
 """Does the sampler know when it is wrong? Hard problems, many seeds: who is off, and who says so.
 
     python -m nested_sampling.doubts --first 1000 --seeds 20 --workers 2 --out doubts.jsonl
+    python -m nested_sampling.doubts merged --kept runs --out merged.jsonl
     python -m nested_sampling.doubts summarise doubts.jsonl --out ../docs/results/nested_doubts.json
 
 A run is off where its log Z is further from the truth than three of its own errors. Of the runs that are off, at
-least 95 % should carry a doubt; of the others, at most 3 %. The campaign goes on where it was interrupted.
+least 95 % should carry a doubt; of the others, at most 3 %. The campaign goes on where it was interrupted. With
+`--keep FOLDER` the results are kept, and `merged` asks the same of merges of four of them, and of each one refined.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from itertools import product
 from pathlib import Path
@@ -30,7 +32,7 @@ import numpy as np
 from nested_sampling.hard import HARD
 from nested_sampling.problems import Known, problem
 from probewise.errors import DoubtfulResultWarning
-from probewise.nested import run
+from probewise.nested import NestedResult, Weighted, merge, refine, run
 
 OFF = 3.0
 
@@ -40,13 +42,16 @@ def known(name: str) -> Known:
     return HARD[name]() if name in HARD else problem(name)
 
 
-def one(name: str, seed: int, n_live: int, max_cost: float) -> dict[str, Any]:
-    """Run once."""
+def one(name: str, seed: int, n_live: int, max_cost: float, keep: Path | None) -> dict[str, Any]:
+    """Run once, and keep the result where a folder is given."""
     posed = known(name)
     begun = time.process_time()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         result = run(posed, rng=np.random.default_rng([seed, 28]), n_live=n_live, max_cost=max_cost)
+    if keep is not None:
+        keep.mkdir(parents=True, exist_ok=True)
+        result.save(keep / f"{name} {seed}.npz")
     return {
         "problem": name,
         "seed": seed,
@@ -63,6 +68,38 @@ def one(name: str, seed: int, n_live: int, max_cost: float) -> dict[str, Any]:
         "cpu_s": round(time.process_time() - begun, 2),
         "doubts": list(result.warnings),
     }
+
+
+def merged(kept: Path, together: int = 4) -> Iterator[dict[str, Any]]:
+    """Merge the kept results of each problem, some at a time, and refine each of them."""
+    for name in HARD:
+        posed, files = known(name), sorted(kept.glob(f"{name} *.npz"))
+        results = [NestedResult.load(file) for file in files]
+        rng = np.random.default_rng([28, len(files)])
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtfulResultWarning)
+            for first in range(0, len(results) - together + 1, together):
+                part = results[first : first + together]
+                joined = merge(part, rng=rng)
+                doubts = [note for note in joined.warnings if not note.startswith("run ")]
+                yield _told(posed, joined, doubts, what="merge", problem=name, inherited=len(joined.warnings))
+            for result in results:
+                found = refine(result, posed, rng=rng)
+                yield _told(posed, found, found.doubts, what="refine", problem=name, inherited=len(result.warnings))
+
+
+def _told(posed: Known, found: NestedResult | Weighted, doubts: Sequence[str], **more: Any) -> dict[str, Any]:
+    z = (found.log_z - posed.log_z) / math.hypot(found.log_z_error, posed.log_z_error)
+    return {**more, "log_z_error": found.log_z_error, "z": z, "doubts": list(doubts)}
+
+
+def wilson(n_hits: int, n: int) -> tuple[float, float]:
+    """Return Wilson's 95 % interval of a share."""
+    if n == 0:
+        return 0.0, 1.0
+    z, p = 1.96, n_hits / n
+    middle, half = p + z * z / (2 * n), z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    return (middle - half) / (1 + z * z / n), (middle + half) / (1 + z * z / n)
 
 
 def summarise(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -117,6 +154,14 @@ def main(given: list[str] | None = None) -> None:
     """Run seeds, or sum files up."""
     arguments = sys.argv[1:] if given is None else given
     parser = argparse.ArgumentParser(prog="python -m nested_sampling.doubts", description=__doc__)
+    if arguments[:1] == ["merged"]:
+        parser.add_argument("--kept", type=Path, required=True)
+        parser.add_argument("--out", type=Path, required=True)
+        options = parser.parse_args(arguments[1:])
+        with records.Lines(options.out) as lines:
+            for line in merged(options.kept):
+                lines.add(line)
+        return
     if arguments[:1] == ["summarise"]:
         parser.add_argument("files", nargs="+", type=Path)
         parser.add_argument("--out", type=Path)
@@ -134,6 +179,7 @@ def main(given: list[str] | None = None) -> None:
     parser.add_argument("--live", type=int, default=300)
     parser.add_argument("--max-cost", type=float, default=5.0, help="1: no check")
     parser.add_argument("--workers", type=int, default=1)
+    parser.add_argument("--keep", type=Path, help="folder in which to keep the results")
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args(arguments)
     done = {(line["problem"], line["seed"], line["n_live"]) for line in records.read_lines(options.out)}
@@ -141,7 +187,7 @@ def main(given: list[str] | None = None) -> None:
     # Seed by seed, so that an interruption leaves every problem with about as many.
     wanted = [(n, s, options.live) for s, n in product(seeds, options.problems)]
     with records.Lines(options.out) as lines, ProcessPoolExecutor(options.workers) as pool:
-        running = [pool.submit(one, *key, options.max_cost) for key in wanted if key not in done]
+        running = [pool.submit(one, *key, options.max_cost, options.keep) for key in wanted if key not in done]
         for number, future in enumerate(as_completed(running), start=1):
             lines.add(future.result())
             if sys.stderr.isatty():

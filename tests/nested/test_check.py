@@ -59,20 +59,24 @@ def test_the_hierarchical_evidence_is_that_of_draws_from_the_population() -> Non
 
 
 @pytest.mark.slow
-def test_a_right_run_is_confirmed_for_a_fraction_of_its_cost() -> None:
+def test_right_runs_are_confirmed_for_a_fraction_of_their_cost() -> None:
+    """Two of thirty cost more than half of the run, since they were asked again: the median of eleven does not."""
     known = problems.problem("Gaussian 4-D")
-    alone = quiet(known, n_live=200, max_cost=1.0)
-    result = quiet(known, n_live=200)
-    assert alone.check is None
-    assert result.log_z == alone.log_z
-    assert np.array_equal(result.theta, alone.theta)
-    assert not result.warnings
-    assert result.check is not None
-    assert abs(result.check.distance) < 2.5
-    assert abs(result.check.log_z - known.log_z) < 3.9 * result.check.log_z_error
-    assert result.n_calls == alone.n_calls + result.check.n_calls
-    assert result.check.n_calls < 0.4 * alone.n_calls
-    assert "check        log Z" in result.summary()
+    cost, z, n_same, n_doubted = [], [], 0, 0
+    for seed in range(11):
+        alone = quiet(known, rng=np.random.default_rng(seed), max_cost=1.0)
+        result = quiet(known, rng=np.random.default_rng(seed))
+        assert alone.check is None
+        assert result.check is not None
+        z.append((result.check.log_z - known.log_z) / result.check.log_z_error)
+        assert f"check        log Z {result.check.log_z:.2f}" in result.summary()
+        cost.append(result.n_calls / alone.n_calls - 1)
+        n_same += np.array_equal(result.theta, alone.theta) and result.log_z == alone.log_z
+        n_doubted += bool(result.warnings)
+    assert abs(np.mean(z)) < 3.9 * 1.3 / math.sqrt(11)  # with 40 live points errors have long tails: sd 1.3 of thirty
+    assert np.median(cost) < 0.5
+    assert n_same > 7
+    assert n_doubted < 4
 
 
 def misled(max_cost: float) -> tuple[NestedResult, NestedResult]:
@@ -111,13 +115,23 @@ def test_a_wrong_evidence_is_cured_by_longer_chains() -> None:
 
 
 @pytest.mark.slow
-def test_many_scales_with_chains_too_short_are_never_wrong_without_a_word() -> None:
-    """In twelve dimensions log Z of the search alone is too high by many errors."""
-    known = hard.many_dimensions(12)
-    wrong = quiet(known, n_live=40, move=SliceMove(steps_per_param=0.3, fewest_steps=3), max_cost=1.0)
-    result = quiet(known, n_live=40, move=SliceMove(steps_per_param=0.3, fewest_steps=3), max_cost=2.0)
-    assert abs(wrong.log_z - known.log_z) > 3 * wrong.log_z_error
-    assert any("errors apart" in note for note in result.warnings)
+@pytest.mark.parametrize("max_cost", [2.0, 5.0])
+def test_many_scales_with_chains_too_short_are_never_wrong_without_a_word(max_cost: float) -> None:
+    """In twelve dimensions log Z of the search alone is off by many errors, or its memory is beyond what they model.
+
+    With a limit of 2 the second estimate does not end.
+    """
+    known, move = hard.many_dimensions(12), SliceMove(steps_per_param=0.3, fewest_steps=3)
+    n_off = n_forgetful = 0
+    for part in rng().spawn(8):
+        result = quiet(known, rng=part, n_live=40, move=move, max_cost=max_cost)
+        off = abs(result.log_z - known.log_z) > 3 * result.log_z_error
+        n_off += off
+        n_forgetful += result.memory > 10
+        assert result.warnings or not off
+        assert any("memory is" in note for note in result.warnings) == (result.memory > 10)
+    assert n_off
+    assert n_forgetful
 
 
 def test_a_volume_that_few_hypotheses_were_counted_by_is_confirmed_or_doubted() -> None:
@@ -132,9 +146,10 @@ def test_a_volume_that_few_hypotheses_were_counted_by_is_confirmed_or_doubted() 
 def test_the_check_keeps_to_max_calls() -> None:
     known = problems.problem("Gaussian 4-D")
     alone = quiet(known, max_cost=1.0)
-    result = quiet(known, max_calls=alone.n_calls + 400)
-    assert result.n_calls <= alone.n_calls + 400
+    result = quiet(known, max_calls=int(1.2 * alone.n_calls))
+    assert result.n_calls <= 1.2 * alone.n_calls
     assert result.check is None
+    assert "did not end within max_cost and max_calls" in result.warnings[-1]
 
 
 def test_a_checked_run_is_repeated_by_its_seed_and_saved_whole(tmp_path: Path) -> None:

@@ -57,8 +57,14 @@ class _Route:
 
     problem: Samplable
     n_live: int
-    move: Move
+    move: SliceMove
     name: str
+
+    @property
+    def least_calls(self) -> int:
+        """Evaluations of the first live points and of one round, with a margin of two: fewer are not worth a start."""
+        n_steps = max(self.move.fewest_steps, math.ceil(self.move.steps_per_param * len(self.problem.prior.names)))
+        return math.ceil(self.n_live * (1 + n_steps * self.move.target))
 
 
 def checked(
@@ -95,7 +101,7 @@ def checked(
     -------
     NestedResult
         The first run, or one with longer chains if only that agrees with the second estimate. `check` holds the second
-        estimate; a warning is added if the two still disagree, or if the second estimate does not end within the limits.
+        estimate. A warning is added if the two still disagree, or if the second does not end within the limits.
     """
     budget = max_cost * first.n_calls
     if max_calls is not None:
@@ -106,7 +112,7 @@ def checked(
         """Run a second estimate; None where it exceeds the budget."""
         nonlocal spent
         left = int(budget - spent)
-        if left < 2 * route.n_live:
+        if left < route.least_calls:
             return None
         try:
             found = search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=rng)
@@ -200,9 +206,17 @@ def _near(first: NestedResult, problem: Samplable, rng: np.random.Generator) -> 
     return near if whole else None
 
 
-def _longer(move: Move) -> Move:
-    """Double the length of the chains; other moves are replaced by slice sampling."""
-    return move.longer() if isinstance(move, SliceMove) else SliceMove().longer()
+def _longer(move: Move) -> SliceMove:
+    """Double the length of the chains, to twice the default at least; other moves are replaced by slice sampling."""
+    least = SliceMove().longer()
+    if not isinstance(move, SliceMove):
+        return least
+    double = move.longer()
+    return replace(
+        double,
+        steps_per_param=max(double.steps_per_param, least.steps_per_param),
+        fewest_steps=max(double.fewest_steps, least.fewest_steps),
+    )
 
 
 def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from scipy.stats import chi2, norm
 
 from probewise._arrays import FloatArray
 from probewise.nested import NestedResult, Weighted, refine, run, update
-from probewise.nested.importance import _bridged, _with_lost
+from probewise.nested.importance import _bridged, with_lost
 from probewise.nested.proposal import find_parts, fit_proposals, joined
 from probewise.nested.space import unbounded
 from probewise.priors import Normal, Product
@@ -71,11 +71,11 @@ def test_a_part_followed_by_few_lines_of_descent_may_be_lost() -> None:
     theta = 0.1 * rng.standard_normal((1000, 2)) + np.where(np.arange(1000) < 100, 3.0, -1.0)[:, None]
     even = np.full(1000, -math.log(1000))
     found = Weighted(("x", "y"), theta, np.zeros(1000), even, 0.0, 0.01, 1000.0, 1000, 0.1)
-    told = _with_lost(found, 20.0, space, rng)
+    told = with_lost(found, 20.0, space, rng)
     assert told.lost == pytest.approx(0.1 * math.exp(-2.0), rel=0.01)
     assert told.log_z_error == pytest.approx(math.hypot(0.01, told.lost))
     assert told.sound
-    hopeless = _with_lost(found, 0.5, space, rng)
+    hopeless = with_lost(found, 0.5, space, rng)
     assert not hopeless.sound
     assert "may be lost" in hopeless.summary()
 

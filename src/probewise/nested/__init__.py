@@ -17,6 +17,7 @@ from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
 from probewise.nested.sampler import LIVE_PER_PARAM, least_live, step
+from probewise.nested.sparing import run_slow
 from probewise.nested.stop import (
     NESTED_STOP,
     EvidenceChange,
@@ -64,6 +65,7 @@ __all__ = [
     "refine",
     "repartitioned",
     "run",
+    "run_slow",
     "step",
     "update",
 ]

@@ -101,7 +101,7 @@ class Weighted(ShowsItself):
     def doubts(self) -> tuple[str, ...]:
         """Reasons not to trust the error, in words; empty if there are none."""
         if self.run is not None:
-            return ()
+            return self.run.warnings
         reasons = (
             (not self.pareto_k < _MOST_K, f"Pareto k of the weights is {self.pareto_k:.2f}, not below {_MOST_K}"),
             (not self.n_eff >= _FEW_EFFECTIVE, f"only {self.n_eff:.0f} effective samples, not {_FEW_EFFECTIVE:.0f}"),
@@ -213,13 +213,13 @@ def refine(
     if n_pilots < 1:
         raise ParameterError("n_pilots", n_pilots, "1 or more")
     space = unbounded(problem.prior)
-    n_lineages = _n_lineages(result)
-    fitted, held = _split(result, n_lineages, space, rng)
+    n_lineages = count_lineages(result)
+    fitted, held = split_off(result, n_lineages, space, rng)
     known = [fitted]
     for _ in range(n_pilots):
         proposals = fit_proposals(np.concatenate(known), rng=rng)
         pilots = [
-            _sample(p, 0.0, _HeldOut.nothing(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
+            weigh_draws(p, 0.0, HeldOut.nothing(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
             for p in proposals
         ]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
@@ -228,12 +228,12 @@ def refine(
         others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if better.n_eff > 2 * len(evaluate.names):
-            known.append(_resampled_for_fit(better.theta, better.log_weight, space, rng))
-    found = _with_lost(_sample(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng)
-    return replace(found, inherited=_inherited(found, result))
+            known.append(resampled_for_fit(better.theta, better.log_weight, space, rng))
+    found = with_lost(weigh_draws(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng)
+    return replace(found, inherited=inherited_doubts(found, result))
 
 
-def _inherited(found: Weighted, result: Posterior) -> tuple[str, ...]:
+def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
     """Return the doubts about the refined result, and one if it differs by more than the errors allow."""
     if isinstance(result, Weighted):
         return result.doubts
@@ -302,10 +302,10 @@ def update(
     n_eff, k = n_effective(log_weight), math.inf
     if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
         proposal = fit_proposals(
-            _resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
+            resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
         )[-1]
-        found = _sample(proposal, prior_share, _HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
-        found = _with_lost(found, _n_lineages(previous) * n_eff / len(rows), space, rng)
+        found = weigh_draws(proposal, prior_share, HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
+        found = with_lost(found, count_lineages(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
         k = found.pareto_k
@@ -325,7 +325,7 @@ def update(
 
 
 @dataclass(frozen=True, eq=False)
-class _HeldOut:
+class HeldOut:
     """Posterior samples held out from the fit, and their effective number.
 
     `x` (n, n_params) in unbounded coordinates; the prior's log density there and the log likelihood, (n,).
@@ -337,34 +337,36 @@ class _HeldOut:
     n_independent: float
 
     @classmethod
-    def nothing(cls) -> _HeldOut:
+    def nothing(cls) -> HeldOut:
         """Hold out nothing."""
         return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
 
 
-def _n_lineages(found: Posterior) -> float:
+def count_lineages(found: Posterior) -> float:
     """Effective number of independent samples for the shares of a posterior's parts.
 
     Many samples of a run descend from one live point: ln Z of a part followed by n live points has the error
     sqrt(H memory / n), where a share estimated from n independent samples has the relative error 1 / sqrt(n).
     """
     if isinstance(found, Weighted):
-        return found.n_eff if found.run is None else _n_lineages(found.run)
+        return found.n_eff if found.run is None else count_lineages(found.run)
     return found.n_live / max(found.information * found.memory, 1.0)
 
 
-def _split(found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator) -> tuple[FloatArray, _HeldOut]:
+def split_off(
+    found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
+) -> tuple[FloatArray, HeldOut]:
     """Split samples at random into those for fitting a density, (n, n_params), and held-out ones."""
     lot = rng.random(len(found.theta)) < _HELD_OUT
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
     rows = chosen[resampled(weight, min(_MOST_HELD, chosen.size), rng)]
     x = space.enter(found.theta[rows])
-    held = _HeldOut(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
-    return _resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
+    held = HeldOut(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
+    return resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
 
 
-def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
+def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, rng: np.random.Generator) -> FloatArray:
     """Resample for fitting a density: about the effective sample size, so that few samples are repeated.
 
     A third more is drawn with the square root of the weights: a proposal must have wider tails than
@@ -376,7 +378,7 @@ def _resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, 
     return space.enter(theta[np.unique(np.concatenate(rows))])
 
 
-def _with_lost(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
+def with_lost(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
     """Add to the error the share of the posterior that a run of `n_lineages` effective samples may have lost."""
     if not found.n_eff > 1:
         return found
@@ -387,17 +389,18 @@ def _with_lost(found: Weighted, n_lineages: float, space: Space, rng: np.random.
     return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
 
 
-def _sample(
+def weigh_draws(
     proposal: Proposal,
     prior_share: float,
-    held: _HeldOut,
+    held: HeldOut,
     space: Space,
     evaluate: Evaluator,
     *,
     n_draws: int,
     rng: np.random.Generator,
+    tail: float = 3.0,
 ) -> Weighted:
-    """Draw, evaluate and weight."""
+    """Draw, evaluate and weight; `tail` as for `pareto_k`."""
     n_prior = round(prior_share * n_draws)
 
     def log_proposal(x: FloatArray, log_density: FloatArray) -> FloatArray:
@@ -421,7 +424,7 @@ def _sample(
             evaluate.names, theta[:0], nothing, nothing, -math.inf, math.inf, 0.0, evaluate.n_calls, math.inf
         )
     theta, log_likelihood, log_ratio = theta[alive], log_likelihood[alive], log_ratio[alive]
-    k = pareto_k(log_ratio)
+    k = pareto_k(log_ratio, tail)
     held_ratio = np.empty(0)
     if len(held.x):
         held_ratio = held.log_density + held.log_likelihood - log_proposal(held.x, held.log_density)
@@ -471,15 +474,15 @@ def _bridged(
     return log_z, math.sqrt(spread + kept_error**2), missed, cut - float(logsumexp(cut))
 
 
-def pareto_k(log_weight: FloatArray) -> float:
+def pareto_k(log_weight: FloatArray, tail: float = 3.0) -> float:
     """Estimate the shape of the tail of importance weights, (n,) log weights of any scale.
 
-    A generalised Pareto distribution is fitted to the largest weights, 3 sqrt(n) of them but at most a
+    A generalised Pareto distribution is fitted to the largest weights, `tail` sqrt(n) of them but at most a
     fifth, with the estimator of Zhang & Stephens (2009), as in Vehtari et al. (2024). Below 0.5 the
     weights have a finite variance; above 0.7 their mean converges too slowly to be used.
     """
     n = len(log_weight)
-    n_tail = int(min(0.2 * n, 3.0 * math.sqrt(n)))
+    n_tail = int(min(0.2 * n, tail * math.sqrt(n)))
     if n_tail < 5:
         return math.inf
     weight = np.sort(np.exp(log_weight - log_weight.max()))

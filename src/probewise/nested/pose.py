@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_callable
 from probewise.errors import ParameterError
+from probewise.nested.evaluate import Samplable
 from probewise.priors import Marginal, Prior, Product
 
-__all__ = ["AnyPrior", "Posed", "pose"]
+__all__ = ["AnyPrior", "Posed", "as_problem", "pose"]
 
 AnyPrior: TypeAlias = "Prior | Mapping[str, Any] | Sequence[Any] | Callable[[FloatArray], Any]"
 
@@ -193,4 +194,34 @@ def _marginal(name: str, one: Any) -> Marginal:
         return _Scipy(one)
     raise ParameterError(
         name, one, "Uniform(low, high), LogUniform(low, high), Normal(mean, sd), or a frozen continuous scipy.stats one"
+    )
+
+
+def as_problem(
+    problem: object,
+    prior: AnyPrior | None,
+    names: Sequence[str] | None,
+    vectorized: bool,
+    pass_dict: bool,
+    periodic: Sequence[str],
+) -> Samplable:
+    """Return a problem as it is, or make one of a log likelihood and its prior."""
+    if hasattr(problem, "log_likelihood") or isinstance(problem, type):
+        if prior is not None or names is not None or vectorized or pass_dict or periodic:
+            raise ParameterError(
+                "prior, names, vectorized, pass_dict, periodic",
+                "given beside a problem that has its own",
+                "these beside a log likelihood, a function; or the problem alone",
+            )
+        return cast(Samplable, problem)
+    if prior is None:
+        allowed = "a problem with a prior and a log_likelihood(theta), such as inference.SensorProblem; or a function"
+        raise ParameterError("problem", problem, f"{allowed} with its prior: (log_likelihood, prior)")
+    return pose(
+        cast("Callable[..., Any]", problem),
+        prior,
+        names=names,
+        vectorized=vectorized,
+        pass_dict=pass_dict,
+        periodic=periodic,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import gammaln, logsumexp
@@ -12,10 +12,10 @@ from scipy.special import gammaln, logsumexp
 from probewise._arrays import FloatArray
 from probewise.nested.clusters import Clusters, find_clusters
 
-__all__ = ["Proposal", "find_parts", "fit_proposals", "joined"]
+__all__ = ["DEGREES_OF_FREEDOM", "Proposal", "find_parts", "fit_proposals", "joined"]
 
 # Heavier tails than a Gaussian's keep the weights bounded where the fit is too narrow.
-_DEGREES_OF_FREEDOM = 8.0
+DEGREES_OF_FREEDOM = 8.0
 _MOST_KERNELS = 400
 _FEW = 40
 _SCALES = (1.0, 0.5, 0.2, 0.05, 0.01)
@@ -41,7 +41,7 @@ class Proposal:
         n_params = self.clusters.mean.shape[1]
         which = rng.choice(len(self.share), size=n, p=self.share)
         white = rng.standard_normal((n, n_params))
-        white *= np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, size=(n, 1)))
+        white *= np.sqrt(DEGREES_OF_FREEDOM / rng.chisquare(DEGREES_OF_FREEDOM, size=(n, 1)))
         out = np.empty((n, n_params))
         for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):
             rows = np.flatnonzero(which == k)
@@ -49,13 +49,17 @@ class Proposal:
             out[rows] = self.clusters.mean[k] + place @ self.clusters.root[k].T
         return out
 
+    def widened(self, factor: float) -> Proposal:
+        """Return the same mixture with kernels wider by a factor."""
+        return replace(self, width=tuple(factor * width for width in self.width))
+
     def log_density(self, x: FloatArray) -> FloatArray:
         """Natural log of the density, (n, n_params) -> (n,)."""
         blocks = np.array_split(x, max(1, -(-len(x) // _BLOCK)))
         return np.concatenate([self._log_density(block) for block in blocks])
 
     def _log_density(self, x: FloatArray) -> FloatArray:
-        n_params, nu = x.shape[1], _DEGREES_OF_FREEDOM
+        n_params, nu = x.shape[1], DEGREES_OF_FREEDOM
         constant = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
         parts = []
         for k, (centres, width) in enumerate(zip(self.centres, self.width, strict=True)):

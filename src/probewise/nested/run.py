@@ -8,7 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import checked
 from probewise.nested.evaluate import Samplable
 from probewise.nested.moves import Move, SliceMove
-from probewise.nested.pose import AnyPrior, pose
+from probewise.nested.pose import AnyPrior, as_problem
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import least_live, search
 from probewise.nested.stop import RoundSummary, StopRule
@@ -112,7 +112,7 @@ def run(
         another seed, or cannot be written. If a later saving fails, the run goes on with a warning.
     """
     require_rng(rng)
-    posed = _posed(problem, prior, names, vectorized, pass_dict, periodic)
+    posed = as_problem(problem, prior, names, vectorized, pass_dict, periodic)
     if not require_number("max_cost", max_cost) >= 1:
         raise ParameterError("max_cost", max_cost, "1 (no check) or more")
     moving: Move = SliceMove() if move is None else move
@@ -152,35 +152,3 @@ def run(
     for note in result.warnings:
         warnings.warn(note, DoubtfulResultWarning, stacklevel=2)
     return result
-
-
-def _posed(
-    problem: object,
-    prior: AnyPrior | None,
-    names: Sequence[str] | None,
-    vectorized: bool,
-    pass_dict: bool,
-    periodic: Sequence[str],
-) -> Samplable:
-    """Return a problem as it is, or make one of a log likelihood and its prior."""
-    if hasattr(problem, "log_likelihood") or isinstance(problem, type):
-        if prior is not None or names is not None or vectorized or pass_dict or periodic:
-            raise ParameterError(
-                "prior, names, vectorized, pass_dict, periodic",
-                "given beside a problem that has its own",
-                "these beside a log likelihood, a function; or nested.run(problem, rng=rng)",
-            )
-        return cast(Samplable, problem)
-    if prior is None:
-        allowed = "a problem with a prior and a log_likelihood(theta), such as inference.SensorProblem; or a function"
-        raise ParameterError(
-            "problem", problem, f"{allowed} with its prior: nested.run(log_likelihood, prior, rng=rng)"
-        )
-    return pose(
-        cast("Callable[..., Any]", problem),
-        prior,
-        names=names,
-        vectorized=vectorized,
-        pass_dict=pass_dict,
-        periodic=periodic,
-    )

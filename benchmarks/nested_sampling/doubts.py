@@ -71,26 +71,29 @@ def one(name: str, seed: int, n_live: int, max_cost: float, keep: Path | None) -
 
 
 def merged(kept: Path, together: int = 4) -> Iterator[dict[str, Any]]:
-    """Merge the kept results of each problem, some at a time, and refine each of them."""
-    for name in HARD:
-        posed, files = known(name), sorted(kept.glob(f"{name} *.npz"))
-        results = [NestedResult.load(file) for file in files]
-        rng = np.random.default_rng([28, len(files)])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DoubtfulResultWarning)
-            for first in range(0, len(results) - together + 1, together):
-                part = results[first : first + together]
+    """Merge the kept results of each problem, some at a time; then refine each result, problem by problem."""
+    files = {name: sorted(kept.glob(f"{name} *.npz")) for name in HARD}
+    for name, own in files.items():
+        rng = np.random.default_rng([28, len(own)])
+        for first in range(0, len(own) - together + 1, together):
+            part = [NestedResult.load(file) for file in own[first : first + together]]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DoubtfulResultWarning)
                 joined = merge(part, rng=rng)
-                doubts = [note for note in joined.warnings if not note.startswith("run ")]
-                yield _told(posed, joined, doubts, what="merge", problem=name, inherited=len(joined.warnings))
-            for result in results:
-                found = refine(result, posed, rng=rng)
-                yield _told(posed, found, found.doubts, what="refine", problem=name, inherited=len(result.warnings))
+            yield _told(
+                name, joined, joined.warnings, what="merge", files=[file.stem for file in own[first : first + together]]
+            )
+    for number, name in product(range(max(map(len, files.values()))), HARD):
+        if number < len(files[name]):
+            result = NestedResult.load(files[name][number])
+            found = refine(result, known(name), rng=np.random.default_rng([29, number]))
+            yield _told(name, found, found.doubts, what="refine", files=[files[name][number].stem])
 
 
-def _told(posed: Known, found: NestedResult | Weighted, doubts: Sequence[str], **more: Any) -> dict[str, Any]:
+def _told(name: str, found: NestedResult | Weighted, doubts: Sequence[str], **more: Any) -> dict[str, Any]:
+    posed = known(name)
     z = (found.log_z - posed.log_z) / math.hypot(found.log_z_error, posed.log_z_error)
-    return {**more, "log_z_error": found.log_z_error, "z": z, "doubts": list(doubts)}
+    return {"problem": name, **more, "log_z_error": found.log_z_error, "z": z, "doubts": list(doubts)}
 
 
 def wilson(n_hits: int, n: int) -> tuple[float, float]:

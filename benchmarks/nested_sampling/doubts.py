@@ -110,14 +110,17 @@ def summarise(lines: Sequence[dict[str, Any]]) -> dict[str, Any]:
     off = [line for line in lines if abs(line["z"]) > OFF]
     sound = [line for line in lines if abs(line["z"]) <= OFF]
     z = np.array([line["z"] for line in lines])
+    n_off, n_sound = (sum(bool(line["doubts"]) for line in part) for part in (off, sound))
     return {
         "runs": len(lines),
         "mean_z": round(float(z.mean()), 2),
         "sd_z": round(float(z.std(ddof=1)), 2) if len(z) > 1 else None,
         "off": len(off),
-        "off_and_doubted": sum(bool(line["doubts"]) for line in off),
+        "off_and_doubted": n_off,
         "sound": len(sound),
-        "sound_but_doubted": sum(bool(line["doubts"]) for line in sound),
+        "sound_but_doubted": n_sound,
+        "share_of_off_doubted": [round(p, 3) for p in wilson(n_off, len(off))],
+        "share_of_sound_doubted": [round(p, 3) for p in wilson(n_sound, len(sound))],
         "claimed_error": round(float(np.median([line["log_z_error"] for line in lines])), 3),
         "memory": round(float(np.median([line["memory"] for line in lines])), 2),
         "n_evaluations": round(float(np.median([line["n_evaluations"] for line in lines]))),

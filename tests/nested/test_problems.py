@@ -216,13 +216,14 @@ def test_evaluations_are_counted_and_samples_follow_the_weights() -> None:
     assert two.mean(two.theta[:, 0])[0] == pytest.approx(1.75)
 
 
-@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
-def test_few_live_points_count_the_search_and_the_draws_of_its_refinement() -> None:
-    """Two pilot rounds of two forms with an eighth of the draws each, at least 50, and the draws themselves."""
-    found = few.measure("plateau", range(2), 100, 400)
-    assert found["evaluations"] - found["of_these_the_search"] == 400 + 4 * 50
-    assert (found["peer"], found["work_ratio"]) == (None, None)
-    assert found["worst_z"] < 5
+@pytest.mark.slow
+def test_few_evaluations_are_compared_at_the_peers_error() -> None:
+    found = few.measure("Rosenbrock 2-D", range(2))
+    assert found["peer"] == "nautilus"
+    assert found["evaluations_ratio"] == pytest.approx(found["evaluations"] / 15_000, abs=0.006)
+    mean_square = np.mean(np.square(found["errors"]))
+    assert found["work_ratio"] == pytest.approx(found["evaluations"] * mean_square / 1.5, rel=0.02, abs=0.006)
+    assert found["worst_z"] == max(map(abs, found["z"])) < 5
 
 
 def test_the_comparison_names_the_best_correct_peer() -> None:

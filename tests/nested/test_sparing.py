@@ -47,8 +47,8 @@ def test_a_plain_function_of_one_point_gives_the_same_as_one_of_a_batch() -> Non
     assert many.weight @ (many.theta[:, 0] < 0.5) == pytest.approx(0.75, abs=0.12)
 
 
-def test_an_error_finer_than_half_of_what_was_asked_for_is_not_claimed() -> None:
-    assert run_slow(problems.gaussian(2), rng=rng(3), error=0.5).log_z_error >= 0.25
+def test_an_error_much_finer_than_what_was_asked_for_is_not_claimed() -> None:
+    assert run_slow(problems.gaussian(2), rng=rng(3), error=0.5).log_z_error >= 0.375
 
 
 def test_where_draws_do_not_reach_the_posterior_an_ordinary_run_follows() -> None:

@@ -211,12 +211,14 @@ def as_problem(
             raise ParameterError(
                 "prior, names, vectorized, pass_dict, periodic",
                 "given beside a problem that has its own",
-                "these beside a log likelihood, a function; or the problem alone",
+                "these beside a log likelihood, a function; or nested.run(problem, rng=rng)",
             )
         return cast(Samplable, problem)
     if prior is None:
         allowed = "a problem with a prior and a log_likelihood(theta), such as inference.SensorProblem; or a function"
-        raise ParameterError("problem", problem, f"{allowed} with its prior: (log_likelihood, prior)")
+        raise ParameterError(
+            "problem", problem, f"{allowed} with its prior: nested.run(log_likelihood, prior, rng=rng)"
+        )
     return pose(
         cast("Callable[..., Any]", problem),
         prior,

@@ -51,7 +51,7 @@ _LEAST_CALLS = 5000
 # In more dimensions draws fill the space too thinly to claim a smaller error: on a curved ridge in five
 # (Rosenbrock's) they missed up to a fifth of the posterior without a sign.
 _DENSE, _LEAST_ERROR = 3, 0.1
-_FINEST = 0.5  # of the error asked for: smaller ones are not claimed, since nothing so small is looked for
+_FINEST = 0.75  # of the error asked for: smaller ones are not claimed, since nothing so small is looked for
 _N_LIVE, _N_LIVE_ALONE = 50, 100
 _LIKE_INDEPENDENT = 0.5  # draws that shape one component together are worth fewer independent ones
 # Exploration: draws of a power, grown where it rises slowly; effective sample size that lets the power rise.
@@ -66,8 +66,8 @@ _FIRST = 0.75
 _N_SAMPLES = 2000
 # Draws of two densities have two groups of weights, which a longer tail would mix: only its end tells of the variance.
 _TAIL = 1.0
-# Where the error is this many times too large, or doubtful, the draws go into a second fit.
-_MUCH, _MOST_FITS = 1.3, 2
+# Where the error is this many times too large, or doubtful, the draws go into another fit, up to a number of them.
+_MUCH, _MOST_FITS = 1.3, 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +100,8 @@ def run_slow(
 ) -> Weighted:
     """Compute evidence and posterior of a problem in few evaluations, for likelihoods that take seconds.
 
-    In a few dimensions (about ten; tried on six problems) it needs as many evaluations for its error as the best
-    peers or fewer. In more, or for an ordinary likelihood, use `run`.
+    In up to ten dimensions it takes about as many evaluations for its error as the best peers, or fewer (measured on
+    six problems). In more, where a part of the posterior is narrow, or for a fast likelihood, use `run`.
 
     Parameters
     ----------
@@ -111,8 +111,8 @@ def run_slow(
     rng
         Source of randomness.
     error
-        Standard error of log Z at which the draws end. Errors below half of it are not claimed, nor below 0.1 in more
-        than three dimensions.
+        Standard error of log Z at which the draws end. Errors below three quarters of it are not claimed, nor below
+        0.1 in more than three dimensions.
     max_calls
         Limit of likelihood evaluations, 5000 or more; the error may end larger for it. Where draws do not reach the
         posterior for half of it, an ordinary run with 100 live points follows.

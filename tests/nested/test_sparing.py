@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from nested_sampling import problems
+from nested_sampling import hard, problems
 from nested_sampling.samplers import Counted
 
 from probewise.errors import ParameterError
@@ -48,7 +48,7 @@ def test_a_plain_function_of_one_point_gives_the_same_as_one_of_a_batch() -> Non
 
 
 def test_an_error_much_finer_than_what_was_asked_for_is_not_claimed() -> None:
-    assert run_slow(problems.gaussian(2), rng=rng(3), error=0.5).log_z_error >= 0.375
+    assert run_slow(problems.gaussian(2), rng=rng(3), error=0.5).log_z_error >= 0.5
 
 
 def test_where_draws_do_not_reach_the_posterior_an_ordinary_run_follows() -> None:
@@ -67,6 +67,15 @@ def test_a_prior_of_which_little_is_possible_is_drawn_from_until_enough_is() -> 
 
     found = run_slow(corner, problems.box(2, 0, 1), vectorized=True, rng=rng(5))
     assert abs(found.log_z - math.log(0.01)) < N_ERRORS * found.log_z_error
+
+
+@pytest.mark.slow
+def test_in_six_dimensions_a_narrow_part_may_be_lost_and_the_result_says_so() -> None:
+    """Of two seeds one loses the needle, and with it 4.5 nats."""
+    known = hard.needle_beside_hill()
+    found = [run_slow(known, rng=np.random.default_rng([seed, 28])) for seed in range(2)]
+    assert all("narrow part of the posterior" in one.doubts[-1] for one in found)
+    assert not any(one.sound for one in found)
 
 
 def test_options_out_of_range_are_refused() -> None:

@@ -48,10 +48,13 @@ from probewise.nested.weights import n_effective, resampled
 __all__ = ["run_slow"]
 
 _LEAST_CALLS = 5000
-# In more dimensions draws fill the space too thinly to claim a smaller error: on a curved ridge in five
-# (Rosenbrock's) they missed up to a fifth of the posterior without a sign.
+# In more dimensions draws fill the space too thinly. On a curved ridge in five (Rosenbrock's) they missed up to a fifth
+# of the posterior without a sign, so no smaller error is claimed; and narrow parts are lost.
 _DENSE, _LEAST_ERROR = 3, 0.1
-_FINEST = 0.75  # of the error asked for: smaller ones are not claimed, since nothing so small is looked for
+_THIN = (
+    "in more than three dimensions the draws may have missed a narrow part of the posterior; "
+    "where it may have one, use nested.run"
+)
 _N_LIVE, _N_LIVE_ALONE = 50, 100
 _LIKE_INDEPENDENT = 0.5  # draws that shape one component together are worth fewer independent ones
 # Exploration: draws of a power, grown where it rises slowly; effective sample size that lets the power rise.
@@ -101,7 +104,8 @@ def run_slow(
     """Compute evidence and posterior of a problem in few evaluations, for likelihoods that take seconds.
 
     In up to ten dimensions it takes about as many evaluations for its error as the best peers, or fewer (measured on
-    six problems). In more, where a part of the posterior is narrow, or for a fast likelihood, use `run`.
+    six problems). In more than three it may miss a narrow part of the posterior, which is always among its doubts:
+    use `run` where there may be one, and for fast likelihoods.
 
     Parameters
     ----------
@@ -111,8 +115,8 @@ def run_slow(
     rng
         Source of randomness.
     error
-        Standard error of log Z at which the draws end. Errors below three quarters of it are not claimed, nor below
-        0.1 in more than three dimensions.
+        Standard error of log Z at which the draws end; in more than three dimensions at least 0.1. No smaller error is
+        claimed.
     max_calls
         Limit of likelihood evaluations, 5000 or more; the error may end larger for it. Where draws do not reach the
         posterior for half of it, an ordinary run with 100 live points follows.
@@ -161,11 +165,13 @@ def run_slow(
     found = _weighed(explored, original, evaluate, space, wanted=wanted, max_calls=max_calls - second.n_calls, rng=rng)
     n_calls = evaluate.n_calls + second.n_calls
     told(n_calls)
-    least = _FINEST * error if n_params <= _DENSE else max(_FINEST * error, _LEAST_ERROR)
-    found = replace(found, n_calls=n_calls, log_z_error=max(found.log_z_error, least))
+    thin = () if n_params <= _DENSE else (_THIN,)
     if found.doubts and not found.inherited:
-        return _of_run(second, original.log_likelihood, n_calls, found.pareto_k)
-    return found
+        warned = replace(second, warnings=(*second.warnings, *thin))
+        return _of_run(warned, original.log_likelihood, n_calls, found.pareto_k)
+    # Nothing smaller was looked for.
+    log_z_error = max(found.log_z_error, wanted)
+    return replace(found, n_calls=n_calls, log_z_error=log_z_error, inherited=(*found.inherited, *thin))
 
 
 def _of_run(run: NestedResult, log_likelihood: FloatArray, n_calls: int, k: float = math.inf) -> Weighted:

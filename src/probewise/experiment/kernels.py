@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cache
 from typing import Self
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 
 __all__ = ["MOST_KERNELS", "LocalKernels"]
 
@@ -21,6 +22,7 @@ MOST_KERNELS = 250
 _NEIGHBOURS = 10  # neighbours per parameter, enough for a covariance
 _RIDGE = 1e-6  # of the overall covariance, to avoid singular ones
 _BLOCK = 256  # points per batch, to fit the cache
+_FEW = 600  # points up to which all distances are faster than a tree
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ class LocalKernels:
         scale = np.maximum(points.std(axis=0), 1e-300)
         rows = rng.permutation(n_samples)[: min(most, (n_samples + 1) // 2)]
         n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
-        near = cKDTree(away / scale).query(away[rows] / scale, k=n_near)[1].reshape(len(rows), n_near)
+        near = _nearest(away / scale, rows, n_near)
         centre = away[rows]
         spread = away[near] - away[near].mean(axis=1, keepdims=True)
         overall = np.atleast_2d(np.cov(points, rowvar=False))
@@ -59,7 +61,7 @@ class LocalKernels:
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         pull = np.einsum("kij,kj->ki", precision, centre)
         constant = -0.5 * (np.einsum("ki,ki->k", pull, centre) + log_det + n_params * math.log(2 * math.pi))
-        upper = np.triu_indices(n_params)
+        upper = _upper(n_params)
         product = -np.where(upper[0] == upper[1], 0.5, 1.0) * precision[:, upper[0], upper[1]]
         form = np.concatenate([constant[:, None], pull, product], axis=1).T
         return cls(origin, centre, root, form)
@@ -72,7 +74,7 @@ class LocalKernels:
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the natural log of the density, (n, n_params) -> (n,)."""
-        upper = np.triu_indices(points.shape[1])
+        upper = _upper(points.shape[1])
         out = np.empty(len(points))
         for start in range(0, len(points), _BLOCK):
             away = points[start : start + _BLOCK] - self.origin
@@ -83,3 +85,18 @@ class LocalKernels:
             each -= most[:, None]
             out[start : start + _BLOCK] = most + np.log(np.exp(each.astype(np.float32)).sum(axis=1))
         return out - math.log(len(self.centre))
+
+
+def _nearest(points: FloatArray, rows: IntArray, n: int) -> IntArray:
+    """Return the `n` nearest points to each of some points, themselves included, (n_rows, n)."""
+    if len(points) > _FEW:
+        return np.asarray(cKDTree(points).query(points[rows], k=n)[1].reshape(len(rows), n))
+    square = (points**2).sum(axis=1)
+    away = square - 2.0 * points[rows] @ points.T  # less the row's own square, the same for all
+    return np.asarray(np.argpartition(away, n - 1, axis=1)[:, :n])
+
+
+@cache
+def _upper(n_params: int) -> tuple[IntArray, IntArray]:
+    """Return the indices of the upper triangle of a matrix."""
+    return np.triu_indices(n_params)

@@ -26,11 +26,18 @@ _PHASES = 7
 _PER_PHASE = 0.16  # of the amplitude: width of each phase's component, about the spacing of neighbouring phases
 _COARSE = 0.3  # noise sds from which rounding of the readings matters
 _PRINTED = 0.05  # noise sds: smallest lattice that is not likely by chance for unrounded readings
+_LEAST = -1e300  # log of a probability of zero, for differences
 _FREE = 2  # readings that determine the lattice
 
 
 def _mean_over(nodes: list[FloatArray]) -> FloatArray:
-    return np.asarray(logsumexp(nodes, axis=0) - math.log(len(nodes)))
+    """Return the log of the mean over equally weighted nodes of equal shape; called too often for scipy's version."""
+    stacked = np.stack(nodes)
+    most = np.maximum(stacked.max(axis=0), _LEAST)
+    stacked -= most
+    np.exp(stacked, out=stacked)
+    with np.errstate(divide="ignore"):  # impossible at every node
+        return np.asarray(most + np.log(stacked.mean(axis=0)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,14 +37,15 @@ _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 @dataclass(frozen=True)
 class Effort:
-    """Accepted steps per sample to aim for, and number of kernels in the proposal."""
+    """Accepted steps per sample to aim for, number of kernels, and least effective share of the samples."""
 
     enough: float
     n_kernels: int
+    keep: float = KEEP
 
 
 THOROUGH = Effort(1.5, MOST_KERNELS)
-BRIEF = Effort(1.0, 75)
+BRIEF = Effort(1.0, 75, 0.3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +145,7 @@ def update(
     """
     before = previous.weighted
     n = len(before.theta)
+    least = (THOROUGH if effort is None else effort).keep * n
     if before.log_z == -math.inf:
         return previous
     bridge = _Bridge(problem)
@@ -162,13 +164,13 @@ def update(
             if fall_back is not None:
                 return _from_scratch(fall_back(), n, bridge, n_calls, rng)
             return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
-        share = 1.0 if all_at_once >= KEEP * n else _next_power(log_weight, base, now, share)
+        share = 1.0 if all_at_once >= least else _next_power(log_weight, base, now, share, least)
         weighed = _reweighed(log_weight, now.at(share), base)
         gained = float(logsumexp(weighed))
         log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
         n_eff = n_effective(log_weight)
         variance += max(1.0 / n_eff - 1.0 / n, 0.0)
-        if share == 1.0 and n_eff >= KEEP * n:
+        if share == 1.0 and n_eff >= least:
             break
         rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
         now, moves = _move(now.take(rows), share, bridge, rng, _parted(rows) if fall_back is None else None, effort)
@@ -359,9 +361,9 @@ def _parted(rows: IntArray) -> list[IntArray]:
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
-def _next_power(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float) -> float:
+def _next_power(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float, enough: float) -> float:
     """Return the largest power of the last reading's likelihood with enough effective samples, by bisection."""
-    low, high, enough = share, 1.0, KEEP * len(base)
+    low, high = share, 1.0
     for _ in range(30):
         middle = 0.5 * (low + high)
         low, high = (

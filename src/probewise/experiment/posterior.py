@@ -33,6 +33,7 @@ _IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
 _FEWER = 3  # times
 _SUSPECTED = ((0.2, 1), (0.02, 2), (0.0, 6))  # probability from which on a rival has which fraction of the samples
 _SURPRISING = 5.0  # nats that a reading costs the leading kind, from which on every kind is heard by many samples
+_SURPRISED = 3  # fraction of the samples that a rival has then
 _MOST_OFF = 0.02  # by which a kind's probability may be wrong
 _CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
 _STRAINED = 6.0  # nats, where samples could not follow
@@ -193,9 +194,8 @@ def _taken_in(
         if kind.left_out and probability[k] < _SUSPECTED[1][0]:
             if surprising:
                 earlier = kind.problem(problem.recording.take(slice(0, -1)))
-                particles[k] = resized(particles[k], n_particles // 2, earlier, rng=rng)
-            else:
-                effort = BRIEF
+                particles[k] = resized(particles[k], n_particles // _SURPRISED, earlier, rng=rng)
+            effort = BRIEF
         particles[k] = update(particles[k], problem, rng=rng, effort=effort)
     return particles
 

@@ -56,7 +56,16 @@ class LocalKernels:
         covariance = np.einsum("kni,knj->kij", spread, spread) / n_near
         covariance += _RIDGE * (overall + np.diag(scale**2))
         covariance *= widened**2
-        root = np.linalg.cholesky(covariance)
+        return cls.from_moments(centre, covariance, origin=origin)
+
+    @classmethod
+    def from_moments(cls, centre: FloatArray, covariance: FloatArray, *, origin: FloatArray | None = None) -> Self:
+        """Build from centres about `origin`, (n_kernels, n_params), and the covariance of each kernel."""
+        if origin is None:
+            origin = np.asarray(centre.mean(axis=0))
+            centre = centre - origin
+        n_params = centre.shape[1]
+        root = np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
         precision = np.linalg.inv(covariance)
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         pull = np.einsum("kij,kj->ki", precision, centre)

@@ -16,9 +16,9 @@ from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
 from probewise.effects.wrapped import Wrapped
 from probewise.recordings.plan import Plan, Recording
-from probewise.sensor.stages import Effect
+from probewise.sensor.stages import Effect, Poses
 
-__all__ = ["EACH_S", "Pace", "Paced", "Told", "clocked"]
+__all__ = ["EACH_S", "FromRest", "Pace", "Paced", "Told", "clocked"]
 
 EACH_S = 8.0
 """Seconds of a run's own time that each reading takes on average."""
@@ -75,6 +75,31 @@ class Paced(Wrapped[FloatArray]):
         """Convert parameters from the run's own time to seconds, any shape (..., n_params)."""
         powers = np.array([self.powers.get(name, 0) for name in self.prior.names])
         return np.asarray(theta * (pace.each_s / EACH_S) ** powers)
+
+    def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
+        """Describe the effect."""
+        return self.effect.sentence(mean, sd)
+
+
+@dataclass(frozen=True, eq=False)
+class FromRest(Wrapped[Any]):
+    """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
+
+    effect: Told
+
+    def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
+        """Apply the effect to all readings but the run's first."""
+        found = self.effect.apply(value, theta, plan)
+        own = plan.covariates.get(_COLUMN)
+        if own is None or not (first := own <= 0.0).any():
+            return found
+        if not isinstance(value, Poses):
+            return np.where(first, value, found)
+        return replace(
+            found,
+            x_mm=np.where(first, value.x_mm, found.x_mm),
+            y_mm=np.where(first, value.y_mm, found.y_mm),
+        )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Describe the effect."""

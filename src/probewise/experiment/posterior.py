@@ -20,6 +20,8 @@ from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import Bridged, bridged, redrawn
 from probewise.experiment.kinds import Kind
 from probewise.experiment.particles import BRIEF, THOROUGH, Particles, prior_particles, resized, sampled, update
+from probewise.experiment.refitted import refitted
+from probewise.experiment.rivals import declared_noise
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.result import NestedResult
@@ -40,6 +42,9 @@ _STRAINED = 6.0  # nats, where samples could not follow
 _TOLD_APART = 1.5  # nats between an evidence carried and one taken anew, from which on the samples are in doubt
 _HOPELESS = 60.0  # nats behind the best kind, from which on no evidence is taken anew
 _DRAWS = 1000
+_NESTED = 6.0  # nats by which a rival may be less likely than the plain model, which is a case of it
+_BEHIND = 9.0  # nats behind the best kind, from which on a rival is not sampled anew
+_LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
 _LOST = 0.01  # probability of a kind that must not be missed
 
 
@@ -154,6 +159,8 @@ def updated(
     particles = _taken_in(previous, problems, n_particles, rng)
     now = replace(previous, particles=tuple(particles))
     if any(kind.left_out for kind in now.kinds):
+        particles = _revived(now, problems, n_particles, rng)
+        now = replace(previous, particles=tuple(particles))
         particles = [
             _weighed_again(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
             for p, problem, odds in zip(particles, problems, now.log_odds, strict=True)
@@ -197,6 +204,40 @@ def _taken_in(
                 particles[k] = resized(particles[k], n_particles // _SURPRISED, earlier, rng=rng)
             effort = BRIEF
         particles[k] = update(particles[k], problem, rng=rng, effort=effort)
+    return particles
+
+
+def _revived(
+    now: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator
+) -> list[Particles]:
+    """Sample a rival anew, about refits of what other kinds believe, where its own samples may have lost the truth.
+
+    They may have after a reading that few of them were near. And a rival whose effect can be negligible cannot be much
+    less likely than the plain model: if it claims to be, its samples are elsewhere.
+    """
+    particles, log_odds = list(now.particles), now.log_odds
+    for k, (kind, problem) in enumerate(zip(now.kinds, problems, strict=True)):
+        noise = declared_noise(kind.likelihood)
+        if kind.effect is None or noise is None:
+            continue
+        alike = [j for j, other in enumerate(now.kinds) if other.shape == kind.shape and j != k]
+        plain = next(j for j in alike if not now.kinds[j].left_out)
+        own = particles[k]
+        beyond = own.log_z < particles[plain].log_z - _NESTED
+        if not (beyond or own.strained or own.hurried):
+            continue
+        best = max(alike, key=lambda j: log_odds[j])
+        donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
+        hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
+        n = max(len(own.ancestor), _size(kind, 0.0, n_particles))
+        noise_sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
+        found = refitted(
+            kind, problem, own.weighted, donors, noise_sd=noise_sd, n_draws=2 * n, hopeless=hopeless, rng=rng
+        )
+        if found is None or found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
+            continue
+        fresh = sampled(found, n, problem, rng=rng)
+        particles[k] = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
     return particles
 
 

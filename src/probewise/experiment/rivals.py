@@ -18,15 +18,17 @@ from probewise._arrays import FloatArray
 from probewise.effects import (
     VOCABULARY,
     AmbientStep,
+    Backlash,
     Extent,
     GainDrift,
+    Hysteresis,
     Lag,
     NamedEffect,
     OffsetDrift,
 )
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import noise_laws
-from probewise.experiment.pace import EACH_S, Paced, Told
+from probewise.experiment.pace import EACH_S, FromRest, Paced, Told
 from probewise.experiment.shown import Shown
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
@@ -35,9 +37,9 @@ from probewise.recordings.plan import Instrumentation, Plan
 from probewise.sensor import Chain, FixedLevels
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["ON_FIELD", "Rival", "rivals_of"]
+__all__ = ["ON_FIELD", "Rival", "declared_noise", "rivals_of"]
 
-_DURATION_S = 300.0
+_DURATION_S = 150.0
 _SCAN_MM = 100.0
 
 ON_FIELD = {
@@ -61,6 +63,8 @@ WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
 """Effects that are aliased with another shape, unless there is a card at a known place."""
 
 _IN_TIME = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name, Lag.name})
+
+_OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +108,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
         effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _scan(reach_mm)))
         if effect is not None and name not in carried:
             found += [Rival(name, effect=way) for way in _ways(effect)]
-    noise = _noise_of(likelihood)
+    noise = declared_noise(likelihood)
     if noise is not None:
         laws = noise_laws(*noise, (model.levels.i_min, model.levels.i_max))
         found += [Rival(name, likelihood=law) for name, law in laws.items()]
@@ -113,6 +117,8 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
 
 def _ways(effect: NamedEffect[FloatArray]) -> list[Told]:
     """List the ways in which an effect may act in a run: one that changes with time does so at the run's own pace."""
+    if effect.name in _OF_MOTION:
+        return [Shown(effect), FromRest(Shown(effect))]
     if effect.name not in _IN_TIME:
         return [Shown(effect)]
     ways = [effect, GainLoss.like(effect)] if isinstance(effect, GainDrift) else [effect]
@@ -142,7 +148,8 @@ class GainLoss(GainDrift):
         )
 
 
-def _noise_of(likelihood: Likelihood) -> tuple[float, float] | None:
+def declared_noise(likelihood: Likelihood) -> tuple[float, float] | None:
+    """Return the noise's sd and rounding step (0: not rounded) of a likelihood of known sd; None for any other."""
     if isinstance(likelihood, Rounded):
         return likelihood.sd, likelihood.step
     if isinstance(likelihood, GaussianKnown) and np.ndim(likelihood.sd) == 0:

@@ -20,8 +20,8 @@ from probewise.priors import LogUniform, Prior, Product
 
 __all__ = ["Shown"]
 
-_SMALLEST = 1.0
-"""Smallest sd of an effect's size, in typical sizes: about what changes a reading by one noise sd."""
+_SMALLEST = 4.0
+"""Smallest sd of an effect's size, in typical sizes of a recording: a smaller one hardly moves the shape."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,171 @@
+"""Samples of a kind of hypotheses that do not depend on its own history: refits of what other kinds believe.
+
+The samples of a rival may have gathered where the earlier readings led them, with none where the truth is; no later
+reading brings them back. Other kinds have samples there. Each of these, with a size of the effect drawn from its prior,
+is fitted to all readings (Levenberg-Marquardt, all starts side by side); a Gaussian about each good fit, with kernels
+about the rival's own samples, is the density of an importance sample.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.experiment.kernels import LocalKernels
+from probewise.experiment.kinds import Kind
+from probewise.inference.problem import SensorProblem
+from probewise.nested.importance import Weighted, pareto_k
+from probewise.nested.weights import n_effective, resampled
+
+__all__ = ["fits", "refitted"]
+
+_STARTS = 60
+_STEPS = 8
+_NUDGE = 1e-3  # of a parameter's scale: the finite difference
+_KEPT = 24  # fits that carry a Gaussian
+_WORSE = 12.0  # nats behind the best fit, from which on a fit carries none
+_WIDER = 1.4  # factor on the width of these Gaussians
+_OWN = 0.4  # share of the draws from kernels about the kind's own samples
+
+
+def fits(
+    kind: Kind, problem: SensorProblem, donors: Sequence[Weighted], *, noise_sd: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fit a kind with an effect on the mean to all readings, from the samples of other kinds.
+
+    Parameters
+    ----------
+    kind, problem
+        The kind and its problem.
+    donors
+        Posteriors whose first parameters are the shape's.
+    noise_sd
+        Sd of a reading's noise.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    theta
+        The fits, (n_starts, n_params).
+    score
+        Log likelihood plus log prior of each, (n_starts,).
+    precision
+        Inverse covariances about them, (n_starts, n_params, n_params).
+    """
+    recording = problem.recording
+    usable = recording.usable
+    plan, readings = recording.plan, recording.readings
+    drawn = kind.prior.from_unit_cube(rng.random((2000, len(kind.prior.names))))
+    low, high = np.quantile(drawn, [0.16, 0.84], axis=0)
+    scale = np.maximum(0.5 * (high - low), 1e-12)
+    theta = drawn[:_STARTS].copy()
+    n_effect = 0 if kind.effect is None else len(kind.effect.prior.names)
+    n_shape = theta.shape[1] - n_effect
+    for k, donor in enumerate(donors):
+        theta[k :: len(donors), :n_shape] = donor.samples(_STARTS, rng=rng)[k :: len(donors), :n_shape]
+
+    def predict(at: FloatArray) -> FloatArray:
+        return np.asarray(problem.model.predict(at, plan)[:, usable])
+
+    def cost_of(residual: FloatArray, at: FloatArray) -> FloatArray:
+        cost = 0.5 * (residual**2).sum(axis=1) - kind.prior.log_prob(at)
+        return np.where(np.isfinite(cost), cost, np.inf)
+
+    n, n_params = theta.shape
+    ridge = np.eye(n_params) / scale**2
+    residual = (readings[usable] - predict(theta)) / noise_sd
+    cost, damping = cost_of(residual, theta), np.full(n, 1.0)
+    normal = np.broadcast_to(ridge, (n, n_params, n_params)).copy()
+    for _ in range(_STEPS):
+        slope = np.empty((n, residual.shape[1], n_params))
+        for j in range(n_params):
+            nudged = theta.copy()
+            nudged[:, j] += _NUDGE * scale[j]
+            slope[:, :, j] = (predict(nudged) - (readings[usable] - noise_sd * residual)) / (_NUDGE * scale[j])
+        slope /= noise_sd
+        normal = slope.transpose(0, 2, 1) @ slope + ridge
+        pull = (slope.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
+        damped = normal + damping[:, None, None] * ridge * 10.0
+        tried = theta + np.linalg.solve(damped, pull[:, :, None])[:, :, 0]
+        possible = np.isfinite(kind.prior.log_prob(tried))
+        tried = np.where(possible[:, None], tried, theta)
+        at = (readings[usable] - predict(tried)) / noise_sd
+        found = cost_of(at, tried)
+        better = found < cost
+        theta = np.where(better[:, None], tried, theta)
+        residual = np.where(better[:, None], at, residual)
+        cost = np.where(better, found, cost)
+        damping = np.clip(np.where(better, damping / 5.0, damping * 5.0), 1e-4, 1e8)
+    score = np.full(n, -np.inf)
+    alive = np.isfinite(cost)
+    if alive.any():
+        score[alive] = problem.log_likelihood(theta[alive]) + kind.prior.log_prob(theta[alive])
+    return theta, score, normal
+
+
+def refitted(
+    kind: Kind,
+    problem: SensorProblem,
+    own: Weighted,
+    donors: Sequence[Weighted],
+    *,
+    noise_sd: float,
+    n_draws: int,
+    hopeless: float,
+    rng: np.random.Generator,
+) -> Weighted | None:
+    """Sample a kind's posterior by importance sampling about refits and about its own samples.
+
+    Parameters
+    ----------
+    kind, problem, donors, noise_sd, rng
+        As for `fits`.
+    own
+        The kind's own samples.
+    n_draws
+        Number of draws.
+    hopeless
+        Log evidence below which it is not worth sampling: None is returned where no fit can reach it.
+    """
+    theta, score, precision = fits(kind, problem, donors, noise_sd=noise_sd, rng=rng)
+    order = np.argsort(-score)
+    order = order[score[order] > score[order[0]] - _WORSE] if math.isfinite(score[order[0]]) else order[:0]
+    if not len(order):
+        return None
+    log_volume = 0.5 * theta.shape[1] * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(precision[order])[1]
+    laplace = score[order] + log_volume
+    if laplace.max() < hopeless:
+        return None
+    best = order[np.argsort(-laplace)][:_KEPT]
+    about = LocalKernels.from_moments(theta[best], _WIDER**2 * np.linalg.inv(precision[best]))
+    densities, shares = [about], [1.0]
+    if own.log_z > hopeless:
+        rows = resampled(own.weight, len(own.theta), rng)
+        if len(np.unique(rows)) > 4 * theta.shape[1]:
+            densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=75))
+            shares = [1.0 - _OWN, _OWN]
+    points = np.concatenate([d.draw(round(s * n_draws), rng=rng) for d, s in zip(densities, shares, strict=True)])
+    n = len(points)
+    log_prior = kind.prior.log_prob(points)
+    possible = np.isfinite(log_prior)
+    points, log_prior = points[possible], log_prior[possible]
+    if not len(points):
+        return None
+    likely = problem.log_likelihood(points)
+    alive = np.isfinite(likely)
+    points, log_prior, likely = points[alive], log_prior[alive], likely[alive]
+    if len(points) < 10:
+        return None
+    each = [d.log_density(points) + math.log(s) for d, s in zip(densities, shares, strict=True)]
+    log_ratio = log_prior + likely - np.asarray(logsumexp(each, axis=0))
+    log_z = float(logsumexp(log_ratio)) - math.log(n)
+    log_weight = log_ratio - float(logsumexp(log_ratio))
+    n_eff = n_effective(log_weight)
+    error = math.sqrt(max(1.0 / n_eff - 1.0 / n, 0.0))
+    calls = own.n_calls + n
+    return Weighted(own.names, points, likely, log_weight, log_z, error, n_eff, calls, pareto_k(log_ratio))

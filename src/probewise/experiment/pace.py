@@ -18,7 +18,7 @@ from probewise.effects.wrapped import Wrapped
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor.stages import Effect, Poses
 
-__all__ = ["EACH_S", "FromRest", "Pace", "Paced", "Told", "clocked"]
+__all__ = ["EACH_S", "FromRest", "Pace", "Paced", "Told", "clocked", "run_time_s"]
 
 EACH_S = 8.0
 """Seconds of a run's own time that each reading takes on average."""
@@ -50,6 +50,11 @@ class Pace:
         return replace(recording, plan=self.on(recording.plan))
 
 
+def run_time_s(plan: Plan) -> FloatArray | None:
+    """Return the run's own time of each reading, (n_points,); None where the plan has no such column."""
+    return plan.covariates.get(_COLUMN)
+
+
 class Told(Effect[Any], Protocol):
     """An effect that can say what it does."""
 
@@ -68,7 +73,7 @@ class Paced(Wrapped[FloatArray]):
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effect."""
-        own = plan.covariates.get(_COLUMN)
+        own = run_time_s(plan)
         return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
 
     def by_the_clock(self, theta: FloatArray, pace: Pace) -> FloatArray:
@@ -90,7 +95,7 @@ class FromRest(Wrapped[Any]):
     def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
         """Apply the effect to all readings but the run's first."""
         found = self.effect.apply(value, theta, plan)
-        own = plan.covariates.get(_COLUMN)
+        own = run_time_s(plan)
         if own is None or not (first := own <= 0.0).any():
             return found
         if not isinstance(value, Poses):

@@ -25,7 +25,7 @@ from probewise.nested.result import NestedResult
 from probewise.nested.weights import n_effective, resampled
 from probewise.priors import Prior
 
-__all__ = ["BRIEF", "THOROUGH", "Effort", "Particles", "prior_particles", "resized", "sampled", "update"]
+__all__ = ["BRIEF", "STEADY", "THOROUGH", "Effort", "Particles", "prior_particles", "resized", "sampled", "update"]
 
 KEEP = 0.5  # least effective share of the samples without resampling
 SURPRISED = 12.5  # nats by which even the best sample misses the last reading: five sds of Gaussian noise
@@ -37,15 +37,20 @@ _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 @dataclass(frozen=True)
 class Effort:
-    """Accepted steps per sample to aim for, number of kernels, and least effective share of the samples."""
+    """Accepted steps per sample to aim for, number of kernels, least effective share of the samples, most temperatures.
+
+    Samples that need more temperatures for one reading are far from where it leads, and are marked as strained.
+    """
 
     enough: float
     n_kernels: int
     keep: float = KEEP
+    most: float = math.inf
 
 
 THOROUGH = Effort(1.5, MOST_KERNELS)
-BRIEF = Effort(1.0, 75, 0.3)
+STEADY = Effort(1.2, 120, 0.4, 12)
+BRIEF = Effort(1.0, 75, 0.3, 10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,7 +150,8 @@ def update(
     """
     before = previous.weighted
     n = len(before.theta)
-    least = (THOROUGH if effort is None else effort).keep * n
+    effort = THOROUGH if effort is None else effort
+    least = effort.keep * n
     if before.log_z == -math.inf:
         return previous
     bridge = _Bridge(problem)
@@ -164,7 +170,9 @@ def update(
             if fall_back is not None:
                 return _from_scratch(fall_back(), n, bridge, n_calls, rng)
             return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
-        share = 1.0 if all_at_once >= least else _next_power(log_weight, base, now, share, least)
+        given_up = n_resampled - previous.n_resampled >= effort.most
+        strained |= given_up and all_at_once < least
+        share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
         weighed = _reweighed(log_weight, now.at(share), base)
         gained = float(logsumexp(weighed))
         log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
@@ -198,7 +206,9 @@ def update(
     return Particles(found, ancestor, previous.start_variance, n_resampled, strained, hurried)
 
 
-def resized(particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator) -> Particles:
+def resized(
+    particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: Effort | None = None
+) -> Particles:
     """Resample to another number of samples, and move them apart.
 
     `problem` holds the readings included so far.
@@ -208,16 +218,20 @@ def resized(particles: Particles, n: int, problem: SensorProblem, *, rng: np.ran
         return particles
     rows = resampled(had.weight, n, rng)
     start = _Cloud(had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1)))
-    moved, moves = _move(start, 1.0, _Bridge(problem), rng) if len(problem.recording) else (start, _Moves(0.0, 0))
+    moved, moves = (
+        _move(start, 1.0, _Bridge(problem), rng, effort=effort) if len(problem.recording) else (start, _Moves(0.0, 0))
+    )
     found = replace(_even(moved, had), n_calls=had.n_calls + moves.n_calls)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
 
 
-def sampled(found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator) -> Particles:
+def sampled(
+    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: Effort | None = None
+) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     bridge = _Bridge(problem)
     cloud = bridge.cloud(found.theta[resampled(found.weight, n, rng)])
-    moved, moves = _move(cloud, 1.0, bridge, rng)
+    moved, moves = _move(cloud, 1.0, bridge, rng, effort=effort)
     drawn = replace(_even(moved, found), n_calls=found.n_calls + n + moves.n_calls)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 

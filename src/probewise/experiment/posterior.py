@@ -19,7 +19,17 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import Bridged, bridged, redrawn
 from probewise.experiment.kinds import Kind
-from probewise.experiment.particles import BRIEF, THOROUGH, Particles, prior_particles, resized, sampled, update
+from probewise.experiment.particles import (
+    BRIEF,
+    STEADY,
+    THOROUGH,
+    Effort,
+    Particles,
+    prior_particles,
+    resized,
+    sampled,
+    update,
+)
 from probewise.experiment.refitted import refitted
 from probewise.experiment.rivals import declared_noise
 from probewise.inference.problem import SensorProblem
@@ -27,21 +37,21 @@ from probewise.nested.importance import Weighted
 from probewise.nested.result import NestedResult
 from probewise.recordings.plan import Recording
 
-__all__ = ["Posterior", "prior_posterior", "updated"]
+__all__ = ["Posterior", "prior_posterior", "reconsidered", "updated"]
 
 FromScratch = Callable[[SensorProblem], NestedResult]
 
 _IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
 _FEWER = 3  # times
-_SUSPECTED = ((0.2, 1), (0.02, 2), (0.0, 6))  # probability from which on a rival has which fraction of the samples
-_SURPRISING = 5.0  # nats that a reading costs the leading kind, from which on every kind is heard by many samples
-_SURPRISED = 3  # fraction of the samples that a rival has then
+_SUSPECTED = ((0.2, 2), (0.02, 4), (0.0, 6))  # probability from which on a rival has which fraction of the samples
 _MOST_OFF = 0.02  # by which a kind's probability may be wrong
+_DOUBTED_OFF = 0.06  # the same in a run that doubts its sensor, where no decision hangs on less
 _CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
 _STRAINED = 6.0  # nats, where samples could not follow
 _TOLD_APART = 1.5  # nats between an evidence carried and one taken anew, from which on the samples are in doubt
 _HOPELESS = 60.0  # nats behind the best kind, from which on no evidence is taken anew
 _DRAWS = 1000
+_MOST_DRAWS = 1500
 _NESTED = 6.0  # nats by which a rival may be less likely than the plain model, which is a case of it
 _BEHIND = 9.0  # nats behind the best kind, from which on a rival is not sampled anew
 _LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
@@ -85,8 +95,9 @@ class Posterior:
 
     def doubting(self, times: float) -> Posterior:
         """Return the posterior with the odds of an incomplete sensor model multiplied by `times`."""
-        more = math.log(times)
-        kinds = tuple(replace(k, log_prior=k.log_prior + more) if k.left_out else k for k in self.kinds)
+        log_prior = np.array([k.log_prior + (math.log(times) if k.left_out else 0.0) for k in self.kinds])
+        log_prior -= logsumexp(log_prior)
+        kinds = tuple(replace(k, log_prior=p) for k, p in zip(self.kinds, log_prior.tolist(), strict=True))
         return replace(self, kinds=kinds)
 
     def joined(self, *, rng: np.random.Generator) -> Weighted:
@@ -156,9 +167,10 @@ def updated(
         (only,), (problem,) = previous.particles, problems
         found = update(only, problem, rng=rng, fall_back=lambda: from_scratch(problem))
         return replace(previous, particles=(found,))
-    particles = _taken_in(previous, problems, n_particles, rng)
+    doubted = any(kind.left_out for kind in previous.kinds)
+    particles = _taken_in(previous, problems, STEADY if doubted else THOROUGH, rng)
     now = replace(previous, particles=tuple(particles))
-    if any(kind.left_out for kind in now.kinds):
+    if doubted:
         particles = _revived(now, problems, n_particles, rng)
         now = replace(previous, particles=tuple(particles))
         particles = [
@@ -167,87 +179,96 @@ def updated(
         ]
         now = replace(previous, particles=tuple(particles))
     settled: set[int] = set()
-    while (k := _most_doubtful(now, settled)) is not None:
+    while (k := _most_doubtful(now, settled, _DOUBTED_OFF if doubted else _MOST_OFF)) is not None:
         settled.add(k)
-        particles[k] = _renewed(particles[k], problems[k], n_particles, from_scratch, rng)
+        n = min(n_particles, _MOST_DRAWS) if doubted else n_particles
+        particles[k] = _renewed(particles[k], problems[k], n, from_scratch, rng)
         now = replace(now, particles=tuple(particles))
     if not np.isfinite(now.log_odds).any():
         raise NotConvergedError("no hypothesis of any kind could have given these readings")
     for k, p in enumerate(now.probability):
         had, n = len(particles[k].ancestor), _size(now.kinds[k], p, n_particles)
         if n > had or p < _IMPROBABLE:
-            particles[k] = resized(particles[k], n, problems[k], rng=rng)
+            particles[k] = resized(
+                particles[k], n, problems[k], rng=rng, effort=BRIEF if now.kinds[k].left_out else None
+            )
     return replace(now, particles=tuple(particles))
 
 
 def _taken_in(
-    previous: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator
+    previous: Posterior, problems: list[SensorProblem], usual: Effort, rng: np.random.Generator
 ) -> list[Particles]:
-    """Take the last reading into every kind; where it surprises the leading one, into many samples of every kind.
+    """Take the last reading into every kind, with less effort into improbable rivals."""
+    return [
+        update(particles, problem, rng=rng, effort=BRIEF if kind.left_out and p < _SUSPECTED[1][0] else usual)
+        for kind, particles, problem, p in zip(
+            previous.kinds, previous.particles, problems, previous.probability, strict=True
+        )
+    ]
 
-    What has just begun to act is likely for few of a rival's samples: of few hundred there may be none.
-    """
-    particles, probability = list(previous.particles), previous.probability
-    first, surprising = [], False
-    if any(kind.left_out for kind in previous.kinds):
-        k = previous.leader
-        led = update(particles[k], problems[k], rng=rng)
-        surprising = len(problems[k].recording) > 1 and _surprise(led, particles[k], problems[k]) > _SURPRISING
-        particles[k], first = led, [k]
-    for k, (kind, problem) in enumerate(zip(previous.kinds, problems, strict=True)):
-        if k in first:
-            continue
-        effort = THOROUGH
-        if kind.left_out and probability[k] < _SUSPECTED[1][0]:
-            if surprising:
-                earlier = kind.problem(problem.recording.take(slice(0, -1)))
-                particles[k] = resized(particles[k], n_particles // _SURPRISED, earlier, rng=rng)
-            effort = BRIEF
-        particles[k] = update(particles[k], problem, rng=rng, effort=effort)
-    return particles
+
+def reconsidered(
+    posterior: Posterior, recording: Recording, n_particles: int, *, rng: np.random.Generator
+) -> Posterior:
+    """Sample every rival anew that might matter, whatever its history: to be asked before a run ends."""
+    problems = [kind.problem(recording) for kind in posterior.kinds]
+    return replace(posterior, particles=tuple(_revived(posterior, problems, n_particles, rng, each=True)))
 
 
 def _revived(
-    now: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator
+    now: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator, *, each: bool = False
 ) -> list[Particles]:
-    """Sample a rival anew, about refits of what other kinds believe, where its own samples may have lost the truth.
+    """Sample a rival anew, from what other kinds believe, where its own samples may have lost the truth.
 
     They may have after a reading that few of them were near. And a rival whose effect can be negligible cannot be much
-    less likely than the plain model: if it claims to be, its samples are elsewhere.
+    less likely than the plain model: if it claims to be, its samples are elsewhere. With `each`, every rival.
     """
     particles, log_odds = list(now.particles), now.log_odds
     for k, (kind, problem) in enumerate(zip(now.kinds, problems, strict=True)):
-        noise = declared_noise(kind.likelihood)
-        if kind.effect is None or noise is None:
+        if not kind.left_out:
             continue
         alike = [j for j, other in enumerate(now.kinds) if other.shape == kind.shape and j != k]
         plain = next(j for j in alike if not now.kinds[j].left_out)
         own = particles[k]
         beyond = own.log_z < particles[plain].log_z - _NESTED
-        if not (beyond or own.strained or own.hurried):
+        if not (each or beyond or own.strained or own.hurried):
             continue
         best = max(alike, key=lambda j: log_odds[j])
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
         hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
         n = max(len(own.ancestor), _size(kind, 0.0, n_particles))
-        noise_sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
-        found = refitted(
-            kind, problem, own.weighted, donors, noise_sd=noise_sd, n_draws=2 * n, hopeless=hopeless, rng=rng
-        )
+        found = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
         if found is None or found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
             continue
-        fresh = sampled(found, n, problem, rng=rng)
+        fresh = sampled(found, n, problem, rng=rng, effort=BRIEF)
         particles[k] = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
     return particles
 
 
-def _surprise(now: Particles, before: Particles, problem: SensorProblem) -> float:
-    """How much less likely the last reading was, given those before, than one that is expected exactly, nats."""
-    recording = problem.recording
-    if not recording.usable[-1] or now.log_z == -math.inf:
-        return 0.0
-    reading = recording.readings[-1:]
-    return float(problem.likelihood.log_prob(reading, reading[None])[0]) - (now.log_z - before.log_z)
+def _from_others(
+    kind: Kind,
+    problem: SensorProblem,
+    own: Weighted,
+    donors: list[Weighted],
+    n: int,
+    hopeless: float,
+    rng: np.random.Generator,
+) -> Weighted | None:
+    """Sample a kind's posterior with what others believe: refits of it, or the samples themselves for a noise law."""
+    noise = declared_noise(kind.likelihood)
+    if kind.effect is not None:
+        if noise is None:
+            return None
+        sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
+        return refitted(kind, problem, own, donors, noise_sd=sd, n_draws=2 * n, hopeless=hopeless, rng=rng)
+    n_own = len(kind.prior.names)
+    points = [donor.samples(n // 2, rng=rng)[:, :n_own] for donor in donors]
+    if own.log_z > hopeless:
+        points.append(own.samples(n // 2, rng=rng))
+    try:
+        return redrawn(np.concatenate(points), kind.prior.names, problem, rng=rng, n_draws=n)
+    except NotConvergedError:
+        return None
 
 
 def _size(kind: Kind, probability: float, n_particles: int) -> int:
@@ -262,7 +283,7 @@ def _shares(log_odds: FloatArray) -> FloatArray:
     return np.asarray(share / share.sum())
 
 
-def _most_doubtful(now: Posterior, settled: set[int]) -> int | None:
+def _most_doubtful(now: Posterior, settled: set[int], most_off: float) -> int | None:
     """Return the kind whose evidence error has the largest effect on its probability; None if all are negligible."""
     log_odds = now.log_odds
     off = np.zeros(len(log_odds))
@@ -278,7 +299,7 @@ def _most_doubtful(now: Posterior, settled: set[int]) -> int | None:
         off[k] = max(abs(_share(odds + way * doubt) - _share(odds)) for way in (-1, 1))
         if particles.strained and _share(odds + _STRAINED) > _LOST and _share(odds - _STRAINED) < 1 - _LOST:
             off[k] = 1.0
-    return int(off.argmax()) if off.max() > _MOST_OFF else None
+    return int(off.argmax()) if off.max() > most_off else None
 
 
 def _share(odds: float) -> float:

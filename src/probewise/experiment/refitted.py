@@ -17,6 +17,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.kinds import Kind
+from probewise.experiment.pace import EACH_S, run_time_s
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.weights import n_effective, resampled
@@ -29,6 +30,7 @@ _NUDGE = 1e-3  # of a parameter's scale: the finite difference
 _KEPT = 24  # fits that carry a Gaussian
 _WORSE = 12.0  # nats behind the best fit, from which on a fit carries none
 _WIDER = 1.4  # factor on the width of these Gaussians
+_IN_GAP = 0.4  # of the gap between two readings: sd of a change point within it
 _OWN = 0.4  # share of the draws from kernels about the kind's own samples
 
 
@@ -64,6 +66,13 @@ def fits(
     low, high = np.quantile(drawn, [0.16, 0.84], axis=0)
     scale = np.maximum(0.5 * (high - low), 1e-12)
     theta = drawn[:_STARTS].copy()
+    moments = [j for j, name in enumerate(kind.prior.names) if name.endswith(".at_s")]
+    times_s = run_time_s(plan)
+    if moments and times_s is not None and len(times_s) > 1:
+        # A change is seen by the gap between readings that it falls into, whatever the slope says.
+        gap = rng.integers(1, len(times_s), len(theta))
+        theta[:, moments] = (times_s[gap - 1] + rng.random(len(theta)) * (times_s[gap] - times_s[gap - 1]))[:, None]
+        scale[moments] = _IN_GAP * EACH_S
     n_effect = 0 if kind.effect is None else len(kind.effect.prior.names)
     n_shape = theta.shape[1] - n_effect
     for k, donor in enumerate(donors):

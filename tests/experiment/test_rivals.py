@@ -16,6 +16,7 @@ from probewise.experiment.asking import Field
 from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
 from probewise.experiment.posterior import prior_posterior, updated
+from probewise.experiment.refitted import refitted
 from probewise.experiment.rivals import rivals_of
 from probewise.inquiry import prior_entropy
 from probewise.recordings import Instrumentation
@@ -257,6 +258,55 @@ def test_readings_lost_to_exactly_black_are_no_chance():
     gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (exact, noisy)]
     assert gained[0] > 5.0
     assert gained[1] < 0.5
+
+
+PLAYED = [(846.5, 260.0), (854.5, 260.0), (846.5, 243.8), (854.5, 178.8), (967.4, 243.8), (886.8, 162.5)]
+"""Places about a circle, taken from all sides."""
+
+
+def played(experiment, kind, width_mm):
+    """Readings without noise about a circle, of an arm with gear play."""
+    places = [Reading(10.0, Pose(x, y), 8.0 * k) for k, (x, y) in enumerate(PLAYED)]
+    plan = experiment.problem(places).recording.plan
+    level = kind.model.predict(np.array([[922.0, 240.0, 77.0, width_mm]]), plan)[0]
+    read = [replace(reading, value=float(value)) for reading, value in zip(places, level, strict=True)]
+    return experiment.problem(read).recording
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rival_whose_samples_went_astray_is_found_from_what_others_believe(doubting, seed):
+    """Two routes to one evidence: refits from the plain model's samples, and nested sampling of all readings."""
+    rng = np.random.default_rng(seed)
+    kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
+    problem = kind.problem(played(doubting, kind, 6.0))
+    right = from_scratch(problem, 200, rng)
+    plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
+    donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
+    lost = replace(prior_posterior([kind], 500, rng=rng).particles[0].weighted, log_z=-1000.0)
+    found = refitted(kind, problem, lost, [donor], noise_sd=1.0, n_draws=2000, hopeless=-60.0, rng=rng)
+    assert found is not None
+    assert found.log_z == pytest.approx(right.log_z, abs=4 * math.hypot(found.log_z_error, right.log_z_error))
+    assert found.mean()[3] == pytest.approx(6.0, abs=4 * found.sd()[3])
+
+
+def test_a_rival_without_hope_is_not_sampled(doubting):
+    kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
+    recording = played(doubting, kind, 6.0)
+    rng = np.random.default_rng(0)
+    own = prior_posterior([kind], 500, rng=rng).particles[0].weighted
+    assert refitted(kind, kind.problem(recording), own, [own], noise_sd=1.0, n_draws=500, hopeless=0.0, rng=rng) is None
+
+
+def test_gear_play_may_spare_the_first_reading(doubting):
+    """Nobody knows whence the arm came to its first place: two kinds, which agree on all other readings."""
+    kinds = [kind for kind in doubting.kinds if kind.left_out == "backlash"]
+    places = [Reading(10.0, Pose(x, y), 8.0 * k) for k, (x, y) in enumerate(PLAYED)]
+    plan = doubting.problem(places).recording.plan
+    theta = np.array([[922.0, 240.0, 77.0, 6.0]])
+    moved, rested = (kind.model.predict(theta, plan)[0] for kind in kinds)
+    np.testing.assert_allclose(moved[1:], rested[1:])
+    assert rested[0] == pytest.approx(doubting.kinds[0].model.predict(theta[:, :3], plan)[0, 0])
+    assert abs(moved[0] - rested[0]) > 1.0
 
 
 @pytest.mark.slow

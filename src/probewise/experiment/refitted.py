@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.kinds import Kind
 from probewise.experiment.pace import EACH_S, run_time_s
@@ -31,7 +31,9 @@ _KEPT = 24  # fits that carry a Gaussian
 _WORSE = 12.0  # nats behind the best fit, from which on a fit carries none
 _WIDER = 1.4  # factor on the width of these Gaussians
 _IN_GAP = 0.4  # of the gap between two readings: sd of a change point within it
-_OWN = 0.4  # share of the draws from kernels about the kind's own samples
+_KERNELS = 75
+_FAR = 2.5  # factor on the width of some kernels, so that draws extend beyond what is found
+_LEAST = 10  # possible draws from which on they are weighed
 
 
 def fits(
@@ -151,30 +153,41 @@ def refitted(
     if laplace.max() < hopeless:
         return None
     best = order[np.argsort(-laplace)][:_KEPT]
-    about = LocalKernels.from_moments(theta[best], _WIDER**2 * np.linalg.inv(precision[best]))
-    densities, shares = [about], [1.0]
-    if own.log_z > hopeless:
-        rows = resampled(own.weight, len(own.theta), rng)
-        if len(np.unique(rows)) > 4 * theta.shape[1]:
-            densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=75))
-            shares = [1.0 - _OWN, _OWN]
-    points = np.concatenate([d.draw(round(s * n_draws), rng=rng) for d, s in zip(densities, shares, strict=True)])
-    n = len(points)
-    log_prior = kind.prior.log_prob(points)
-    possible = np.isfinite(log_prior)
-    points, log_prior = points[possible], log_prior[possible]
+    densities = [LocalKernels.from_moments(theta[best], _WIDER**2 * np.linalg.inv(precision[best]))]
+    if own.log_z > hopeless and len(rows := _distinct(own, theta.shape[1], rng)):
+        densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
+    first = _weighed(own, problem, densities, n_draws // 2, rng)
+    if first is None or not len(rows := _distinct(first, theta.shape[1], rng)):
+        return first
+    # A posterior is more curved than the Gaussians about its fits: once more, about what these have found.
+    near = LocalKernels.about(first.theta[rows], rng=rng, most=_KERNELS)
+    far = LocalKernels.about(first.theta[rows], rng=rng, widened=_FAR, most=_KERNELS)
+    return _weighed(first, problem, [near, near, far, *densities], n_draws, rng) or first
+
+
+def _distinct(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
+    """Resample rows of a posterior; none where too few are distinct to fit kernels."""
+    rows = resampled(posterior.weight, len(posterior.theta), rng)
+    return rows if len(np.unique(rows)) > 4 * n_params else rows[:0]
+
+
+def _weighed(
+    own: Weighted, problem: SensorProblem, densities: list[LocalKernels], n: int, rng: np.random.Generator
+) -> Weighted | None:
+    """Sample by importance sampling from an even mixture of densities; None where hardly a draw is possible."""
+    shares = np.bincount(rng.permutation(n) % len(densities), minlength=len(densities))
+    points = np.concatenate([d.draw(int(k), rng=rng) for d, k in zip(densities, shares, strict=True)])
+    points = points[np.isfinite(problem.prior.log_prob(points))]
     if not len(points):
         return None
     likely = problem.log_likelihood(points)
-    alive = np.isfinite(likely)
-    points, log_prior, likely = points[alive], log_prior[alive], likely[alive]
-    if len(points) < 10:
+    points, likely = points[np.isfinite(likely)], likely[np.isfinite(likely)]
+    if len(points) < _LEAST:
         return None
-    each = [d.log_density(points) + math.log(s) for d, s in zip(densities, shares, strict=True)]
-    log_ratio = log_prior + likely - np.asarray(logsumexp(each, axis=0))
+    density = logsumexp([d.log_density(points) for d in densities], axis=0) - math.log(len(densities))
+    log_ratio = problem.prior.log_prob(points) + likely - np.asarray(density)
     log_z = float(logsumexp(log_ratio)) - math.log(n)
     log_weight = log_ratio - float(logsumexp(log_ratio))
     n_eff = n_effective(log_weight)
     error = math.sqrt(max(1.0 / n_eff - 1.0 / n, 0.0))
-    calls = own.n_calls + n
-    return Weighted(own.names, points, likely, log_weight, log_z, error, n_eff, calls, pareto_k(log_ratio))
+    return Weighted(own.names, points, likely, log_weight, log_z, error, n_eff, own.n_calls + n, pareto_k(log_ratio))

@@ -27,6 +27,7 @@ _WIDE = 3.0  # factor on the width of some kernels, so that draws extend beyond 
 _OF_WIDE = 0.15  # share of the draws from those
 _STEPS = 60
 _CLOSE = 1e-4
+_UNKNOWN = 2.0  # nats: error of an evidence that cannot be estimated anew
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,8 @@ def bridged(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Gener
     rows = resampled(posterior.weight, n, rng)
     # Copies of a sample are adjacent, and so are in the same half.
     halves = np.split(rows, 2)
+    if min(len(np.unique(posterior.theta[half, 0])) for half in halves) <= 2 * posterior.theta.shape[1]:
+        return Bridged(posterior.log_z, max(posterior.log_z_error, _UNKNOWN), 0)  # too few to fit kernels
     found = []
     for own, other in (halves, halves[::-1]):
         density = _Density.about(posterior.theta[other], rng=rng)

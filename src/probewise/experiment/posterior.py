@@ -54,6 +54,7 @@ _DRAWS = 1000
 _MOST_DRAWS = 1500
 _NESTED = 6.0  # nats by which a rival may be less likely than the plain model, which is a case of it
 _BEHIND = 9.0  # nats behind the best kind, from which on a rival is not sampled anew
+_FEWEST = 4.0  # effective draws below which a sample replaces none
 _LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
 _LOST = 0.01  # probability of a kind that must not be missed
 
@@ -239,6 +240,8 @@ def _revived(
         n = max(len(own.ancestor), _size(kind, 0.0, n_particles))
         found = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
         if found is None or found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
+            continue
+        if found.n_eff < _FEWEST:
             continue
         fresh = sampled(found, n, problem, rng=rng, effort=BRIEF)
         particles[k] = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))

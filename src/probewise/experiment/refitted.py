@@ -24,11 +24,12 @@ from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["fits", "refitted"]
 
-_STARTS = 60
+_STARTS = 90
 _STEPS = 8
+_HELD = 1e12  # stiffness of a parameter that is held, in inverse squares of its scale
 _NUDGE = 1e-3  # of a parameter's scale: the finite difference
-_KEPT = 24  # fits that carry a Gaussian
-_WORSE = 12.0  # nats behind the best fit, from which on a fit carries none
+_KEPT = 45  # fits that carry a Gaussian
+_WORSE = 8.0  # nats behind the best fit, from which on a fit carries none
 _WIDER = 1.4  # factor on the width of these Gaussians
 _IN_GAP = 0.4  # of the gap between two readings: sd of a change point within it
 _KERNELS = 75
@@ -92,6 +93,9 @@ def fits(
     residual = (readings[usable] - predict(theta)) / noise_sd
     cost, damping = cost_of(residual, theta), np.full(n, 1.0)
     normal = np.broadcast_to(ridge, (n, n_params, n_params)).copy()
+    # Half of the starts hold their effect and fit the shape alone, so that fits lie along a ridge, not at its top only.
+    of_effect = np.arange(n_params) >= n_shape
+    held = (np.arange(n) >= n // 2)[:, None, None] * np.diag(_HELD * of_effect / scale**2)
     for _ in range(_STEPS):
         slope = np.empty((n, residual.shape[1], n_params))
         for j in range(n_params):
@@ -101,7 +105,7 @@ def fits(
         slope /= noise_sd
         normal = slope.transpose(0, 2, 1) @ slope + ridge
         pull = (slope.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
-        damped = normal + damping[:, None, None] * ridge * 10.0
+        damped = normal + damping[:, None, None] * ridge * 10.0 + held
         tried = theta + np.linalg.solve(damped, pull[:, :, None])[:, :, 0]
         possible = np.isfinite(kind.prior.log_prob(tried))
         tried = np.where(possible[:, None], tried, theta)

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from scipy.integrate import quad
 
 from probewise.errors import ParameterError, ShapeError
-from probewise.priors import Empty, Joint, LogUniform, Normal, Prior, Product, Uniform
+from probewise.priors import Empty, Joint, LogNormal, LogUniform, Normal, Prior, Product, Uniform
 
-MARGINALS = [Uniform(-2.0, 5.0), LogUniform(0.01, 30.0), Normal(1.0, 2.5)]
+MARGINALS = [Uniform(-2.0, 5.0), LogUniform(0.01, 30.0), LogNormal(3.0, 0.6), Normal(1.0, 2.5)]
 
 
 @pytest.mark.parametrize("marginal", MARGINALS, ids=str)
@@ -51,6 +51,7 @@ def test_joined_priors_keep_names_and_columns_in_order():
         lambda: Uniform(1, 1),
         lambda: Uniform(0, float("inf")),
         lambda: LogUniform(0, 1),
+        lambda: LogNormal(0.0, 1.0),
         lambda: Normal(0, 0),
         lambda: Normal(float("nan"), 1),
     ],

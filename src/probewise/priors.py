@@ -17,7 +17,18 @@ from probewise._arrays import FloatArray, floats
 from probewise._kinds import require_kind, require_like, require_number
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["Empty", "Joint", "LogUniform", "Marginal", "Normal", "Prior", "Product", "Uniform", "require_prior"]
+__all__ = [
+    "Empty",
+    "Joint",
+    "LogNormal",
+    "LogUniform",
+    "Marginal",
+    "Normal",
+    "Prior",
+    "Product",
+    "Uniform",
+    "require_prior",
+]
 
 
 @runtime_checkable
@@ -167,6 +178,39 @@ class Normal:
 
     def __str__(self) -> str:
         return f"normal {self.mean:g} ± {self.sd:g}"
+
+
+@dataclass(frozen=True)
+class LogNormal:
+    """Distribution of a positive number whose logarithm is normal: its median, and the sd of the logarithm."""
+
+    median: float
+    log_sd: float
+
+    def __post_init__(self) -> None:
+        for name in ("median", "log_sd"):
+            require_number(name, getattr(self, name))
+        if not (0 < self.median < math.inf and 0 < self.log_sd < math.inf):
+            raise ParameterError("LogNormal(median, log_sd)", (self.median, self.log_sd), "greater than 0, finite")
+
+    def from_unit(self, u: FloatArray) -> FloatArray:
+        """Quantile function, any shape."""
+        return np.asarray(self.median * np.exp(self.log_sd * ndtri(u)))
+
+    def to_unit(self, value: FloatArray) -> FloatArray:
+        """Cumulative distribution function, any shape."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(ndtr(np.log(np.maximum(value, 0.0) / self.median) / self.log_sd))
+
+    def log_prob(self, value: FloatArray) -> FloatArray:
+        """Natural log of the density, any shape; -inf at and below zero."""
+        safe = np.where(value > 0, value, self.median)
+        z = np.log(safe / self.median) / self.log_sd
+        density = -0.5 * z * z - np.log(safe * self.log_sd * math.sqrt(2 * math.pi))
+        return np.where(value > 0, density, -np.inf)
+
+    def __str__(self) -> str:
+        return f"log-normal about {self.median:g}"
 
 
 @dataclass(frozen=True)

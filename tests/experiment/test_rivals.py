@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from probewise import scene
 from probewise.arm import Pose, Reading
 from probewise.calibration import FittedSensor, mean_field
 from probewise.errors import ParameterError
-from probewise.experiment import CLEAN, Exploration, begin, left_out_of, repaired, result_json, step
+from probewise.experiment import CLEAN, Exploration, begin, experiment_for, left_out_of, repaired, result_json, step
 from probewise.experiment.asking import Field
 from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
@@ -307,6 +308,32 @@ def test_gear_play_may_spare_the_first_reading(doubting):
     np.testing.assert_allclose(moved[1:], rested[1:])
     assert rested[0] == pytest.approx(doubting.kinds[0].model.predict(theta[:, :3], plan)[0, 0])
     assert abs(moved[0] - rested[0]) > 1.0
+
+
+def test_the_next_run_starts_with_the_doubt_that_the_last_one_left(sensor):
+    """What a repaired sensor knows of its effect is inferred along with the shape; a run that trusts takes the mean."""
+    width = np.random.default_rng(1).normal(6.0, 0.8, (len(sensor.samples), 1))
+    again = replace(
+        sensor,
+        names=(*sensor.names, "backlash.width_mm"),
+        samples=np.concatenate([sensor.samples, width], axis=1),
+        effects=("backlash",),
+    )
+    field = scene.Field()
+    circle = scene.Circle(field, (50.0, 150.0), inside=True)
+    doubted, trusted = (experiment_for(again, circle, field, trust=trust) for trust in (0.9, 1.0))
+    plain = doubted.kinds[0]
+    assert (plain.left_out, plain.prior.names[3:]) == ("", ("backlash.width_mm",))
+    assert "backlash" not in {kind.left_out for kind in doubted.kinds}
+    drawn = prior_posterior([plain], 2000, rng=np.random.default_rng(2)).particles[0].weighted
+    assert (drawn.mean()[3], drawn.sd()[3]) == pytest.approx((6.0, 0.8), abs=0.1)
+    assert trusted.kinds[0].prior.names == circle.prior.names
+    places = [Reading(10.0, Pose(x, y), 8.0 * k) for k, (x, y) in enumerate(PLAYED)]
+    plan = doubted.problem(places).recording.plan
+    theta = np.array([[922.0, 240.0, 77.0, again.mean()["backlash.width_mm"]]])
+    np.testing.assert_allclose(
+        plain.model.predict(theta, plan), trusted.kinds[0].model.predict(theta[:, :3], plan), atol=1e-9
+    )
 
 
 @pytest.mark.slow

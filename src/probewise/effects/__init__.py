@@ -18,7 +18,7 @@ from probewise.effects.glint import Glint
 from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
 from probewise.effects.height import HeightGradient, HeightOffset
 from probewise.effects.knocks import ArmKnock, GainStep
-from probewise.effects.known import Known
+from probewise.effects.known import Estimated, Informed, Known
 from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
 from probewise.effects.motion import in_scans, sign_of_motion
@@ -144,6 +144,7 @@ __all__ = [
     "EdgeBlur",
     "EdgeMisplacement",
     "EdgeShadow",
+    "Estimated",
     "Extent",
     "Flicker",
     "GainDrift",
@@ -154,6 +155,7 @@ __all__ = [
     "HeightGradient",
     "HeightOffset",
     "Hysteresis",
+    "Informed",
     "Known",
     "Lag",
     "LogHeavyTailed",

@@ -1,4 +1,4 @@
-"""An effect with fixed parameters."""
+"""An effect whose parameters are known: exactly, or to within what a run has left open."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.wrapped import Wrapped
 from probewise.errors import ParameterError
-from probewise.priors import Empty
+from probewise.priors import Empty, Marginal, Prior, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect
 
-__all__ = ["Known"]
+__all__ = ["Estimated", "Informed", "Known"]
 
 V = TypeVar("V")
 
@@ -41,3 +41,37 @@ class Known(Wrapped[V]):
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
         """Apply the effect with the fixed values; theta is (n_samples, 0)."""
         return self.effect.apply(value, np.array([self.values]), plan)
+
+
+@dataclass(frozen=True)
+class Informed(Wrapped[V]):
+    """An effect with another prior: what is known of its parameters already."""
+
+    effect: Effect[V]
+    own: Prior
+
+    @property
+    def prior(self) -> Prior:
+        """That prior."""
+        return self.own
+
+
+@dataclass(frozen=True)
+class Estimated(Known[V]):
+    """An effect fixed at an estimate of its parameters, which remembers how well they are known.
+
+    `marginals` are what is known of each, in the order of `values`. A run that trusts its sensor takes the values;
+    one that doubts it infers them along with the shape (`informed`).
+    """
+
+    marginals: tuple[Marginal, ...] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.marginals) != len(self.values):
+            raise ParameterError("marginals", self.marginals, "one for each of the values")
+
+    @property
+    def informed(self) -> Informed[V]:
+        """The effect with these marginals as its prior."""
+        return Informed(self.effect, Product(dict(zip(self.effect.prior.names, self.marginals, strict=True))))

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, frozen
+from probewise.effects import Estimated
 from probewise.errors import ParameterError
 from probewise.experiment.pace import Told
 from probewise.experiment.rivals import Rival
@@ -96,7 +97,8 @@ def kinds_of(
     for part in _parts(shape, sensor_prior, prior):
         own, log_prior = part.prior, math.log(part.share)
         plain = log_prior + math.log(trust)
-        kinds.append(Kind(part.label, "", plain, own, part.model(quick), likelihood, part.placed, prior.names))
+        whole, model = _inferred(own, chain, quick) if trust < 1 else (own, quick)
+        kinds.append(Kind(part.label, "", plain, whole, part.model(model), likelihood, part.placed, prior.names))
         for rival in rivals:
             log_p = log_prior + math.log((1.0 - trust) / (len(ways) * ways[rival.name]))
             if rival.effect is None:
@@ -112,6 +114,18 @@ def kinds_of(
                 Kind(part.label, rival.name, log_p, both, model, likelihood, part.placed, prior.names, rival.effect)
             )
     return tuple(kinds)
+
+
+def _inferred(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior, SensorModel]:
+    """Return prior and model with the estimated effects of a repaired sensor among the parameters."""
+    estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
+    if not estimated or not isinstance(chain, Chain):
+        return own, quick
+    informed = [effect.informed for effect in estimated]
+    known = tuple(effect for effect in chain.effects if not isinstance(effect, Estimated))
+    acting = replace(chain, effects=(*known, *informed))
+    both = Joint((own, *(_Called(effect.name, effect.prior) for effect in informed)))
+    return both, TabledChain.of(acting, quick) or acting
 
 
 @dataclass(frozen=True, eq=False)

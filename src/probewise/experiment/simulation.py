@@ -18,12 +18,13 @@ from probewise._kinds import did_you_mean
 from probewise.arm import LegoScale, Pose, Reach, Reading, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
-from probewise.effects import Known
+from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
 from probewise.experiment.learning import AdjustedMixture, sensor_prior
 from probewise.experiment.setting import Experiment
 from probewise.inference import Naive, Rounded
 from probewise.inquiry import Finishing, Grid, Utility
+from probewise.priors import LogNormal, Marginal, Normal
 from probewise.recordings import Disc, Instrumentation, Polygon
 from probewise.scene import (
     SHAPES,
@@ -39,6 +40,7 @@ from probewise.scene import (
 )
 from probewise.scene.albedo import require_shape
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage
+from probewise.sensor.stages import AnyEffect
 from probewise.world import Covered, Oval, Spot, Surface, World
 
 __all__ = [
@@ -204,7 +206,7 @@ def experiment_for(
         sd = math.hypot(noise_sd, (scale.step or 0.0) / math.sqrt(12))
         # A reading on the edge fits neither level, and the naive model has no partial coverage.
         return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
-    chain = chain_of(sensor, scene)
+    chain = chain_of(sensor, scene, estimated=trust < 1 and not learn_sensor)
     # Unrounded readings get cells scaled to the noise; the end cells are open.
     likelihood = Rounded(noise_sd, scale.step or noise_sd / _CELLS_PER_SD, scale.low, scale.high)
     if learn_sensor:
@@ -245,15 +247,32 @@ def levels_of(sensor: FittedSensor) -> FixedLevels:
     return FixedLevels(means["I_min"], means["I_max"])
 
 
-def chain_of(sensor: FittedSensor, scene: HypothesisScene) -> Chain:
-    """Return the chain of a fitted sensor over a scene: mean field's mixture, mean levels, effects at their means."""
+def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = False) -> Chain:
+    """Return the chain of a fitted sensor over a scene: mean field's mixture, mean levels, effects at their means.
+
+    With `estimated`, the effects remember how well they are known, so that a run can infer them along.
+    """
     means = sensor.mean()
-    effects = tuple(
-        Known(effect, tuple(means[f"{effect.name}.{name}"] for name in effect.prior.names))
-        for effect in sensor.carried_effects
-        if effect.stage is not Stage.NOISE  # noise of readings far apart in place and time is independent
-    )
-    return Chain(sensor.mixture(), levels_of(sensor), scene, effects, n_nodes=FAST_NODES)
+    effects: list[AnyEffect] = []
+    for effect in sensor.carried_effects:
+        if effect.stage is Stage.NOISE:  # noise of readings far apart in place and time is independent
+            continue
+        names = [f"{effect.name}.{name}" for name in effect.prior.names]
+        values = tuple(means[name] for name in names)
+        samples = [sensor.samples[:, sensor.names.index(name)] for name in names]
+        if estimated and all(own.std() > 0 for own in samples):
+            effects.append(Estimated(effect, values, tuple(map(_known_to, samples))))
+        else:
+            effects.append(Known(effect, values))
+    return Chain(sensor.mixture(), levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)
+
+
+def _known_to(samples: FloatArray) -> Marginal:
+    """Return what is known of a parameter, from its posterior samples, (n_samples,); what is positive stays so."""
+    if (samples > 0).all():
+        log = np.log(samples)
+        return LogNormal(float(np.exp(log.mean())), float(log.std()))
+    return Normal(float(samples.mean()), float(samples.std()))
 
 
 TRUST = 0.9

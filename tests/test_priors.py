@@ -55,7 +55,7 @@ def test_joined_priors_keep_names_and_columns_in_order():
         lambda: Normal(0, 0),
         lambda: Normal(float("nan"), 1),
     ],
-    ids=["no width", "no end", "no decade", "no sd", "no mean"],
+    ids=["no width", "no end", "no decade", "no median", "no sd", "no mean"],
 )
 def test_improper_priors_are_refused(make):
     with pytest.raises(ParameterError, match="allowed"):

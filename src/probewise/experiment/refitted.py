@@ -32,6 +32,7 @@ _KEPT = 45  # fits that carry a Gaussian
 _WORSE = 8.0  # nats behind the best fit, from which on a fit carries none
 _WIDER = 1.4  # factor on the width of these Gaussians
 _IN_GAP = 0.4  # of the gap between two readings: sd of a change point within it
+_JITTER = 1e-9
 _KERNELS = 75
 _FAR = 2.5  # factor on the width of some kernels, so that draws extend beyond what is found
 _LEAST = 10  # possible draws from which on they are weighed
@@ -148,6 +149,7 @@ def refitted(
         Log evidence below which it is not worth sampling: None is returned where no fit can reach it.
     """
     theta, score, precision = fits(kind, problem, donors, noise_sd=noise_sd, rng=rng)
+    score = np.where(np.isfinite(precision).all(axis=(1, 2)), score, -np.inf)
     order = np.argsort(-score)
     order = order[score[order] > score[order[0]] - _WORSE] if math.isfinite(score[order[0]]) else order[:0]
     if not len(order):
@@ -157,7 +159,7 @@ def refitted(
     if laplace.max() < hopeless:
         return None
     best = order[np.argsort(-laplace)][:_KEPT]
-    densities = [LocalKernels.from_moments(theta[best], _WIDER**2 * np.linalg.inv(precision[best]))]
+    densities = [LocalKernels.from_moments(theta[best], _WIDER**2 * _inverse(precision[best]))]
     if own.log_z > hopeless and len(rows := _distinct(own, theta.shape[1], rng)):
         densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
     first = _weighed(own, problem, densities, n_draws // 2, rng)
@@ -167,6 +169,13 @@ def refitted(
     near = LocalKernels.about(first.theta[rows], rng=rng, most=_KERNELS)
     far = LocalKernels.about(first.theta[rows], rng=rng, widened=_FAR, most=_KERNELS)
     return _weighed(first, problem, [near, near, far, *densities], n_draws, rng) or first
+
+
+def _inverse(precision: FloatArray) -> FloatArray:
+    """Invert (n, n_params, n_params), whose parameters may differ by many powers of ten, positive definite."""
+    size = 1.0 / np.sqrt(np.diagonal(precision, axis1=1, axis2=2))
+    both = size[:, :, None] * size[:, None, :]
+    return np.asarray(np.linalg.inv(precision * both + _JITTER * np.eye(precision.shape[1])) * both)
 
 
 def _distinct(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:

@@ -37,7 +37,7 @@ from probewise.recordings.plan import Instrumentation, Plan
 from probewise.sensor import Chain, FixedLevels
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["ON_FIELD", "Rival", "declared_noise", "rivals_of"]
+__all__ = ["OF_MOTION", "ON_FIELD", "Rival", "declared_noise", "rivals_of"]
 
 _DURATION_S = 150.0
 _SCAN_MM = 100.0
@@ -64,7 +64,8 @@ WITH_CARDS = {"sensor_tilt": False, "position_scale": True}
 
 _IN_TIME = frozenset({AmbientStep.name, OffsetDrift.name, GainDrift.name, Lag.name})
 
-_OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
+OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
+"""Effects of the direction from which the arm comes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +118,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
 
 def _ways(effect: NamedEffect[FloatArray]) -> list[Told]:
     """List the ways in which an effect may act in a run: one that changes with time does so at the run's own pace."""
-    if effect.name in _OF_MOTION:
+    if effect.name in OF_MOTION:
         return [Shown(effect), FromRest(Shown(effect))]
     if effect.name not in _IN_TIME:
         return [Shown(effect)]

@@ -21,6 +21,8 @@ from probewise.calibration.sensor_file import require_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
 from probewise.experiment.learning import AdjustedMixture, sensor_prior
+from probewise.experiment.pace import FromRest, Told
+from probewise.experiment.rivals import OF_MOTION
 from probewise.experiment.setting import Experiment
 from probewise.inference import Naive, Rounded
 from probewise.inquiry import Finishing, Grid, Utility
@@ -250,7 +252,8 @@ def levels_of(sensor: FittedSensor) -> FixedLevels:
 def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = False) -> Chain:
     """Return the chain of a fitted sensor over a scene: mean field's mixture, mean levels, effects at their means.
 
-    With `estimated`, the effects remember how well they are known, so that a run can infer them along.
+    With `estimated`, the effects remember how well they are known, so that a run can infer them along; those of the
+    arm's motion spare a run's first reading, since nobody knows whence the arm came.
     """
     means = sensor.mean()
     effects: list[AnyEffect] = []
@@ -261,7 +264,8 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
         values = tuple(means[name] for name in names)
         samples = [sensor.samples[:, sensor.names.index(name)] for name in names]
         if estimated and all(own.std() > 0 for own in samples):
-            effects.append(Estimated(effect, values, tuple(map(_known_to, samples))))
+            acting = FromRest(cast(Told, effect)) if effect.name in OF_MOTION else effect
+            effects.append(Estimated(acting, values, tuple(map(_known_to, samples))))
         else:
             effects.append(Known(effect, values))
     return Chain(sensor.mixture(), levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)

@@ -89,6 +89,11 @@ class SensorAndShape:
         return False
 
     @property
+    def known_nearby(self) -> bool:
+        """False: a prediction costs as much near another one."""
+        return False
+
+    @property
     def exchangeable(self) -> bool:
         """Whether the sensor's Gaussians are exchangeable."""
         return self.sensor.exchangeable

@@ -15,7 +15,20 @@ from probewise.errors import ParameterError
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
 
-__all__ = ["Limit", "Motion", "RowsInRuns", "Term", "integrate", "integrate_states"]
+__all__ = [
+    "Given",
+    "Limit",
+    "Motion",
+    "RowsInRuns",
+    "Term",
+    "gaps_of",
+    "integrate",
+    "integrate_states",
+    "observed",
+    "path",
+    "starts_of",
+    "stepped",
+]
 
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
@@ -169,11 +182,19 @@ def integrate(
         Largest step, in the unit of time.
     """
     states = integrate_states(motion, places, parameters, columns, max_step=max_step)
-    if motion.law.observe is None:
-        return next(iter(states.values()))
+    return observed(motion.law, states, parameters, columns)
+
+
+def observed(
+    law: Law, states: Mapping[str, FloatArray], parameters: Mapping[str, Any], columns: Mapping[str, Any]
+) -> FloatArray:
+    """Return the readings (n_samples, n_points) of states at every row, each of that shape."""
+    first = next(iter(states.values()))
+    if law.observe is None:
+        return first
     with np.errstate(all="ignore"):
-        out = np.asarray(motion.law.observe(states, dict(parameters), dict(columns)), dtype=np.float64)
-    return np.array(np.broadcast_to(out, next(iter(states.values())).shape))
+        out = np.asarray(law.observe(dict(states), dict(parameters), dict(columns)), dtype=np.float64)
+    return np.array(np.broadcast_to(out, first.shape))
 
 
 def integrate_states(
@@ -186,36 +207,71 @@ def integrate_states(
 ) -> dict[str, FloatArray]:
     """Integrate like `integrate`, but return every state at every row, (n_samples, n_points)."""
     motion = Motion(motion) if isinstance(motion, Law) else motion
-    rows = places.rows
-    n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
-    start = {}
-    for state, given in motion.law.states.items():
-        at = _at(parameters[given], rows[:1])[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
-        start[state] = np.array(np.broadcast_to(at, (n_samples, rows.shape[1])))
-    kept = {state: np.empty((n_samples, *rows.shape)) for state in start}
-    steps = places.n_steps(max_step)
-    # A clock that runs fast or slow changes the time column, and with it the time that passes from row to row.
-    gaps = np.diff(_at(columns[str(places.table.time)], rows), axis=1)
-    s = motion.settled({}, dict(start))
-    with np.errstate(all="ignore"):
-        given_there = _Given.of(motion, places, parameters, columns, start)
-        for k in range(len(rows)):
-            for state, values in s.items():
-                kept[state][:, k] = values
-            if k == len(rows) - 1:
-                break
-            n = int(steps[k])
-            between, gap = given_there.between(k), gaps[:, k]
-            for i in range(n):
-                s = _stepped(motion, s, between, gap, i / n, 1 / n)
+    in_gap = places.n_steps(max_step)
+    at_row = np.concatenate([[0], np.cumsum(in_gap)])
+    kept: dict[str, FloatArray] = {}
+    k = 0
+    for number, s in enumerate(path(motion, places, parameters, columns, in_gap)):
+        if number != at_row[k]:
+            continue
+        for state, values in s.items():
+            if k == 0:
+                kept[state] = np.empty((len(values), *places.rows.shape))
+            kept[state][:, k] = values
+        k += 1
     place, run = places.place
     return {state: values[:, place, run] for state, values in kept.items()}
 
 
-def _stepped(
-    motion: Motion, s: dict[str, Any], between: Callable[[Any], Pair], gap: FloatArray, begin: float, length: float
+def path(
+    motion: Motion,
+    places: RowsInRuns,
+    parameters: Mapping[str, FloatArray],
+    columns: Mapping[str, NDArray[Any]],
+    in_gap: IntArray,
+) -> Iterator[dict[str, FloatArray]]:
+    """Yield the states (n_samples, n_runs) at the start and after every step, `in_gap` (n_places - 1,) in each gap."""
+    n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
+    start = starts_of(motion.law, places, parameters, n_samples)
+    gaps = gaps_of(places, columns)
+    s = motion.settled({}, dict(start))
+    with np.errstate(all="ignore"):
+        given_there = Given.of(motion, places, parameters, columns, start)
+        yield s
+        for k, n in enumerate(in_gap.tolist()):
+            between, gap = given_there.between(k), gaps[:, k]
+            for i in range(n):
+                s = stepped(motion, s, between, gap, i / n, 1 / n)
+                yield s
+
+
+def gaps_of(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
+    """Return the time that passes from each position to the next, (1 or n_samples, n_places - 1, n_runs).
+
+    A clock that runs fast or slow changes the time column, and with it this.
+    """
+    return np.asarray(np.diff(_at(columns[str(places.table.time)], places.rows), axis=1))
+
+
+def starts_of(
+    law: Law, places: RowsInRuns, parameters: Mapping[str, FloatArray], n_samples: int
+) -> dict[str, FloatArray]:
+    """Return the states in which runs start, (n_samples, n_runs) each."""
+    start = {}
+    for state, given in law.states.items():
+        first = places.rows[:1]
+        at = _at(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
+        start[state] = np.array(np.broadcast_to(at, (n_samples, first.shape[1])))
+    return start
+
+
+def stepped(
+    motion: Motion, s: dict[str, Any], between: Callable[[Any], Pair], gap: FloatArray, begin: Any, length: Any
 ) -> dict[str, Any]:
-    """Advance by a share `length` of a gap; split the step where friction brings a state to rest."""
+    """Advance by a share `length` of a gap; split the step where friction brings a state to rest.
+
+    `begin` and `length` are numbers, or arrays of as many as there are columns of states.
+    """
     ways = motion.ways(s, *between(begin))
     after = _runge_kutta(motion, s, between, gap, begin, length, ways)
     for state, way in ways.items():
@@ -255,7 +311,7 @@ Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, eq=False)
-class _Given:
+class Given:
     """Parameters and columns at the positions of runs: those held over a gap, and those interpolated linearly.
 
     Arrays are (1 or n_samples, n_places, n_runs).
@@ -274,7 +330,8 @@ class _Given:
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
         start: Mapping[str, FloatArray],
-    ) -> _Given:
+    ) -> Given:
+        """Arrange parameters and columns, (n_points,) or (n_samples, n_points), for a law that begins at `start`."""
         rows, law, time = places.rows, motion.law, places.table.time
         constant: dict[str, Any] = {}
         moving: dict[str, FloatArray] = {}
@@ -298,17 +355,22 @@ class _Given:
         """Return a function of the share of the gap from position k to the next, which gives parameters and columns."""
         moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
         sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
-        held = {name: v[:, k] for name, v in self.held.items()}
-        if not (moving or sloping):
-            throughout = self.constant, held
-            return lambda share: throughout
+        return _between(self.constant, moving, {name: v[:, k] for name, v in self.held.items()}, sloping)
 
-        def at(share: Any) -> Pair:
-            p = {**self.constant, **{name: low + share * rise for name, (low, rise) in moving.items()}}
-            u = {**held, **{name: low + share * rise for name, (low, rise) in sloping.items()}}
-            return p, u
+    def throughout(self, gap: IntArray) -> Callable[[Any], Pair]:
+        """Return `between` for many steps at once, that go on from the positions `gap` (n_steps,); runs are within."""
 
-        return at
+        def flat(values: Any) -> Any:
+            return values.reshape(len(values), -1)
+
+        def rising(values: FloatArray) -> tuple[Any, Any]:
+            return flat(values[:, gap]), flat(np.diff(values, axis=1)[:, gap])
+
+        constant = {name: np.tile(v, (1, len(gap))) if v.shape[1] > 1 else v for name, v in self.constant.items()}
+        moving = {name: rising(v) for name, v in self.moving.items()}
+        sloping = {name: rising(v) for name, v in self.sloping.items()}
+        held = {name: flat(v[:, gap]) for name, v in self.held.items()}
+        return _between(constant, moving, held, sloping)
 
 
 class _Asked(dict[str, Any]):
@@ -343,6 +405,25 @@ class _Asked(dict[str, Any]):
     def items(self) -> Any:
         self.names |= dict.fromkeys(super().keys())
         return super().items()
+
+
+def _between(
+    constant: Mapping[str, Any],
+    moving: Mapping[str, tuple[Any, Any]],
+    held: Mapping[str, Any],
+    sloping: Mapping[str, tuple[Any, Any]],
+) -> Callable[[Any], Pair]:
+    """Return a function of the share of a gap: parameters and columns, of which some rise linearly (low, rise)."""
+    if not (moving or sloping):
+        throughout = constant, held
+        return lambda share: throughout
+
+    def at(share: Any) -> Pair:
+        p = {**constant, **{name: low + share * rise for name, (low, rise) in moving.items()}}
+        u = {**held, **{name: low + share * rise for name, (low, rise) in sloping.items()}}
+        return p, u
+
+    return at
 
 
 def _at(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:

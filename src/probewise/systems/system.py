@@ -11,14 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
+from probewise.systems.all_steps import Trajectories, integrate_near, steps_of
 from probewise.systems.calls import Caller, Tally
 from probewise.systems.mistakes import mistake_in
-from probewise.systems.motion import Motion, RowsInRuns, integrate
+from probewise.systems.motion import Motion, RowsInRuns, integrate, observed
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
@@ -47,6 +48,8 @@ class System:
         Coordinates of an earlier fit, used as the start.
     tally
         Counts samples at which a law raises an error.
+    trajectories
+        Trajectories of a law, from which others are found.
     """
 
     simulator: Simulator
@@ -55,6 +58,7 @@ class System:
     caller: Caller | None = None
     first: FloatArray | None = None
     tally: Tally = field(default_factory=Tally)
+    trajectories: Trajectories = field(default_factory=Trajectories, repr=False)
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable) -> System:
@@ -213,6 +217,11 @@ class System:
         """Whether many samples cost little more than one: for a law, or a `simulate` that broadcasts."""
         return self.caller is None or self.caller.broadcasts
 
+    @property
+    def known_nearby(self) -> bool:
+        """Whether predictions near a point cost little once it was predicted itself: for a law."""
+        return self.caller is None
+
     def admits(self, effect: NamedEffect[Any]) -> bool:
         """Return whether an effect acts at a stage of this system."""
         return effect.stage is not Stage.RATE or self.simulator.law is not None
@@ -308,18 +317,35 @@ class SystemChain:
         plan: RunTable,
     ) -> FloatArray:
         """Integrate the law with its effects; NaN for samples at which it raises an error."""
-        law = self.system.simulator.law
+        system, law = self.system, self.system.simulator.law
         assert law is not None
-        motion = self._applied(Stage.RATE, Motion(law), theta, plan)
-        places = RowsInRuns(plan)
-        self.system.tally.n_steps += int(places.n_steps(self.system.max_step).sum())
+
+        def of_some(samples: IntArray) -> tuple[Motion, dict[str, FloatArray], dict[str, NDArray[Any]]]:
+            def own(values: Any) -> Any:
+                return values[samples] if np.ndim(values) == 2 and len(values) > 1 else values
+
+            return (
+                self._applied(Stage.RATE, Motion(law), theta[samples], plan),
+                {name: own(values) for name, values in parameters.items()},
+                {name: own(values) for name, values in columns.items()},
+            )
+
         try:
-            return integrate(motion, places, parameters, columns, max_step=self.system.max_step)
+            states, cost = integrate_near(
+                of_some,
+                steps_of(plan, system.max_step),
+                system.trajectories,
+                effects=(system.runs, self.effects),
+                theta=theta,
+                n_own=system.n_params,
+            )
+            system.tally.n_steps += cost
+            return observed(law, states, parameters, columns)
         except ProbewiseError:
             raise
         except Exception:
             if len(theta) == 1:
-                self.system.tally.n_failed += 1
+                system.tally.n_failed += 1
                 return np.full((1, len(plan)), np.nan)
 
         def of_one(values: Any, k: int) -> Any:

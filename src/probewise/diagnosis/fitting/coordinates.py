@@ -86,6 +86,11 @@ class CalibratedSensor(ABC):
         return False
 
     @property
+    def known_nearby(self) -> bool:
+        """False: a prediction costs as much near another one."""
+        return False
+
+    @property
     def exchangeable(self) -> bool:
         """Whether its Gaussians are exchangeable."""
         return False

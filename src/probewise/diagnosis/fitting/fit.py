@@ -30,6 +30,7 @@ __all__ = [
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
+_AS_EXPECTED = 0.5  # of the gain to second order, from which a step without damping is taken without trying others
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
@@ -206,6 +207,7 @@ def _walk(
     """Minimise from one start: yields points to predict, (n, n_params), and is sent predictions, (n, n_points)."""
     usable = recording.usable
     readings = recording.readings[usable]
+    nearby = model.sensor.known_nearby
 
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
         whitened = law((readings - predicted).T)
@@ -218,6 +220,8 @@ def _walk(
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
+    if nearby:
+        yield z[None, :]
     predicted, slopes = yield from jacobian(z)
     best = float(objective(predicted[None, :], z[None, :])[0])
     if not (np.isfinite(best) and np.isfinite(slopes).all()):  # no finite starting point
@@ -232,10 +236,14 @@ def _walk(
         tries = _steps(curvature, downhill)
         if not len(tries):
             break
+        expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
         tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
-        # If predictions broadcast, slopes are computed along with them.
-        about = [_points_about(at) for at in tries] if model.sensor.in_bulk else []
-        batch = yield np.concatenate([points for points, _ in about]) if about else tries
+        # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
+        about = [_points_about(at) for at in tries] if model.sensor.in_bulk and not nearby else []
+        batch = yield np.concatenate([points for points, _ in about]) if about else tries[: 1 if nearby else None]
+        if nearby and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:
+            batch = np.concatenate([batch, (yield tries[1:])])
+        tries = tries[: len(batch)] if nearby else tries
         all_predicted = batch.reshape(len(tries), -1, batch.shape[1])[:, :, usable]
         values = objective(all_predicted[:, 0], tries)
         values = np.where(np.isfinite(values), values, np.inf)

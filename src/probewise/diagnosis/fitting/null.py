@@ -81,6 +81,11 @@ class Null(Protocol):
         return False
 
     @property
+    def known_nearby(self) -> bool:
+        """Whether predictions near a point cost little once it was predicted itself; by default False."""
+        return False
+
+    @property
     def starts(self) -> FloatArray:
         """Coordinates to fit from, (n_starts, n_params)."""
         ...

@@ -1,0 +1,379 @@
+"""Integrate a law by solving for all its steps at once, by Newton's method from a trajectory nearby.
+
+A trajectory of a fixed-step method satisfies s[k + 1] = step(s[k]) for every k: a system of equations whose only
+solution is what stepping gives. Its Jacobian is block bidiagonal, so an iteration is one evaluation of all steps
+together and one banded triangular solve. Samples near a known trajectory share its Jacobian (chord iterations), the
+others have their own; those that do not converge are left to be stepped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dtbtrs
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.systems.motion import Given, Motion, RowsInRuns, gaps_of, integrate_states, path, starts_of, stepped
+from probewise.systems.table import RunTable
+
+__all__ = ["Known", "Problem", "Solved", "Steps", "Trajectories", "integrate_near", "solve", "steps_of"]
+
+_CHORDS = 4  # iterations with the Jacobian of a known trajectory
+_NEWTONS = 8  # iterations with a sample's own Jacobian
+_HOPELESS = 4  # of these, after which a sample that still changes by a tenth is left to be stepped
+_SLOW = 0.1  # change of a chord iteration, in that of the one before, from which a sample needs its own Jacobian
+_CONVERGED, _SETTLED = 1e-8, 1e-12  # change of an iteration, in the largest state, and what the next would change
+_NUDGE = 1e-7  # of the largest state, for the Jacobian
+_FAR = 1e-3  # change from a known trajectory, in the largest state, from which another one is remembered
+_MOST_NEW = 8  # trajectories remembered of one batch
+_MOST_KNOWN = 48  # trajectories remembered
+_WORTH_A_STEP = 500  # steps of one sample in one run, evaluated together, at the cost of a step of all of them
+# Samples times runs up to which all steps at once cost less than one after another: near known trajectories, where two
+# evaluations of all steps suffice, and far from them, where a dozen are needed.
+_FEW_NEAR, _FEW_FAR = 300, 40
+
+Problem = Callable[[IntArray], tuple[Motion, Mapping[str, FloatArray], Mapping[str, NDArray[Any]]]]
+"""Function of the numbers of some samples: their law with its effects, their parameters, and the columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The steps of an integration, for all runs together: arrays (n_steps * n_runs,), the runs within a step."""
+
+    places: RowsInRuns
+    max_step: float
+
+    @cached_property
+    def in_gap(self) -> IntArray:
+        """Number of steps from each position of the runs to the next, (n_places - 1,)."""
+        return self.places.n_steps(self.max_step)
+
+    @cached_property
+    def gap(self) -> IntArray:
+        """Position of the runs from which each step goes on, (n_steps,)."""
+        return np.repeat(np.arange(len(self.in_gap)), self.in_gap)
+
+    @cached_property
+    def number(self) -> IntArray:
+        """Number of steps before each position, (n_places,)."""
+        return np.concatenate([[0], np.cumsum(self.in_gap)])
+
+    @property
+    def n_runs(self) -> int:
+        """Number of runs."""
+        return int(self.places.rows.shape[1])
+
+    @cached_property
+    def begin(self) -> FloatArray:
+        """Share of that time at which each step begins."""
+        share = (np.arange(len(self.gap)) - self.number[self.gap]) / self.in_gap[self.gap]
+        return np.repeat(share, self.n_runs)
+
+    @cached_property
+    def length(self) -> FloatArray:
+        """Share of that time that each step takes."""
+        return np.repeat(1.0 / self.in_gap[self.gap], self.n_runs)
+
+    def at_rows(self, states: FloatArray) -> FloatArray:
+        """Select states (n_states, n_samples, n_steps + 1, n_runs) at every row: (n_states, n_samples, n_points)."""
+        place, run = self.places.place
+        return np.asarray(states[:, :, self.number[place], run])
+
+
+@lru_cache(maxsize=16)
+def steps_of(table: RunTable, max_step: float) -> Steps:
+    """Return the steps of an integration over a table."""
+    return Steps(RowsInRuns(table), max_step)
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """A trajectory: its parameters, states (n_states, n_steps + 1, n_runs), and its Jacobian once it was needed."""
+
+    theta: FloatArray
+    states: FloatArray
+    bands: list[FloatArray] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Trajectories:
+    """Memory of trajectories, by steps and by effects; `useless` for a law that cannot take all steps at once."""
+
+    known: dict[tuple[Hashable, Hashable], list[Known]] = field(default_factory=dict)
+    useless: bool = False
+
+    def near(self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int) -> tuple[list[Known], IntArray]:
+        """Return known trajectories of the same steps, and for each sample, theta (n_samples, n_params), the nearest.
+
+        Those of other effects are compared by the first `n_own` parameters, if there is none of the same.
+        """
+        own, width = self.known.get((steps, effects), []), theta.shape[1]
+        if not own:
+            own = [each for (other, _), known in self.known.items() if other == steps for each in known]
+            width = n_own
+        if not own:
+            return [], np.zeros(0, dtype=np.int64)
+        there = np.stack([each.theta[:width] for each in own])
+        apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
+        return own, np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
+
+    def keep(self, steps: Hashable, effects: Hashable, more: Sequence[Known]) -> None:
+        """Remember more trajectories, and forget the oldest."""
+        if not more:
+            return
+        own = self.known.pop((steps, effects), [])  # those used last come last
+        self.known[steps, effects] = [*own, *more]
+        excess = sum(map(len, self.known.values())) - _MOST_KNOWN
+        while excess > 0:
+            key = next(iter(self.known))
+            dropped = min(excess, len(self.known[key]))
+            self.known[key] = self.known[key][dropped:]
+            excess -= dropped
+            if not self.known[key]:
+                del self.known[key]
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """States (n_states, n_samples, n_steps + 1, n_runs), which samples converged, and what was learnt by the way.
+
+    `bands` are Jacobians of some samples by their number; `moved` (n_samples,) is the change from the trajectory that a
+    sample began from, in the largest state; `n_evaluated` is the number of steps evaluated, of all samples and runs.
+    """
+
+    states: FloatArray
+    done: BoolArray
+    bands: Mapping[int, FloatArray]
+    moved: FloatArray
+    n_evaluated: int
+
+    def known(self, theta: FloatArray) -> list[Known]:
+        """Return the trajectories that are worth remembering."""
+        worth = np.flatnonzero(self.done & (self.moved > _FAR))[:_MOST_NEW]
+        return [
+            Known(theta[k].copy(), self.states[:, k].copy(), [self.bands[k]] if k in self.bands else [])
+            for k in worth.tolist()
+        ]
+
+
+def integrate_near(
+    problem: Problem, steps: Steps, memory: Trajectories, *, effects: Hashable, theta: FloatArray, n_own: int
+) -> tuple[dict[str, FloatArray], int]:
+    """Integrate samples theta (n_samples, n_params): all steps at once if few, near known trajectories if there are.
+
+    Parameters
+    ----------
+    problem, steps
+        The law of some samples, and the steps.
+    memory
+        Trajectories integrated before; more are added.
+    effects
+        What distinguishes the law with its effects from the same law with others.
+    theta, n_own
+        Parameters, of which the first `n_own` are the system's.
+
+    Returns
+    -------
+    Every state at every row, (n_samples, n_points), and the number of steps that it cost, of however many samples.
+    """
+    n_samples, n_steps = len(theta), len(steps.gap)
+    if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
+        motion, parameters, columns = problem(np.arange(n_samples))
+        return integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step), n_steps
+    states, left, cost = None, np.arange(n_samples), 0
+    known, nearest = memory.near(steps, effects, theta, n_own)
+    if known:
+        try:
+            with np.errstate(all="ignore"):
+                solved = solve(problem, steps, known, nearest)
+            states, left = solved.states, np.flatnonzero(~solved.done)
+            cost = -(-solved.n_evaluated // _WORTH_A_STEP)
+            memory.keep(steps, effects, solved.known(theta))
+        except Exception:  # rates that take no more columns than there are runs
+            memory.useless = True
+    if left.size:
+        motion, parameters, columns = problem(left)
+        every = path(motion, steps.places, parameters, columns, steps.in_gap)
+        there = np.stack([[*s.values()] for s in every], axis=2)
+        if states is None:
+            states = there
+        else:
+            states[:, left] = there
+        cost += n_steps
+        finite = np.isfinite(there).all(axis=(0, 2, 3))
+        memory.keep(
+            steps, effects, [Known(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()]
+        )
+    assert states is not None
+    return dict(zip(problem(np.arange(1))[0].law.states, steps.at_rows(states), strict=True)), cost
+
+
+def solve(problem: Problem, steps: Steps, known: Sequence[Known], nearest: IntArray) -> Solved:
+    """Solve for the states at the end of every step, each sample from the known trajectory nearest to it.
+
+    Parameters
+    ----------
+    problem
+        The law of some samples.
+    steps
+        The steps.
+    known, nearest
+        Trajectories, and for each sample the number of the one to begin from, (n_samples,).
+    """
+    guess = np.stack([each.states for each in known], axis=1)[:, nearest]
+    search = _Search(problem, steps, guess.copy())
+    _share_jacobians(search, known, nearest)
+    # A chord that led away is no better a start than the trajectory that it began from.
+    astray = search.active & ~(search.rate < 1)
+    search.states[:, astray, 1:] = guess[:, astray, 1:]
+    search.change[~search.done] = np.inf
+    bands = _own_jacobians(search)
+    moved = _largest(search.states - guess, guess)
+    return Solved(search.states, search.done, bands, moved, search.n_evaluated)
+
+
+def _share_jacobians(search: _Search, known: Sequence[Known], nearest: IntArray) -> None:
+    """Take chord iterations, each with the Jacobian of the known trajectory nearest to a sample."""
+    for _ in range(_CHORDS):
+        active = search.active & ((search.rate < _SLOW) | ~np.isfinite(search.change))
+        samples = np.flatnonzero(active)
+        if not samples.size:
+            return
+        missed = search.missed(samples)
+        correction = np.empty_like(missed)
+        for number in np.unique(nearest[samples]).tolist():
+            own = nearest[samples] == number
+            if not known[number].bands:
+                at = known[number].states[:, None]
+                known[number].bands.append(search.bands(samples[own][:1], at)[0])
+            correction[:, own] = _corrected(known[number].bands[0], missed[:, own], shared=True)
+        search.correct(samples, correction)
+        far = ~(search.change < _FAR)
+        if samples.size == len(nearest) and far.sum() * search.steps.n_runs > _FEW_FAR:
+            search.possible &= ~far
+
+
+def _own_jacobians(search: _Search) -> dict[int, FloatArray]:
+    """Take Newton iterations of the samples that have not converged; return the last Jacobian of each."""
+    last: dict[int, FloatArray] = {}
+    for k in range(_NEWTONS):
+        if k == _HOPELESS:
+            search.possible &= search.change < _SLOW
+        samples = np.flatnonzero(search.active)
+        if not samples.size:
+            break
+        bands = search.bands(samples, search.states[:, samples])
+        correction = _corrected(np.concatenate(bands), search.missed(samples), shared=False)
+        last |= dict(zip(samples.tolist(), bands, strict=True))
+        search.correct(samples, correction)
+    return last
+
+
+@dataclass(eq=False)
+class _Search:
+    """The states of all samples on the way to their trajectories, and how far each has come."""
+
+    problem: Problem
+    steps: Steps
+    states: FloatArray
+    n_evaluated: int = 0
+    _end: Callable[[FloatArray], FloatArray] = lambda begins: begins
+
+    def __post_init__(self) -> None:
+        n_samples = self.states.shape[1]
+        self.change, self.rate = np.full(n_samples, np.inf), np.zeros(n_samples)
+        self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
+        self._chosen = np.zeros(0, dtype=np.int64)
+        motion, parameters, _ = self.problem(np.arange(n_samples))
+        start = motion.settled({}, starts_of(motion.law, self.steps.places, parameters, n_samples))
+        self.states[:, :, 0] = np.stack(list(start.values()))
+
+    @property
+    def active(self) -> BoolArray:
+        """Samples that have not converged and may yet."""
+        return self.possible & ~self.done
+
+    def ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
+        """Return the states at the end of every step, from those at its begin: (n_states, n, n_steps, n_runs)."""
+        if not np.array_equal(samples, self._chosen):
+            self._chosen, self._end = samples, _every_step(self.problem, self.steps, samples)
+        self.n_evaluated += states[0, :, 1:].size
+        return self._end(states[:, :, :-1])
+
+    def missed(self, samples: IntArray) -> FloatArray:
+        """Return by how much the next state misses the end of each step, (n_states, n, n_steps, n_runs)."""
+        states = self.states[:, samples]
+        return self.ends(samples, states) - states[:, :, 1:]
+
+    def bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
+        """Return the Jacobian of each of some samples about states (n_states, n, n_steps + 1, n_runs), by `_bands`."""
+        at_end, columns = self.ends(samples, states), []
+        for values in states:
+            nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
+            before = values.copy()
+            values += nudge
+            columns.append((self.ends(samples, states) - at_end) / nudge)
+            values[:] = before
+        return _bands(np.stack(columns, axis=1))
+
+    def correct(self, samples: IntArray, correction: FloatArray) -> None:
+        """Add a correction (n_states, n, n_steps, n_runs) to some samples' states, and see who has converged."""
+        change = _largest(correction, self.states[:, samples])
+        self.states[:, samples, 1:] += correction
+        with np.errstate(all="ignore"):
+            rate = np.where(np.isfinite(self.change[samples]), change / self.change[samples], 0.0)
+        first = ~np.isfinite(self.change[samples])
+        self.possible[samples] = np.isfinite(change)
+        self.done[samples] = (change < _CONVERGED) & (np.where(first, 1.0, rate) * change < _SETTLED)
+        self.change[samples], self.rate[samples] = change, rate
+
+
+def _every_step(problem: Problem, steps: Steps, samples: IntArray) -> Callable[[FloatArray], FloatArray]:
+    """Return a function of the states at the begin of every step that gives those at its end."""
+    motion, parameters, columns = problem(samples)
+    n_states = len(motion.law.states)
+    first = {state: np.zeros((len(samples), steps.n_runs)) for state in motion.law.states}
+    between = Given.of(motion, steps.places, parameters, columns, first).throughout(steps.gap)
+    passing = gaps_of(steps.places, columns)[:, steps.gap]
+    width = passing.reshape(len(passing), -1)
+
+    def ends(begins: FloatArray) -> FloatArray:
+        shape = begins.shape
+        s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
+        after = stepped(motion, s, between, width, steps.begin, steps.length)
+        return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
+
+    return ends
+
+
+def _largest(change: FloatArray, states: FloatArray) -> FloatArray:
+    """Return the largest change (n_states, n_samples, ...), in the largest state of its kind, (n_samples,)."""
+    size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
+    return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
+
+
+def _bands(slopes: FloatArray) -> list[FloatArray]:
+    """Return the system of all steps, for each sample the bands below its diagonal of ones, (n_unknowns, 2 n_states).
+
+    `slopes` (n_states, n_states, n_samples, n_steps, n_runs) are those of a step's end by its begin. Unknowns are
+    ordered by run, then by step, then by state.
+    """
+    n_states, _, n_samples, n_steps, n_runs = slopes.shape
+    out = np.zeros((n_samples, n_runs, n_steps, n_states, 2 * n_states))
+    for i in range(n_states):
+        for j in range(n_states):
+            out[:, :, :-1, j, n_states + i - j] = -slopes[i, j, :, 1:].transpose(0, 2, 1)
+    return list(out.reshape(n_samples, -1, 2 * n_states))
+
+
+def _corrected(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
+    """Solve for corrections (n_states, n_samples, n_steps, n_runs); samples share one Jacobian or each has its own."""
+    n_states, n_samples, n_steps, n_runs = missed.shape
+    right = missed.transpose(1, 3, 2, 0).reshape((n_samples, -1) if shared else (1, -1))
+    solved, _ = dtbtrs(bands.T, right.T, uplo="L", diag="U")
+    return np.asarray(solved.T.reshape(n_samples, n_runs, n_steps, n_states).transpose(3, 0, 2, 1))

@@ -27,6 +27,7 @@ from probewise.diagnosis.repair.ensemble import Drawn, draw_models
 from probewise.diagnosis.repair.located import locate
 from probewise.diagnosis.repair.repair import repair_of
 from probewise.diagnosis.residuals.locate import Place
+from probewise.diagnosis.search.proposed import with_proposals
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
@@ -42,7 +43,6 @@ from probewise.recordings.plan import Recording
 
 __all__ = ["Thorough", "diagnose", "diagnose_prepared"]
 
-_PROPOSED_FROM = 0.1  # probability of an unknown effect from which formulas are proposed for it
 
 Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]]
 """Function that recomputes the evidence of a search; returns it with better probabilities, and both evidences."""
@@ -113,9 +113,8 @@ def diagnose_prepared(
 ) -> Diagnosis:
     """Run the pipeline of `diagnose` for any apparatus; see there for returns and raises."""
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
-    if searched.posterior.by_mean.get(("unknown",), 0.0) > _PROPOSED_FROM:
-        searched = _with_proposals(searched, progress=progress)
-        prepared = searched.prepared
+    searched = with_proposals(searched, progress=progress)
+    prepared = searched.prepared
     if prepared.too_little:
         searched = searched.by_prior_alone()
     elif thorough is not None:
@@ -150,16 +149,6 @@ def diagnose_prepared(
         report=VerdictReport(reason, found, noise, weighings, remainder, formula),
         apparatus=prepared.apparatus,
     )
-
-
-def _with_proposals(searched: Searched, *, progress: Progress) -> Searched:
-    """Search again with proposed formulas; return the search unchanged if there are none, or no budget."""
-    prepared = searched.prepared
-    proposals = {} if prepared.apparatus.refits_are_over() else prepared.apparatus.proposals()
-    if not proposals:
-        return searched
-    again = search(replace(prepared, effects={**prepared.effects, **proposals}), progress=progress)
-    return searched if prepared.apparatus.refits_are_over() else again
 
 
 def _grounds(

@@ -27,7 +27,7 @@ from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, relative_sd_of
 
-__all__ = ["SystemPrediction", "as_recording", "predict_system", "write_system_prediction"]
+__all__ = ["SystemPrediction", "as_recording", "of_another_run", "predict_system", "write_system_prediction"]
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
@@ -258,12 +258,12 @@ def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
             effect = next(own for own in fitted.effects if own_of_runs(own) and name.startswith(f"{own}."))
             known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
             positive = effect == NoisePerRun.name  # positive parameters scatter in the logarithm
-            drawn = _of_another_run(np.log(known) if positive else known, rng=rng)
+            drawn = of_another_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
     return out, any(name not in at for name in chain.names)
 
 
-def _of_another_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+def of_another_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
     """Draw the value of a new run given those of other runs: (n_samples, n_runs) -> (n_samples,).
 
     Mean and variance of the runs are unknown; the prior of the variance is worth two more runs with the same scatter.

@@ -11,8 +11,12 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, ModelSamples
+from probewise.diagnosis.system.apparatus import PersonsSystem
 from probewise.errors import NotConvergedError
 from probewise.systems import RunTable
+from probewise.systems.forms import About
+from probewise.systems.forms.again import forms_again, own_of_runs, recorded
+from probewise.systems.prediction import of_another_run
 from probewise.systems.system import SystemChain
 from probewise.world.systems import SystemCase, right_predictions
 
@@ -39,13 +43,16 @@ def log_densities_of_runs(
     readings = later.covariates[case.drawn.kind.reading]
     sd = case.drawn.kind.sd
     rows = np.flatnonzero(case.drawn.rows.run >= case.drawn.rows.n_runs - 2)
+    about = cast(PersonsSystem, diagnosis.apparatus).about
     scores = {
-        "null": _log_density(*predicted_runs(diagnosis.null, later, rng=drawing[0]), readings),
+        "null": _log_density(*predicted_runs(diagnosis.null, about, later, rng=drawing[0]), readings),
         "true": _log_density(case.noise_free[None, rows], np.array([sd]), readings),
     }
     same = diagnosis.repaired is diagnosis.null
     scores["repaired"] = (
-        scores["null"] if same else _log_density(*predicted_runs(diagnosis.repaired, later, rng=drawing[1]), readings)
+        scores["null"]
+        if same
+        else _log_density(*predicted_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings)
     )
     if case.effects:
         try:
@@ -62,21 +69,41 @@ def log_densities_of_runs(
 
 
 def predicted_runs(
-    samples: ModelSamples, table: RunTable, *, rng: np.random.Generator
+    samples: ModelSamples, about: About, table: RunTable, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Predict new runs: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
 
-    Parameters per run are drawn from their prior.
+    Parameters per run are drawn from their prior, and an effect's values per run as `predict_system` draws them.
+
+    Parameters
+    ----------
+    samples
+        The model.
+    about
+        The fit about which its effects were bound.
+    table
+        The new runs.
+    rng
+        Random generator, for the choice of samples and for what a new run has of its own.
     """
     chain = cast(SystemChain, samples.chain)
-    wider = replace(chain, system=chain.system.with_runs(table))
-    of_run = {name: prior for name, prior in wider.system.marginals.items() if name not in chain.names}
+    system = chain.system.with_runs(table)
+    own = [effect.name for effect in chain.effects if own_of_runs(effect.name)]
+    longer = forms_again(own, system.simulator, recorded(about), more_runs=table.scan_names)
+    effects = tuple(longer.get(effect.name, effect) for effect in chain.effects)
+    wider = replace(chain, system=system, effects=effects)
+    of_run = [name for name in wider.names if name not in chain.names]
     n = _N_OF_A_RUN if of_run else _N_SAMPLES
     chosen = rng.permutation(np.arange(n) % len(samples.theta))
     known = dict(zip(chain.names, samples.theta[chosen].T, strict=True))
-    # Stratified: one from each of n parts of equal prior mass.
-    spread = {name: prior.from_unit((rng.permutation(n) + rng.random(n)) / n) for name, prior in of_run.items()}
-    theta = np.stack([(known | spread)[name] for name in wider.names], axis=1)
+    drawn = {}
+    for name in of_run:
+        if name in system.marginals:  # stratified: one from each of n parts of equal prior mass
+            drawn[name] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
+        else:
+            effect = next(own_name for own_name in own if name.startswith(f"{own_name}."))
+            drawn[name] = of_another_run(samples.columns(effect)[chosen], rng=rng)
+    theta = np.stack([(known | drawn)[name] for name in wider.names], axis=1)
     with np.errstate(all="ignore"):
         predicted = np.concatenate([wider.predict(part, table) for part in np.array_split(theta, max(n // 500, 1))])
     return predicted, samples.noise_sd[chosen]

@@ -141,4 +141,4 @@ def _left_open(ensemble: Ensemble, searched: Searched, test: GlobalTest, noise: 
     if fit.names and ruins(Best.of(searched, test, fit, noise, rng=ensemble.rng).improvement):
         return ensemble.of(test.null)
     shares = {names: by_mean.get(names, 0.0) for names in ensemble.likely(fit) if names}
-    return ensemble.averaged(fit, {**shares, (): 1 - sum(shares.values())})
+    return ensemble.averaged(fit, {**shares, (): max(1 - sum(shares.values()), 0.0)})

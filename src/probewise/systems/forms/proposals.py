@@ -15,16 +15,20 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailed
-from probewise.priors import Uniform
+from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Act, Form, Moments, with_unit
+from probewise.systems.forms.modulations import wave_numbers
 from probewise.systems.motion import Motion
 from probewise.systems.table import RunTable
 
 __all__ = ["proposals"]
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
+_MOST_SQUARE_WAVES = 160  # periods of a square wave that are tried
+_ROWS_OF_A_SQUARE_WAVE = 6  # least rows per period: with fewer it is not told from a sinusoid
+_SOFT = 0.5  # steepness of its edges to begin with: at 1 it is nearly a sinusoid
 _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter one is kept
 
 
@@ -65,6 +69,8 @@ def proposals(about: About) -> Iterator[Form]:
     yield from _of_reading(about)
     for name in _columns(about):
         yield from _switch(about, name)
+    if about.table.has_time:
+        yield from _square_wave(about)
     for state in about.states:
         yield from _of_rate(about, state)
 
@@ -154,6 +160,47 @@ def _switch(about: About, name: str) -> Iterator[Form]:
             f"{with_unit(mean[1], sd[1], '')}: a proposal, not a known effect"
         ),
         moments=Moments(tuple(at), by_row=False, gated=True, column=name),
+        expression=f"a {text}",
+    )
+
+
+def _square_wave(about: About) -> Iterator[Form]:
+    """Shift the reading during a share of every period: a wave with flat tops and edges of unknown steepness."""
+    own, table = about.system.simulator, about.table
+    waves = wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_SQUARE_WAVE)
+
+    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+        a, hz, phase, share, edge = (theta[:, k : k + 1] for k in range(5))
+        inside = np.cos(2 * np.pi * (hz * rows.time_s + phase)) - np.cos(np.pi * share)
+        return np.asarray(value + 0.5 * a * (1 + np.tanh(inside / edge)))
+
+    phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
+    grid = np.meshgrid(about.sd, waves, phases, shares, _SOFT, indexing="ij")
+    entries = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
+    typical = about.typical(Stage.OFFSET, act, entries, about.sd)
+    if typical is None:
+        return
+    entries[:, :, 0] = typical
+    text = f"while |({table.time} / period + phase) mod 1| < share / 2"
+    yield Form(
+        f"formula:reading:{own.reading}:{text}",
+        Stage.OFFSET,
+        {
+            "a": HeavyTailed(typical),
+            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+            "phase": Uniform(-1.0, 1.0),
+            "share": Uniform(0.03, 0.97),
+            "edge": LogUniform(0.03, 1.0),
+        },
+        (own.unit, f"1/{about.time_unit}", "1", "1", "1"),
+        ("time",),
+        act,
+        entries,
+        (0,),
+        lambda mean, sd: (
+            f"{own.reading} shifts by {with_unit(mean[0], sd[0], own.unit)} during {with_unit(mean[3], sd[3], '')} of "
+            f"every {1 / mean[1]:.4g} {about.time_unit}: a proposal, not a known effect"
+        ),
         expression=f"a {text}",
     )
 

@@ -1,0 +1,71 @@
+"""Propose formulas for what has no name, where something unknown is likely or several names may stand in for one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.evidence.screening import log_mean, score_effects
+from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.search.search import search
+from probewise.diagnosis.search.searched import Searched
+from probewise.effects import NamedEffect
+from probewise.progress import Progress, silent
+
+__all__ = ["with_proposals"]
+
+_UNKNOWN_FROM = 0.1  # probability of an unknown effect from which formulas are proposed for it
+_SEVERAL_FROM = 0.3  # the same, of two effects or more
+_MOST = 8  # formulas that are refitted
+_WITHIN = 12.0  # nats behind the best of what was refitted, within which screening must see a formula
+
+
+def with_proposals(searched: Searched, *, progress: Progress = silent) -> Searched:
+    """Search again with the formulas that screening favours; return the search unchanged if there are none.
+
+    Formulas of two names explain what one formula does, a product as a step beside a sensitivity, a square wave as two
+    sinusoids, and predict other runs badly.
+    """
+    prepared = searched.prepared
+    if not _may_explain(searched) or prepared.apparatus.refits_are_over():
+        return searched
+    proposals = prepared.apparatus.proposals()
+    if not proposals:
+        return searched
+    progress("weighing formulas")
+    every = {**prepared.effects, **proposals}
+    prior = prepared.apparatus.prior_odds(every)
+    score = _scores(searched, proposals)
+    odds = {name: value + prior.log_mean((name,)) - prior.log_mean(()) for name, value in score.items()}
+    best = max(fit.log_z + searched.prior.log_mean(names) for (_, names), fit in searched.evidences.fits.items())
+    ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
+    kept = {name: proposals[name] for name in ranked if odds[name] > best - _WITHIN}
+    if not kept:
+        return searched
+    again = search(replace(prepared, effects={**prepared.effects, **kept}), prior=prior, progress=progress)
+    return searched if prepared.apparatus.refits_are_over() else again
+
+
+def _may_explain(searched: Searched) -> bool:
+    by_mean = searched.posterior.by_mean
+    several = sum(p for names, p in by_mean.items() if len(names) > 1)
+    return by_mean.get(("unknown",), 0.0) > _UNKNOWN_FROM or several > _SEVERAL_FROM
+
+
+def _scores(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
+    """Return the largest log evidence of each formula with its prior, beside the null or the best single name."""
+    usable, null = searched.prepared.usable, searched.null
+    singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]
+    parents = [null, *sorted(singles, key=lambda fit: -fit.log_z)[:1]]
+    memory, out = TemplateMemory(usable), dict[str, float]()
+    bank: Bank = memory.bank(null.found, list(proposals.values()))
+    for parent in parents:
+        for _, evidence in parent.steering():
+            scores = score_effects(Linearised.of(parent.found, evidence.law), bank)
+            for name, own in scores.items():
+                value = evidence.log_z + searched.prior.log_mean(parent.names) + log_mean(own)
+                out[name] = max(value, out.get(name, value))
+    return out

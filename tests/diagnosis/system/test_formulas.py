@@ -1,0 +1,60 @@
+"""Formulas for what has no name: proposed where two names would stand in for one."""
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.system.diagnose import diagnose_system
+from probewise.systems import RunTable, Simulator
+
+SD = 0.05
+
+
+def _diagnosed(change, *, seed):
+    """Diagnose three runs of a straight line with a change that it leaves out."""
+    rng = np.random.default_rng(seed)
+    run = np.repeat([1.0, 2.0, 3.0], 60)
+    time = np.concatenate([np.sort(rng.uniform(0, 100, 60)) + 100 * k for k in range(3)])
+    force = 10 * rng.random(180)
+    room = 20 + np.cumsum(rng.normal(size=180)) * 0.4
+    damp = 50 + np.cumsum(rng.normal(size=180))
+    columns = {"t_s": time, "run": run, "force": force, "room": room, "damp": damp}
+    y = 2.0 + 0.5 * force + change(columns) + SD * rng.normal(size=180)
+    table = RunTable({**columns, "y": y}, time="t_s", run="run")
+    simulator = Simulator(
+        "y", "V", {"zero": (-10, 10), "slope": (0, 2)}, simulate=lambda p, u: p["zero"] + p["slope"] * u["force"],
+        time="t_s", run="run",
+    )  # fmt: skip
+    return diagnose_system(simulator, table, rng=np.random.default_rng(0))
+
+
+@pytest.mark.slow
+def test_a_square_wave_is_no_pair_of_sinusoids():
+    """A share of .35 of every 23 s, of lambda about 30."""
+    found = _diagnosed(lambda u: 0.23 * ((u["t_s"] / 23.0) % 1 < 0.35), seed=1)
+    assert found.verdict == "unknown"
+    (wave,) = [e for e in found.repaired.chain.effects if e.name.startswith("formula:")]
+    assert wave.expression.startswith("a while")
+    values = dict(zip(wave.prior.names, found.repaired.columns(wave.name).mean(axis=0), strict=True))
+    assert 1 / values["hz"] == pytest.approx(23.0, rel=0.01)
+    assert values["a"] == pytest.approx(0.23, abs=0.05)
+
+
+@pytest.mark.slow
+def test_two_sinusoids_are_named_as_two():
+    found = _diagnosed(
+        lambda u: 0.15 * np.sin(2 * np.pi * u["t_s"] / 23.0) + 0.15 * np.sin(2 * np.pi * u["t_s"] / 9.3), seed=2
+    )
+    assert found.verdict == "named"
+    assert sorted(found.combination) == ["interference", "interference~again"]
+
+
+@pytest.mark.slow
+def test_a_product_of_columns_is_no_pair_of_names():
+    def change(u):
+        return 0.015 * (u["damp"] - u["damp"].mean()) * (u["room"] - u["room"].mean())
+
+    found = _diagnosed(change, seed=3)
+    assert found.verdict == "unknown"
+    (product,) = [e for e in found.repaired.chain.effects if e.name.startswith("formula:")]
+    assert "damp" in product.expression
+    assert "room" in product.expression

@@ -101,6 +101,11 @@ class NoiseLaw:
         )
 
     @property
+    def remembers(self) -> bool:
+        """Return whether successive readings have some of their noise in common."""
+        return bool(self.walk.size or np.any(self.carry))
+
+    @property
     def information(self) -> float:
         """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
         return float(self.tail.information)

@@ -135,12 +135,20 @@ class Refits:
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # With several modes of the null, the best one may change with the effect.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        return self.weighed(model, np.stack(starts), seen[0][0].law)
+        laws = [seen[0][0].law]
+        if laws[0].remembers:  # a slow effect is nothing to a walk: its amplitude would stay at 0
+            laws += [about.law for about, _ in seen[1:]]
+        fitted = [self.weighed(model, np.stack(starts), law) for law in laws]
+        return max(fitted, key=lambda candidate: self.noises.over_all(_log_z_by_noise(candidate)))
 
     def _plainly(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
         """Linearise a fit under the simplest noise distribution too, if it is a different one."""
         plain = parent.evidence[self.noises.certain].law
         return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
+
+
+def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:
+    return {noise: evidence.log_z for noise, evidence in candidate.evidence.items()}
 
 
 def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:

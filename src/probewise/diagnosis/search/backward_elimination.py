@@ -7,6 +7,7 @@ from probewise.diagnosis.search.constants import ELIMINATED, STEERING, SWAPPED
 from probewise.diagnosis.search.forward_selection import promising, proposals_for
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
+from probewise.effects import AGAIN
 
 __all__ = ["eliminate_backward"]
 
@@ -20,7 +21,8 @@ def eliminate_backward(state: SearchState) -> None:
     several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.odds(c))
     named = [c for c in several if not out_of_vocabulary(c.names)]
     rest = [c for c in several if out_of_vocabulary(c.names)]
-    dropped = [(c.names, left_out) for c in [*named[:ELIMINATED], *rest[:1]] for left_out in c.names]
+    # Of an effect that is there twice either may go; what stays is the first of its name.
+    dropped = [(c.names, n) for c in [*named[:ELIMINATED], *rest[:1]] for n in c.names if n + AGAIN not in c.names]
     for k, (names, left_out) in enumerate(dropped):
         state.progress("leaving effects out in turn", k, len(dropped))
         others = tuple(name for name in names if name != left_out)

@@ -23,6 +23,7 @@ from probewise.recordings.plan import Recording
 from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.calls import Tally
 from probewise.systems.forms import About
+from probewise.systems.forms.readings import since_start_of_run
 
 __all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
 
@@ -30,6 +31,7 @@ _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the st
 _MOST_COMPARED = 2400
 _STEPS_TRIED = 8  # of the fit of the simulator, from each start
 _BEST_STARTS = 3  # of which it goes on
+_BEGINNINGS = 0.25, 0.5  # shares of the longest run that are fitted before all of it
 
 
 def diagnose_system(
@@ -225,9 +227,30 @@ def _from_best_start(system: System, recording: Recording, law: NoiseLaw) -> Fit
     """Take a few steps from every start, then continue from the best."""
     model = Model(system, (), recording.plan)
     tried = sorted(fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_height)[:_BEST_STARTS]
-    if all(found.settled for found in tried):
+    longer = _lengthened(model, recording)
+    if not longer and all(found.settled for found in tried):
         return tried[0]
-    return min(fits(model, recording, [found.z for found in tried], law), key=_height)
+    return min(fits(model, recording, [*(found.z for found in tried), *longer], law), key=_height)
+
+
+def _lengthened(model: Model, recording: Recording) -> list[FloatArray]:
+    """Fit the beginning of every run, then more of it: coordinates (n_params,) of the lowest fits.
+
+    A system that swings has a valley for every period that a run may be wrong by; over its first quarter it has few.
+    """
+    system, table = cast(System, model.sensor), cast(RunTable, recording.plan)
+    if not (system.in_bulk and table.has_time):
+        return []
+    since = since_start_of_run(table)
+    starts = list(system.starts)
+    for share in _BEGINNINGS:
+        begun = since <= share * since.max()
+        part = recording.with_readings(np.where(begun, recording.readings, np.nan))
+        if part.usable.sum() < system.least_readings:
+            return []
+        found = sorted(fits(model, part, starts, white_of(part), max_steps=_STEPS_TRIED), key=_height)
+        starts = [each.z for each in found[:_BEST_STARTS]]
+    return starts
 
 
 def _height(found: Fit) -> float:

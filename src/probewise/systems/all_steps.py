@@ -32,7 +32,7 @@ _NUDGE = 1e-7  # of the largest state, for the Jacobian
 _FAR = 1e-3  # change from a known trajectory, in the largest state, from which another one is remembered
 _MOST_NEW = 8  # trajectories remembered of one batch
 _MOST_KNOWN = 48  # trajectories remembered
-_WORTH_A_STEP = 150  # steps of one sample in one run, evaluated together, at the cost of a step of all of them
+_WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at the cost of a step of all of them
 # Samples times runs up to which all steps at once cost less than one after another: near known trajectories, where two
 # evaluations of all steps suffice, and far from them, where a dozen are needed.
 _FEW_NEAR, _FEW_FAR = 300, 40

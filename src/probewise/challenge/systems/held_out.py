@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, ModelSamples
-from probewise.diagnosis.system.apparatus import PersonsSystem
+from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.errors import NotConvergedError
 from probewise.systems import RunTable
 from probewise.systems.forms import About
@@ -43,7 +43,7 @@ def log_densities_of_runs(
     readings = later.covariates[case.drawn.kind.reading]
     sd = case.drawn.kind.sd
     rows = np.flatnonzero(case.drawn.rows.run >= case.drawn.rows.n_runs - 2)
-    about = cast(PersonsSystem, diagnosis.apparatus).about
+    about = cast(SimulatorApparatus, diagnosis.apparatus).about
     scores = {
         "null": _log_density(*predicted_runs(diagnosis.null, about, later, rng=drawing[0]), readings),
         "true": _log_density(case.noise_free[None, rows], np.array([sd]), readings),

@@ -20,7 +20,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.search.constants import VARIANTS_TRIED
+from probewise.diagnosis.search.constants import STEERING, VARIANTS_TRIED
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
@@ -135,10 +135,13 @@ class Refits:
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # With several modes of the null, the best one may change with the effect.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        laws = [seen[0][0].law]
-        if laws[0].remembers:  # a slow effect is nothing to a walk: its amplitude would stay at 0
-            laws += [about.law for about, _ in seen[1:]]
-        fitted = [self.weighed(model, np.stack(starts), law) for law in laws]
+        fitted = [self.weighed(model, np.stack(starts), seen[0][0].law)]
+        if seen[0][0].law.remembers:  # to a walk a slow effect is noise: its amplitude would stay at 0
+            plain = self.noises.certain
+            for about, scores in seen[1:]:
+                promised = parent.evidence[plain].log_z + log_mean(scores)
+                if fitted[0].evidence[plain].log_z < promised - STEERING:
+                    fitted.append(self.weighed(model, np.stack(starts), about.law))
         return max(fitted, key=lambda candidate: self.noises.over_all(_log_z_by_noise(candidate)))
 
     def _plainly(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:

@@ -260,7 +260,7 @@ def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
     assert found.improvement.heldout_log_density_per_reading > 0
     assert (found.where[0].covariate, found.where[0].scan) == ("scan", "edge_90_out")
     assert found.repair.by_rows
-    assert "sensor.json does not carry it" in found.summary()
+    assert "sensor.json does not contain it" in found.summary()
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ def test_the_page_says_what_is_missing_and_what_to_do(saturated):
     assert screen.count("<img") == 1
     for heading in ("Where it shows", "Before and after", "held-out", "Noise", "could have shown"):
         assert heading in rest
-    assert "not detectable" in rest
+    assert "invisible" in rest
 
 
 @pytest.mark.slow

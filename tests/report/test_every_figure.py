@@ -34,7 +34,7 @@ class Bell:
 
 @pytest.fixture(scope="module")
 def result():
-    return run(Bell(), rng=np.random.default_rng(0), n_live=25)
+    return run(Bell(), rng=np.random.default_rng(0), n_live=100)
 
 
 @pytest.fixture(scope="module")

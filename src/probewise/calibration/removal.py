@@ -15,7 +15,6 @@ from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
-from scipy.optimize import brentq
 from scipy.special import expit
 
 from probewise._arrays import FloatArray, IntArray
@@ -264,6 +263,8 @@ def bridged(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
 
     def uneven(log_ratio: float) -> float:
         return float(expit(added - log_ratio).mean() - expit(log_ratio - each).mean())
+
+    from scipy.optimize import brentq  # slow to import, and only a quick calibration needs it
 
     added = np.where(added > -np.inf, added, -1e300)
     low, high = min(added[added > -1e300].min(initial=each.min()), each.min()) - 1.0, max(added.max(), each.max()) + 1.0

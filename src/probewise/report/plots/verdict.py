@@ -62,13 +62,14 @@ def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | N
     ax
         Axes to draw on; a new figure without.
     """
-    ax = axes_or_new(ax, size_in=(6.6, 1.3 + 0.5 * len(beliefs)))
     highest: dict[str, float] = {}
     for believed in beliefs.values():
         for name, p in believed.items():
             highest[name] = max(p, highest.get(name, 0.0))
     likely = [name for name in sorted(highest, key=lambda name: -highest[name]) if highest[name] >= _VISIBLE]
     shown = likely[:_SHOWN]
+    # Long names take a row of the legend each, above the bars.
+    ax = axes_or_new(ax, size_in=(6.6, 1.1 + 0.5 * len(beliefs) + 0.2 * (len(shown) + 1)))
     at = -np.arange(len(beliefs), dtype=np.float64)
     left = np.zeros(len(beliefs))
     for name, colour in zip(shown, CYCLE, strict=False):

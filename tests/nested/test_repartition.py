@@ -140,13 +140,43 @@ def test_its_prior_is_a_density_over_parameters():
     assert (near.log_prob(np.array([[-0.1], [1.1]])) == -np.inf).all()
 
 
-def test_coordinates_and_cube_lead_to_the_same_points():
+def _samples_of_two(n, rng):
+    """Samples of `_two`: three of four are on the right."""
+    return rng.normal(0.0, 0.1, (n, 2)) + np.stack([np.where(rng.random(n) < 0.75, 2.0, -2.0), np.zeros(n)], axis=1)
+
+
+@pytest.mark.parametrize("clustered", [False, True])
+def test_coordinates_and_cube_lead_to_the_same_points(clustered):
     problem, rng = Problem(WIDE, _two), np.random.default_rng(8)
-    near = nested.repartitioned(problem, nested.run(problem, rng=rng, n_live=100).samples(2000, rng=rng)).prior
+    near = nested.repartitioned(problem, _samples_of_two(2000, rng), clustered=clustered).prior
     u = rng.random((50, 2))
     theta = near.from_unit_cube(u)
-    np.testing.assert_allclose(near.to_unit_cube(theta), u, atol=1e-9)
+    np.testing.assert_allclose(near.from_unit_cube(near.to_unit_cube(theta)), theta, atol=1e-9)
     np.testing.assert_allclose(near.leave(near.enter(theta))[0], theta, atol=1e-9)
+    if not clustered:
+        np.testing.assert_allclose(near.to_unit_cube(theta), u, atol=1e-9)
+
+
+def test_a_cluster_of_the_posterior_has_a_part_of_the_prior():
+    problem, rng = Problem(WIDE, _two), np.random.default_rng(12)
+    near = nested.repartitioned(problem, _samples_of_two(2000, rng), clustered=True).prior
+    drawn = near.leave(near.draw(4000, rng=rng))[0]
+    by_cube = near.from_unit_cube(rng.random((4000, 2)))
+    for theta in (drawn, by_cube):
+        # Student t with five degrees of freedom and the scale 0.14: 1.3 % lie beyond a distance of 0.5 in one of two.
+        distance = np.minimum(*(np.hypot(theta[:, 0] - x, theta[:, 1]) for x in (2.0, -2.0)))
+        assert (distance < 0.7).mean() > 0.95
+        # The share of 2,000 samples scatters by 0.01, that of 4,000 draws by 0.007: six sds.
+        assert (theta[:, 0] > 0).mean() == pytest.approx(0.75, abs=0.072)
+    # The density that the parts claim is that of their draws: its mean reciprocal over a region is the region's area.
+    inside = (np.abs(by_cube[:, 0] - 2.0) < 0.2) & (np.abs(by_cube[:, 1]) < 0.2)
+    area = np.where(inside, np.exp(-near.log_prob(by_cube)), 0.0)
+    assert area.mean() == pytest.approx(0.16, abs=6 * area.std() / math.sqrt(4000))
+
+
+def test_few_samples_make_one_part():
+    problem, rng = Problem(WIDE, _two), np.random.default_rng(13)
+    assert len(nested.repartitioned(problem, _samples_of_two(70, rng), clustered=True).prior.parts) == 1
 
 
 def test_what_is_no_prior_is_refused():

@@ -37,6 +37,8 @@ _APART = 2.0
 _N_SAMPLES = 2000
 # The repartitioned run is used only if it needs less than this share of the first run's nats.
 _GAIN = 0.8
+_FEW_NATS = 3.0  # of a second pass from the clusters of the posterior, below which they are used
+_ALIKE = 1.0  # errors within which two runs agree, against a second pass that lies below both
 _SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
 
@@ -135,18 +137,22 @@ def checked(
                 f"({int(budget)} evaluations in all); use a greater limit, or max_cost=1 for no check"
             )
             return _with_peak(replace(first, n_calls=spent, warnings=(*first.warnings, note)), above)
+        name = route.name
         sharper = replace(route, n_live=max(route.n_live, now.n_live))
         if _suspicious(now, estimates, _APART) and (found := estimated(sharper)) is not None:
             estimates = [found] if estimates[0].warnings else [*estimates, found]
+        n_check = sum(each.n_calls for each in estimates) + above.n_calls
         if _suspicious(now, estimates, DISAGREE):
             again = estimated(_Route(problem, now.n_live, _longer(move), "the run again"))
-            if again is not None and not again.warnings and not _suspicious(again, estimates, DISAGREE):
-                now = again
+            if again is not None and not again.warnings:
+                if not _suspicious(again, estimates, DISAGREE):
+                    now = again
+                elif _overlooks(estimates, now, again):
+                    now, estimates, name = again, [now], "the same run with shorter chains"
     except _FailedError as error:
         note = f"the second pass, which checks the evidence, failed: {error}"
         return _with_peak(replace(now, n_calls=spent, warnings=(*now.warnings, note)), above)
-    n_check = sum(each.n_calls for each in estimates) + above.n_calls
-    return _with_peak(_with_check(now, route.name, estimates, n_check, spent), above)
+    return _with_peak(_with_check(now, name, estimates, n_check, spent), above)
 
 
 def _above(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Beyond:
@@ -180,10 +186,7 @@ def _second_route(
 ) -> _Route:
     near = _near(first, problem, rng)
     if near is not None:
-        theta = first.theta[first.log_weight > -math.inf]
-        weight = np.exp(first.log_weight[first.log_weight > -math.inf])
-        log_likelihood = first.log_likelihood[first.log_weight > -math.inf]
-        nats = float(weight @ (log_likelihood + near.prior.made_up(theta))) - first.log_z
+        nats = _nats(first, near)
         # With a log Z that is far too large the nats come out too few, or negative.
         if first.information > 0 and nats < _GAIN * first.information:
             wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
@@ -198,12 +201,23 @@ def _near(first: NestedResult, problem: Samplable, rng: np.random.Generator) -> 
     """Repartition the problem about the posterior found; None where the prior or the samples do not allow it."""
     if not hasattr(problem.prior, "log_prob"):
         return None
+    theta = first.samples(_N_SAMPLES, rng=rng)
     try:
-        near = repartitioned(problem, first.samples(_N_SAMPLES, rng=rng))
-        whole = bool(np.isfinite(near.prior.root).all() and np.isfinite(near.prior.inverse_root).all())
+        clustered, single = (repartitioned(problem, theta, clustered=each) for each in (True, False))
+        # Clusters describe a posterior that they cover; where nats are left to climb, they mislead the live points.
+        for near in (clustered, single):
+            if near.prior.invertible and (near is single or _nats(first, near) < _FEW_NATS):
+                return near
     except (ParameterError, np.linalg.LinAlgError):
-        return None
-    return near if whole else None
+        pass
+    return None
+
+
+def _nats(first: NestedResult, near: Repartitioned) -> float:
+    """Return the information of a second pass, nats: the mean of its log likelihood over the posterior, less log Z."""
+    possible = first.log_weight > -math.inf
+    made_up = near.prior.made_up(first.theta[possible])
+    return float(first.weight[possible] @ (first.log_likelihood[possible] + made_up)) - first.log_z
 
 
 def _longer(move: Move) -> SliceMove:
@@ -237,6 +251,16 @@ def _distance(run: NestedResult, estimates: list[NestedResult]) -> float:
 
 def _suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -> bool:
     return abs(_distance(run, estimates)) > most or bool(estimates[-1].warnings)
+
+
+def _overlooks(estimates: list[NestedResult], first: NestedResult, longer: NestedResult) -> bool:
+    """Whether a second pass lies below two runs that agree although one has chains twice as long.
+
+    A second pass can overlook a part of the posterior where its prior is thin, and is then low; chains that are too
+    short bias two runs differently.
+    """
+    below = min(_distance(run, estimates) for run in (first, longer))
+    return below > _APART and abs(_distance(first, [longer])) < _ALIKE and not first.warnings
 
 
 def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_check: int, spent: int) -> NestedResult:

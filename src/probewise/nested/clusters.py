@@ -77,18 +77,21 @@ class Clusters:
         return Clusters(mean, factor, np.linalg.inv(factor), log_det, self.size[home] - 1)
 
 
-def find_clusters(points: FloatArray) -> Clusters:
+def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
     """Split points, (n, n_params), recursively while two Gaussians explain them better than one.
+
+    No cluster has fewer points than `least`, by default enough for its covariance.
 
     The gain in log likelihood must exceed the number of additional parameters (Akaike's criterion),
     plus 10 nats against chance, plus 0.15 nats per point: halving a uniform box gains only noise, while two
     equal modes 5 sd apart gain a quarter of a nat per point. A false split costs little: the moves are exact
     however space is divided.
     """
+    least = _least(points.shape[1]) if least is None else least
     queue, done = [points], list[FloatArray]()
     while queue:
         group = queue.pop()
-        halves = _split(group) if len(queue) + len(done) + 2 <= _MOST_CLUSTERS else None
+        halves = _split(group, least) if len(queue) + len(done) + 2 <= _MOST_CLUSTERS else None
         if halves is None:
             done.append(group)
         else:
@@ -97,19 +100,20 @@ def find_clusters(points: FloatArray) -> Clusters:
     if len(done) > 1:
         # Recompute the clusters from the division of space that will be used.
         home = clusters.assign(points)
-        if np.bincount(home, minlength=len(done)).min() >= _least(points.shape[1]):
+        if np.bincount(home, minlength=len(done)).min() >= least:
             clusters = Clusters.of([points[home == k] for k in range(len(done))])
     return clusters
 
 
-def _split(points: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+def _split(points: FloatArray, least: int) -> tuple[FloatArray, FloatArray] | None:
     n, n_params = points.shape
-    least = _least(n_params)
     if n < 2 * least:
         return None
     z = (points - points.mean(axis=0)) / np.maximum(points.std(axis=0), 1e-300)
     values, vectors = np.linalg.eigh(z.T @ z / n)
-    axes = np.concatenate([z, z @ vectors / np.sqrt(np.maximum(values, 1e-300))], axis=1)
+    # An axis without extent would overflow in the fourth power.
+    flattest = max(1e-12 * float(values[-1]), 1e-300)
+    axes = np.concatenate([z, z @ vectors / np.sqrt(np.maximum(values, flattest))], axis=1)
     # Two equal modes make the kurtosis small, a small mode beside a large one makes it large.
     fourth = (axes**4).mean(axis=0)
     whole = n * _log_det(points)

@@ -11,14 +11,16 @@ is not searched for again.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from scipy.special import gammaln, stdtr, stdtrit
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.errors import ParameterError, ShapeError
+from probewise.nested.clusters import find_clusters
 from probewise.nested.evaluate import Samplable
 from probewise.nested.space import Space, unbounded
 from probewise.priors import Prior
@@ -27,50 +29,110 @@ __all__ = ["Repartitioned", "principal_root", "repartitioned"]
 
 _DEGREES_OF_FREEDOM = 5.0
 _FLATTEST = 1e-12  # least variance along an axis, relative to the greatest
+_SAMPLES_IN_CLUSTER = 20  # samples per parameter in each cluster: with fewer, repeated samples look like a cluster
 _LEAST_SAMPLES = 2  # distinct samples per parameter, to determine the axes
 
 
 @dataclass(frozen=True, eq=False)
-class _Near:
-    """A prior near the posterior: a product of Student t along the principal axes of posterior samples.
+class _Parts:
+    """A mixture of products of Student t in unbounded coordinates x, one part per cluster of samples.
 
-    With e the coordinates along the axes, the unbounded coordinates are x = `center` (n_params,) +
-    `root` (n_params, n_params) e.
+    Part k has the probability `share` (n_parts,); in it x = `center` (n_parts, n_params) + `root` (n_parts, n_params,
+    n_params) e, where the coordinates e along its principal axes are independent Student t.
     """
 
-    plain: Prior
-    space: Space
+    share: FloatArray
     center: FloatArray
     root: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", frozen(self.center))
-        object.__setattr__(self, "root", frozen(self.root))
+        for name in ("share", "center", "root"):
+            object.__setattr__(self, name, frozen(getattr(self, name)))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.plain.names
+    def __len__(self) -> int:
+        return len(self.share)
 
     @cached_property
     def inverse_root(self) -> FloatArray:
         return np.asarray(np.linalg.inv(self.root))
 
     @cached_property
-    def log_volume(self) -> float:
-        return float(np.linalg.slogdet(self.root)[1])
+    def log_volume(self) -> FloatArray:
+        return np.asarray(np.linalg.slogdet(self.root)[1])
+
+    def along(self, x: FloatArray, part: int) -> FloatArray:
+        """Return the coordinates along the axes of a part, (n, n_params) -> (n, n_params)."""
+        return np.asarray((x - self.center[part]) @ self.inverse_root[part].T)
+
+    def log_densities(self, x: FloatArray) -> FloatArray:
+        """Return each part's log density times its share, (n, n_params) -> (n_parts, n)."""
+        own = [_log_student(self.along(x, part)) for part in range(len(self))]
+        return np.asarray(np.stack(own) + (np.log(self.share) - self.log_volume)[:, None])
+
+    def log_density(self, x: FloatArray) -> FloatArray:
+        """Return the log density of the mixture, (n, n_params) -> (n,)."""
+        return np.asarray(np.logaddexp.reduce(self.log_densities(x), axis=0))
+
+    def placed(self, e: FloatArray, part: IntArray) -> FloatArray:
+        """Return x of coordinates along the axes of a part each, (n, n_params) and (n,) -> (n, n_params)."""
+        return np.asarray(self.center[part] + np.einsum("nij,nj->ni", self.root[part], e))
+
+    @staticmethod
+    def of(groups: Sequence[FloatArray], widening: float) -> _Parts:
+        """Compute mean and principal axes of groups of points, each (n, n_params)."""
+        n = np.array([len(group) for group in groups])
+        root = np.stack([principal_root(group, widening) for group in groups])
+        return _Parts(n / n.sum(), np.stack([group.mean(axis=0) for group in groups]), root)
+
+
+@dataclass(frozen=True, eq=False)
+class _Near:
+    """A prior near the posterior: the mixture `parts`.
+
+    Chains move in coordinates along the principal axes of `whole`, the one part that all samples give.
+    """
+
+    plain: Prior
+    space: Space
+    whole: _Parts
+    parts: _Parts
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.plain.names
+
+    @property
+    def invertible(self) -> bool:
+        """Whether the axes have finite inverses: they have none where samples hardly vary."""
+        matrices = (m for each in (self.whole, self.parts) for m in (each.root, each.inverse_root))
+        return all(bool(np.isfinite(matrix).all()) for matrix in matrices)
 
     @property
     def coordinates(self) -> _Near:
         return self
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        return rng.standard_t(_DEGREES_OF_FREEDOM, (n, len(self.names)))
+        part = rng.choice(len(self.parts), size=n, p=self.parts.share)
+        e = rng.standard_t(_DEGREES_OF_FREEDOM, (n, len(self.names)))
+        return self.whole.along(self.parts.placed(e, part), 0)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        return self.leave(np.asarray(stdtrit(_DEGREES_OF_FREEDOM, u), dtype=np.float64))[0]
+        # The first number also chooses the part: its place within the part's share is again uniform.
+        ladder = np.cumsum(self.parts.share)
+        part = np.minimum(np.searchsorted(ladder, u[:, 0], side="right"), len(ladder) - 1)
+        within = u.copy()
+        within[:, 0] = (u[:, 0] - (ladder - self.parts.share)[part]) / self.parts.share[part]
+        e = np.asarray(stdtrit(_DEGREES_OF_FREEDOM, np.clip(within, 0.0, 1.0)), dtype=np.float64)
+        return self.space.leave(self.parts.placed(e, part))[0]
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        return np.asarray(stdtr(_DEGREES_OF_FREEDOM, self.enter(theta)))
+        """Return the place in the cube that leads to theta by way of the part that is densest there."""
+        x = self.space.enter(theta)
+        part = np.argmax(self.parts.log_densities(x), axis=0)
+        e = np.stack([self.parts.along(x, k) for k in range(len(self.parts))])[part, np.arange(len(x))]
+        u = np.asarray(stdtr(_DEGREES_OF_FREEDOM, e))
+        u[:, 0] = (np.cumsum(self.parts.share) - self.parts.share)[part] + self.parts.share[part] * u[:, 0]
+        return u
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         log_plain = self.plain.log_prob(theta)
@@ -83,18 +145,16 @@ class _Near:
     def made_up(self, theta: FloatArray) -> FloatArray:
         """Log of the original prior's density over this one's, (n,): the same ratio in theta and in x."""
         x = self.space.enter(theta)
-        own = _log_student(self._along(x)) - self.log_volume
-        return np.asarray(self.space.leave(x)[1] - own)
+        return np.asarray(self.space.leave(x)[1] - self.parts.log_density(x))
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        return self._along(self.space.enter(theta))
+        return self.whole.along(self.space.enter(theta), 0)
 
-    def _along(self, x: FloatArray) -> FloatArray:
-        return np.asarray((x - self.center) @ self.inverse_root.T)
-
-    def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        theta, log_plain = self.space.leave(self.center + x @ self.root.T)
-        return theta, np.where(np.isfinite(log_plain), _log_student(x), -np.inf)
+    def leave(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+        x = self.whole.center[0] + e @ self.whole.root[0].T
+        theta, log_plain = self.space.leave(x)
+        log_density = self.parts.log_density(x) + self.whole.log_volume[0]
+        return theta, np.where(np.isfinite(log_plain), log_density, -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +171,9 @@ class Repartitioned:
         return np.asarray(self.problem.log_likelihood(theta) + made_up)
 
 
-def repartitioned(problem: Samplable, theta: FloatArray, *, widening: float = 1.4) -> Repartitioned:
+def repartitioned(
+    problem: Samplable, theta: FloatArray, *, widening: float = 1.4, clustered: bool = False
+) -> Repartitioned:
     """Repartition a problem: a prior near its posterior, for a second run that is shorter and more precise.
 
     Parameters
@@ -123,6 +185,9 @@ def repartitioned(problem: Samplable, theta: FloatArray, *, widening: float = 1.
     widening
         Scale of the new prior in sds of the samples, 1 or more; along each axis it is a Student t with five degrees of
         freedom.
+    clustered
+        Whether the new prior is a mixture with a part for each cluster of the samples, instead of one part for all. It
+        lies nearer to a curved posterior, or to one of several modes. A cluster has at least 20 samples per parameter.
 
     Returns
     -------
@@ -147,7 +212,19 @@ def repartitioned(problem: Samplable, theta: FloatArray, *, widening: float = 1.
         raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
     space = unbounded(problem.prior)
     x = space.enter(theta)
-    return Repartitioned(problem, _Near(problem.prior, space, x.mean(axis=0), principal_root(x, widening)))
+    whole = _Parts.of([x], widening)
+    parts = _Parts.of(_groups(x), widening) if clustered else whole
+    return Repartitioned(problem, _Near(problem.prior, space, whole, parts))
+
+
+def _groups(x: FloatArray) -> list[FloatArray]:
+    """Divide samples (n, n_params) into clusters, each with enough samples for its axes."""
+    least = _SAMPLES_IN_CLUSTER * x.shape[1]
+    clusters = find_clusters(x, least=least)
+    home = clusters.assign(x)
+    groups = [x[home == k] for k in range(len(clusters))]
+    # The last division of space may leave a cluster with fewer.
+    return groups if min(map(len, groups)) >= least else [x]
 
 
 def principal_root(x: FloatArray, scale: float = 1.0) -> FloatArray:

@@ -114,6 +114,26 @@ def test_a_wrong_evidence_is_cured_by_longer_chains() -> None:
     assert result.n_calls <= 5 * sound.n_calls
 
 
+@pytest.mark.parametrize(("longer_by", "cured"), [(0.2, True), (5.0, False), (-2.0, False)])
+def test_two_runs_that_agree_outvote_a_second_pass_that_lies_below_both(longer_by: float, cured: bool) -> None:
+    """Stand-ins, `longer_by` errors above the first run: passes near the posterior overlook a part of it."""
+    known = problems.problem("Gaussian 4-D")
+    sound = quiet(known, max_cost=1.0)
+
+    def answer(problem: object, **options: object) -> NestedResult:
+        shift = longer_by if problem is known else -8.0
+        return dataclasses.replace(sound, log_z=sound.log_z + shift * sound.log_z_error)
+
+    rng = np.random.default_rng(6)
+    result = checked(sound, known, SliceMove(), answer, max_cost=5.0, max_calls=None, least_live=10, rng=rng)
+    assert result.check is not None
+    assert bool(result.warnings) is not cured
+    if cured:
+        assert result.log_z == pytest.approx(sound.log_z + 0.2 * sound.log_z_error)
+        assert result.check.route == "the same run with shorter chains"
+        assert result.check.log_z == sound.log_z
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("max_cost", [2.0, 5.0])
 def test_many_scales_with_chains_too_short_are_never_wrong_without_a_word(max_cost: float) -> None:

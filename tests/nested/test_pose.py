@@ -144,7 +144,7 @@ def test_chains_step_over_the_end_of_a_circle_and_stay_even() -> None:
         (one_point, SQUARE, {"names": ["y", "x"]}, "those of the prior"),
         (one_point, {"x": stats.norm}, {}, "a frozen distribution"),
         (one_point, {"x": stats.poisson(3)}, {}, r"prior\['x'\] is .*continuous"),
-        (one_point, {"x": (0, 1)}, {}, r"prior\['x'\] is \(0, 1\)"),
+        (one_point, {"x": (0, 1, 2)}, {}, r"prior\['x'\] is \(0, 1, 2\)"),
         (one_point, SQUARE, {"periodic": ["z"]}, "periodic is .*names among"),
     ],
 )
@@ -163,3 +163,10 @@ def test_a_problem_in_one_takes_no_prior_besides() -> None:
 def test_a_function_of_many_points_that_was_not_said_to_be_one_is_told_how() -> None:
     with pytest.raises(NotConvergedError, match="vectorized=True"):
         quiet(lambda x: np.zeros(5), SQUARE)
+
+
+def test_a_pair_of_numbers_is_a_uniform_prior() -> None:
+    posed = pose(lambda x: 0.0, {"x": (0, 2), "y": [-1.0, 1.0]})
+    assert posed.prior == Product({"x": Uniform(0.0, 2.0), "y": Uniform(-1.0, 1.0)})
+    with pytest.raises(ParameterError, match="low < high"):
+        pose(lambda x: 0.0, {"x": (2, 0)})

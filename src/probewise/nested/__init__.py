@@ -6,6 +6,7 @@ the stopping rule on consecutive values of log Z).
 """
 
 from probewise.nested.diversify import DiversifyTally, diversify
+from probewise.nested.dynamic import Goal, intensified
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.genealogy import chain_memory
 from probewise.nested.importance import Weighted, pareto_k, refine, update
@@ -37,6 +38,7 @@ __all__ = [
     "DiversifyTally",
     "Evaluator",
     "EvidenceChange",
+    "Goal",
     "KernelMove",
     "Move",
     "NestedResult",
@@ -58,6 +60,7 @@ __all__ = [
     "chain_memory",
     "diversify",
     "diversify_by_kernels",
+    "intensified",
     "least_live",
     "merge",
     "pareto_k",

@@ -13,14 +13,13 @@ from scipy.special import chdtrc
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import DISAGREE, weighted_mean
-from probewise.nested.evidence import integrate
+from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
 from probewise.nested.result import Agreement, Check, NestedResult, versions
 
-__all__ = ["agreement_of", "alive_at_death", "merge"]
+__all__ = ["agreement_of", "alive_at_death", "combined_p_value", "merge"]
 
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
-_DOUBTFUL_P_VALUE = 1e-4
 
 
 def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
@@ -68,7 +67,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
     agreement = agreement_of(parts)
     check = _joined_checks(parts, evidence.log_z, evidence.error(remembered))
-    p_value = _combined([r.insertion_p_value for r in parts])
+    p_value = combined_p_value([r.insertion_p_value for r in parts])
     doubts, error = [], evidence.error(remembered)
     if agreement.p_value < _DISAGREE:
         doubts.append(
@@ -77,7 +76,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
             "the error is widened to their scatter; use more n_live or longer chains"
         )
         error = max(error, agreement.scatter)
-    if p_value < _DOUBTFUL_P_VALUE:
+    if p_value < DOUBTFUL_P_VALUE:
         doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
     if check is not None and abs(check.distance) > DISAGREE:
         doubts.append(
@@ -227,7 +226,7 @@ def _possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
     return math.log(share), math.sqrt(max(1.0 - share, 0.0) / found)
 
 
-def _combined(p_values: Sequence[float]) -> float:
+def combined_p_value(p_values: Sequence[float]) -> float:
     """Combine independent p values (Fisher)."""
     statistic = -2.0 * float(np.log(np.maximum(p_values, 1e-300)).sum())
     return float(chdtrc(2 * len(p_values), statistic))

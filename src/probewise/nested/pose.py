@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, TypeAlias, cast
 
 import numpy as np
@@ -12,15 +13,15 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_callable
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Samplable
-from probewise.priors import Marginal, Prior, Product
+from probewise.priors import Marginal, Prior, Product, Uniform
 
 __all__ = ["AnyPrior", "Posed", "as_problem", "pose"]
 
 AnyPrior: TypeAlias = "Prior | Mapping[str, Any] | Sequence[Any] | Callable[[FloatArray], Any]"
 
 _ALLOWED_PRIOR = (
-    "a prior such as Product({'x': Uniform(0.0, 1.0)}), a dict or list of distributions (probewise.priors or frozen "
-    "scipy.stats ones), or a function from the unit cube to parameters together with names=[...]"
+    "a prior such as Product({'x': Uniform(0.0, 1.0)}), a dict or list of distributions (probewise.priors, pairs (low, "
+    "high) or frozen scipy.stats ones), or a function from the unit cube to parameters together with names=[...]"
 )
 
 
@@ -124,7 +125,7 @@ def pose(
     prior
         A prior with names (`probewise.priors`); a dict of distributions by name; a list of distributions; or a function
         that maps a point of the unit cube to parameters, both (n_params,). Distributions are those of
-        `probewise.priors` or frozen continuous ones of scipy.stats.
+        `probewise.priors`, pairs (low, high) for uniform ones, or frozen continuous ones of scipy.stats.
     names
         Names of the parameters, in order: required if the prior is a function; for a list p0, p1, ... by default.
     vectorized
@@ -185,6 +186,8 @@ def _named(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Pr
 
 
 def _marginal(name: str, one: Any) -> Marginal:
+    if isinstance(one, tuple | list) and len(one) == 2 and all(isinstance(end, Real) for end in one):
+        return Uniform(float(one[0]), float(one[1]))
     if all(hasattr(one, method) for method in ("from_unit", "to_unit", "log_prob")):
         return one  # type: ignore[no-any-return]
     quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
@@ -193,7 +196,10 @@ def _marginal(name: str, one: Any) -> Marginal:
             raise ParameterError(name, one, "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)")
         return _Scipy(one)
     raise ParameterError(
-        name, one, "Uniform(low, high), LogUniform(low, high), Normal(mean, sd), or a frozen continuous scipy.stats one"
+        name,
+        one,
+        "Uniform(low, high) or a pair (low, high), LogUniform(low, high), Normal(mean, sd), or a frozen continuous "
+        "scipy.stats one",
     )
 
 

@@ -26,21 +26,20 @@ from probewise._kinds import (
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.checkpoint import Dead, Keeper, Live, Origin, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
-from probewise.nested.evidence import birth_rows, insertion_p_value, integrate, log_volumes
+from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import NestedResult, few_possible, versions
 from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
-__all__ = ["LIVE_PER_PARAM", "Dead", "Live", "least_live", "search", "step"]
+__all__ = ["LIVE_PER_PARAM", "PRIOR_VOLUME", "Dead", "Live", "least_live", "plain_state", "search", "step"]
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
 
-# Draw from the whole prior while a point costs fewer evaluations than a chain would.
-_PRIOR_VOLUME = 0.05
-# p value of the insertion ranks below which the result is doubtful: one false alarm in 10 000 runs.
-_DOUBTFUL_P_VALUE = 1e-4
+PRIOR_VOLUME = 0.05
+"""Share of the prior above which points are drawn from the whole prior: they cost fewer evaluations than chains."""
+
 _FEW_EFFECTIVE = 30.0
 _STUCK_SHARE = 0.02
 # Lineage variance above which the run descends from too few lineages to estimate its own error.
@@ -124,7 +123,7 @@ def search(
     n_params = len(evaluate.names)
     n_live, n_replaced = _require_counts(n_live, n_replaced, max_calls, n_params)
     rule = RemainingEvidence() if stop is None else stop
-    seed_state = json.dumps(_plain(rng.bit_generator.state))
+    seed_state = json.dumps(plain_state(rng.bit_generator.state))
     if n_params == 0:
         return _without_parameters(evaluate, n_live, seed_state)
     moving: Move = SliceMove() if move is None else move
@@ -238,7 +237,7 @@ def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Genera
     """Replace points once and add the dead ones to the evidence; returns new values and changes none."""
     live, moving = now.live, now.moving
     whole = math.exp(live.log_volume)
-    chains = whole <= _PRIOR_VOLUME
+    chains = whole <= PRIOR_VOLUME
     fresh, gone, tally = step(
         live, moving if chains else PriorRejection(whole), evaluate, n_replaced=n_replaced, rng=rng
     )
@@ -342,7 +341,7 @@ def _result(
     rank = np.concatenate([empty, *(d.rank for d in dead)])
     n_ranked = np.concatenate([empty, *(d.n_ranked for d in dead)])
     p_value = insertion_p_value(rank, n_ranked, rng=rng)
-    if p_value < _DOUBTFUL_P_VALUE:
+    if p_value < DOUBTFUL_P_VALUE:
         notes = (
             *notes,
             f"insertion ranks are not uniform (p = {p_value:.1g}): chains are too short or a mode was lost; "
@@ -422,8 +421,8 @@ def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> Ne
     )
 
 
-def _plain(value: object) -> object:
+def plain_state(value: object) -> object:
     """Convert a generator's state to JSON types."""
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain_state(item) for key, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -1,0 +1,268 @@
+"""Dynamic allocation: add live points to a run where its posterior or its evidence needs them.
+
+A run spends as many points on shells that hold nothing as on those that hold the posterior. Live points may instead be
+added between any two levels of a run: a *thread* of new points starts at the lower level and ends at the upper one, and
+together they form a run with more points alive between the two (Higson, Handley, Hobson & Lasenby 2019, Stat. Comput.
+29, 891). Posterior samples come from the shells that hold the posterior's mass; the error of log Z comes from all
+shells from the start to those.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import replace
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from probewise._arrays import IntArray
+from probewise._kinds import require_rng, require_whole
+from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
+from probewise.nested.checkpoint import Live, Origin
+from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
+from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integrate
+from probewise.nested.merging import alive_at_death, combined_p_value
+from probewise.nested.moves import Move, PriorRejection, SliceMove
+from probewise.nested.result import NestedResult, versions
+from probewise.nested.sampler import PRIOR_VOLUME, least_live, plain_state, step
+
+__all__ = ["Goal", "intensified"]
+
+Goal: TypeAlias = Literal["posterior", "evidence"]
+
+_BULK = 0.95  # central share of the posterior's mass, in order of death, that a thread for the posterior spans
+_SHARE = 0.3  # of the greatest importance for the evidence; a thread for the evidence spans the levels above it
+_SAME = 1e-6  # relative difference of a log likelihood computed again
+
+
+def intensified(
+    result: NestedResult,
+    problem: Samplable,
+    *,
+    n_live: int,
+    goal: Goal = "posterior",
+    move: Move | None = None,
+    max_calls: int | None = None,
+    rng: np.random.Generator,
+) -> NestedResult:
+    """Add `n_live` live points to a run, between the levels where they count most for a goal.
+
+    Call it again to add more: after each call the levels are chosen anew.
+
+    Parameters
+    ----------
+    result
+        A complete run of `run`, or the result of this function.
+    problem
+        Its problem: prior and likelihood.
+    n_live
+        Number of live points to add.
+    goal
+        "posterior": between the levels that hold the central 95 % of the posterior's mass, for more posterior samples;
+        "evidence": from the start to where little of the evidence is left, for a smaller error of log Z.
+    move
+        How new points are drawn; default `SliceMove()`.
+    max_calls
+        Limit of likelihood evaluations for the new points. The new points end at the limit, and the result is valid.
+    rng
+        Source of randomness, independent of the run's.
+
+    Returns
+    -------
+    NestedResult
+        The run with the new points. Its `n_live` is still the run's; `n_at_death` says how many points were alive at
+        each level. `memory` and `check` are the run's, `warnings` too, with one more if the new points' insertion
+        ranks are not uniform.
+
+    Raises
+    ------
+    ParameterError
+        If the run is incomplete or of another problem, or an option is out of range.
+    ShapeError
+        If the problem has other parameters.
+    NotConvergedError
+        If the likelihood fails.
+    """
+    require_rng(rng)
+    least = least_live(len(result.names))
+    if require_whole("n_live", n_live, least=None) < least:
+        raise ParameterError("n_live", n_live, f"{least} or more for {len(result.names)} parameters")
+    if goal not in ("posterior", "evidence"):
+        raise ParameterError("goal", goal, "'posterior' or 'evidence'")
+    if max_calls is not None:
+        require_whole("max_calls", max_calls, least=n_live)
+    evaluate = Evaluator(problem)
+    _require_same(result, evaluate)
+    seed_state = plain_state(rng.bit_generator.state)
+    first, last = _span(result, goal)
+    thread, parent, rank, n_ranked = _thread(
+        result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng
+    )
+    return _joined(result, thread, parent, rank, n_ranked, seed_state, evaluate.n_calls, rng)
+
+
+def _require_same(result: NestedResult, evaluate: Evaluator) -> None:
+    """Raise unless the run is complete and of this problem."""
+    if evaluate.names != result.names:
+        raise ShapeError(f"the problem has the parameters {evaluate.names}; allowed: those of the run, {result.names}")
+    if not result.names:
+        raise ParameterError("result", "a run without parameters", "one with some; the evidence is exact without")
+    if not result.complete:
+        raise ParameterError(
+            "result", f"an incomplete run ({result.stop_reason})", "a run that its stopping rule ended"
+        )
+    known = float(result.log_likelihood[-1])
+    again = float(evaluate.log_likelihood(result.theta[-1:])[0])
+    if abs(again - known) > _SAME * max(1.0, abs(known)):
+        raise ParameterError(
+            "problem", f"one whose log likelihood of the run's last point is {again:.6g}", f"{known:.6g}, as in the run"
+        )
+
+
+def _span(result: NestedResult, goal: Goal) -> tuple[int, int]:
+    """Return the rows of the two deaths between which new points count most."""
+    weight = result.weight
+    if goal == "posterior":
+        ladder = np.cumsum(weight) / weight.sum()
+        first, last = np.searchsorted(ladder, [0.5 - _BULK / 2, 0.5 + _BULK / 2])
+    else:
+        # A death at a level moves the log of all volumes above it by an error of about one in the points alive.
+        importance = np.cumsum(weight[::-1])[::-1] / result.n_at_death
+        first, last = np.flatnonzero(importance >= _SHARE * importance.max())[[0, -1]]
+    # One death at least leaves some points alive above the first level.
+    return int(min(first, result.n_dead - 2)), int(min(last, result.n_dead - 1))
+
+
+def _thread(
+    result: NestedResult,
+    evaluate: Evaluator,
+    move: Move,
+    first: int,
+    last: int,
+    n_live: int,
+    max_calls: int | None,
+    rng: np.random.Generator,
+) -> tuple[tuple[Points, Origin], IntArray, IntArray, IntArray]:
+    """Draw new points above the level of row `first` and let them die up to that of row `last`.
+
+    Returns the new points with their origins, in order of death; the row of the run's point at which each began, -1
+    where that is another new point; insertion ranks; and the numbers of points ranked.
+    """
+    end = (float(result.log_likelihood[last]), float(result.label[last]))
+    bound = Bound(float(result.log_likelihood[first]), float(result.label[first]))
+    above = _alive(result, first)
+    known = _points(result, evaluate, above)
+    log_volume = float(result.log_volume[first])
+    begin = np.concatenate([rng.permutation(len(above)) for _ in range(math.ceil(n_live / len(above)))])[:n_live]
+    drawn, tally = _move_at(move, log_volume).draw(known.take(begin), bound, known.u, evaluate, rng)
+    chained = math.exp(log_volume) <= PRIOR_VOLUME
+    started = np.where(chained, above[begin], -1)
+    origin = Origin(
+        np.full(n_live, bound.log_likelihood), np.full(n_live, bound.label), np.arange(n_live), np.full(n_live, -1)
+    )
+    live, moving = Live(drawn, origin, log_volume), move.adapted(tally) if chained else move
+    dead, ranks, counts = list[tuple[Points, Origin]](), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    n_replaced, cost = n_live // 2, tally.n_evaluated
+    while True:
+        worst = live.points.order()[n_replaced - 1]
+        reached = (float(live.points.log_likelihood[worst]), float(live.points.label[worst])) >= end
+        if reached or (max_calls is not None and evaluate.n_calls + 2 * cost > max_calls):
+            break
+        live, gone, tally = step(live, _move_at(moving, live.log_volume), evaluate, n_replaced=n_replaced, rng=rng)
+        cost = tally.n_evaluated
+        moving = moving.adapted(tally) if math.exp(live.log_volume) <= PRIOR_VOLUME else moving
+        dead.append((gone.points, gone.origin))
+        ranks.append(gone.rank)
+        counts.append(gone.n_ranked)
+    order = live.points.order()
+    dead.append((live.points.take(order), live.origin.take(order)))
+    joined = Points.join(*(points for points, _ in dead)), Origin.join(*(origins for _, origins in dead))
+    parent = np.where(joined[1].ident < n_live, started[np.minimum(joined[1].ident, n_live - 1)], -1)
+    return joined, parent, np.concatenate(ranks), np.concatenate(counts)
+
+
+def _move_at(move: Move, log_volume: float) -> Move:
+    """Return the move for a volume: the prior itself while a draw from it costs less than a chain."""
+    volume = math.exp(log_volume)
+    return move if volume <= PRIOR_VOLUME else PriorRejection(volume)
+
+
+def _alive(result: NestedResult, row: int) -> IntArray:
+    """Rows of the points alive just after the death of a row."""
+    level = (result.log_likelihood[row], result.label[row])
+    born = (result.log_birth < level[0]) | ((result.log_birth == level[0]) & (result.birth_label <= level[1]))
+    return np.flatnonzero(born & (np.arange(result.n_dead) > row))
+
+
+def _points(result: NestedResult, evaluate: Evaluator, rows: IntArray) -> Points:
+    """Rows of a run as points from which chains can start."""
+    theta = result.theta[rows]
+    u = evaluate.space.enter(theta)
+    return Points(u, theta, evaluate.space.leave(u)[1], result.log_likelihood[rows], result.label[rows])
+
+
+def _joined(
+    result: NestedResult,
+    thread: tuple[Points, Origin],
+    parent: IntArray,
+    rank: IntArray,
+    n_ranked: IntArray,
+    seed_state: object,
+    n_calls: int,
+    rng: np.random.Generator,
+) -> NestedResult:
+    """Join a run and new points into one run, in order of death."""
+    points, origin = thread
+    n_old = result.n_dead
+    row_of = np.empty(len(points), dtype=np.int64)
+    row_of[origin.ident] = n_old + np.arange(len(points))
+    parents = np.where(origin.parent >= 0, row_of[origin.parent], parent)
+    log_likelihood = np.concatenate([result.log_likelihood, points.log_likelihood])
+    label = np.concatenate([result.label, points.label])
+    order = np.lexsort((label, log_likelihood))
+    place = np.argsort(order)
+    every_parent = np.concatenate([result.parent, parents])
+    log_birth = np.concatenate([result.log_birth, origin.log_birth])[order]
+    birth_label = np.concatenate([result.birth_label, origin.birth_label])[order]
+    log_likelihood, label = log_likelihood[order], label[order]
+    n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
+    evidence = integrate(
+        log_likelihood, n_at_death, rng=rng, log_start=result.log_start, log_start_error=result.log_start_error
+    )
+    error = evidence.error(result.memory)
+    check = result.check
+    if check is not None:
+        apart = (evidence.log_z - check.log_z) / max(math.hypot(error, check.log_z_error), 1e-12)
+        check = replace(check, distance=apart)
+    own = insertion_p_value(rank, n_ranked, rng=rng)
+    notes = result.warnings
+    if own < DOUBTFUL_P_VALUE:
+        doubt = f"insertion ranks of the added points are not uniform (p = {own:.1g}); use a greater steps_per_param"
+        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=3)
+        notes = (*notes, doubt)
+    seeds = json.loads(result.seed_state)
+    return replace(
+        result,
+        theta=np.concatenate([result.theta, points.theta])[order],
+        log_likelihood=log_likelihood,
+        label=label,
+        log_weight=evidence.log_weight,
+        log_birth=log_birth,
+        birth_label=birth_label,
+        parent=np.where(every_parent >= 0, place[every_parent], -1)[order],
+        n_at_death=n_at_death,
+        log_z=evidence.log_z,
+        log_z_error=error,
+        information=evidence.information,
+        n_eff=evidence.n_eff,
+        n_calls=result.n_calls + n_calls,
+        insertion_rank=np.concatenate([result.insertion_rank, rank]),
+        insertion_n_ranked=np.concatenate([result.insertion_n_ranked, n_ranked]),
+        insertion_p_value=combined_p_value([result.insertion_p_value, own]),
+        seed_state=json.dumps([*(seeds if isinstance(seeds, list) else [seeds]), seed_state]),
+        versions=versions(),
+        warnings=notes,
+        check=check,
+    )

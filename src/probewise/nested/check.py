@@ -13,7 +13,7 @@ Neither estimate sees a narrow peak that begins above where both end; `beyond` l
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -25,7 +25,7 @@ from probewise.nested.beyond import NOTHING, Beyond, look_beyond
 from probewise.nested.evaluate import Samplable
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, repartitioned
-from probewise.nested.result import Check, NestedResult, few_possible
+from probewise.nested.result import Check, NestedResult, few_lineages, few_possible
 
 __all__ = ["DISAGREE", "SingleRun", "checked", "weighted_mean"]
 
@@ -38,7 +38,10 @@ _N_SAMPLES = 2000
 # The repartitioned run is used only if it needs less than this share of the first run's nats.
 _GAIN = 0.8
 _FEW_NATS = 3.0  # of a second pass from the clusters of the posterior, below which they are used
-_ALIKE = 1.0  # errors within which two runs agree, against a second pass that lies below both
+_SAME_MEAN = 0.75  # nats; up to 0.5 where such a pass was right, 0.8 to 9 where it overlooked a part of a curve
+_MOST_COST = 0.2  # of the first run's evaluations, spent on a second pass from clusters
+_AGAIN = 2.2  # times the first run's evaluations: what it costs to repeat it with chains twice as long
+_ALIKE = 2.0  # errors within which two runs agree, against a second pass that lies below both
 _SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
 
@@ -55,12 +58,22 @@ class SingleRun(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Route:
-    """A second estimate of the evidence: a problem of the same evidence, the number of live points and the move."""
+    """A second estimate of the evidence: a problem of the same evidence, the number of live points and the move.
+
+    It takes at most `most_calls` evaluations. Where the mean of its log likelihood over the posterior is not
+    `expected` to within `_SAME_MEAN`, it has found another posterior than the run and is no estimate.
+    """
 
     problem: Samplable
     n_live: int
     move: SliceMove
     name: str
+    most_calls: float = math.inf
+    expected: float | None = None
+
+    def confirmed(self, found: NestedResult) -> bool:
+        """Whether the estimate found the posterior that was expected; its information is the mean less log Z."""
+        return self.expected is None or abs(found.information + found.log_z - self.expected) < _SAME_MEAN
 
     @property
     def least_calls(self) -> int:
@@ -113,7 +126,7 @@ def checked(
     def estimated(route: _Route) -> NestedResult | None:
         """Run a second estimate; None where it exceeds the budget."""
         nonlocal spent
-        left = int(budget - spent)
+        left = int(min(budget - spent, route.most_calls))
         if left < route.least_calls:
             return None
         try:
@@ -128,8 +141,12 @@ def checked(
     try:
         above = _above(first, problem, int(budget - spent), rng)
         spent += above.n_calls
-        route = _second_route(now, problem, move, least_live, rng)
-        estimates = [] if (found := estimated(route)) is None else [found]
+        curved = False
+        for route in _second_routes(now, problem, move, least_live, rng):
+            estimates = [] if (found := estimated(route)) is None else [found]
+            if found is not None and route.confirmed(found):
+                break
+            curved = route.expected is not None
         if not estimates:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
             note = (
@@ -138,16 +155,20 @@ def checked(
             )
             return _with_peak(replace(first, n_calls=spent, warnings=(*first.warnings, note)), above)
         name = route.name
-        sharper = replace(route, n_live=max(route.n_live, now.n_live))
-        if _suspicious(now, estimates, _APART) and (found := estimated(sharper)) is not None:
-            estimates = [found] if estimates[0].warnings else [*estimates, found]
+        if _suspicious(now, estimates, _APART):
+            left, again_costs = budget - spent, _AGAIN * first.n_calls
+            room = left - again_costs if left > again_costs else left
+            n_live = int(min(max(route.n_live, now.n_live), room / estimates[0].n_calls * route.n_live))
+            sharper = replace(route, n_live=n_live, most_calls=math.inf)
+            if n_live > route.n_live and (found := estimated(sharper)) is not None:
+                estimates = [found] if estimates[0].warnings else [*estimates, found]
         n_check = sum(each.n_calls for each in estimates) + above.n_calls
         if _suspicious(now, estimates, DISAGREE):
             again = estimated(_Route(problem, now.n_live, _longer(move), "the run again"))
             if again is not None and not again.warnings:
                 if not _suspicious(again, estimates, DISAGREE):
                     now = again
-                elif _overlooks(estimates, now, again):
+                elif curved and _overlooks(estimates, now, again):
                     now, estimates, name = again, [now], "the same run with shorter chains"
     except _FailedError as error:
         note = f"the second pass, which checks the evidence, failed: {error}"
@@ -181,36 +202,41 @@ class _FailedError(Exception):
     """The likelihood failed during a second estimate."""
 
 
-def _second_route(
+def _second_routes(
     first: NestedResult, problem: Samplable, move: Move, least_live: int, rng: np.random.Generator
-) -> _Route:
-    near = _near(first, problem, rng)
-    if near is not None:
-        nats = _nats(first, near)
+) -> Iterator[_Route]:
+    """Yield the routes to a second estimate, the cheapest first; the last one is an estimate whatever it finds."""
+
+    def from_near(near: Repartitioned, nats: float, **limits: float) -> _Route:
+        wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
+        enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
+        n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
+        return _Route(near, n_live, _longer(move), "a second pass from near the posterior", **limits)
+
+    if first.information > 0:
+        theta = first.samples(_N_SAMPLES, rng=rng)
+        # Clusters describe a posterior that they cover. A curved ridge they may not, and then mislead the live points.
+        clustered = _near(problem, theta, clustered=True)
+        if clustered is not None and (nats := _nats(first, clustered)) < _FEW_NATS < _GAIN * first.information:
+            yield from_near(clustered, nats, most_calls=_MOST_COST * first.n_calls, expected=nats + first.log_z)
+        single = _near(problem, theta, clustered=False)
         # With a log Z that is far too large the nats come out too few, or negative.
-        if first.information > 0 and nats < _GAIN * first.information:
-            wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
-            enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
-            n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
-            return _Route(near, n_live, _longer(move), "a second pass from near the posterior")
+        if single is not None and (nats := _nats(first, single)) < _GAIN * first.information:
+            yield from_near(single, nats)
+            return
     n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
-    return _Route(problem, n_live, _longer(move), "a second run with longer chains")
+    yield _Route(problem, n_live, _longer(move), "a second run with longer chains")
 
 
-def _near(first: NestedResult, problem: Samplable, rng: np.random.Generator) -> Repartitioned | None:
-    """Repartition the problem about the posterior found; None where the prior or the samples do not allow it."""
+def _near(problem: Samplable, theta: FloatArray, *, clustered: bool) -> Repartitioned | None:
+    """Repartition the problem about posterior samples; None where the prior or the samples do not allow it."""
     if not hasattr(problem.prior, "log_prob"):
         return None
-    theta = first.samples(_N_SAMPLES, rng=rng)
     try:
-        clustered, single = (repartitioned(problem, theta, clustered=each) for each in (True, False))
-        # Clusters describe a posterior that they cover; where nats are left to climb, they mislead the live points.
-        for near in (clustered, single):
-            if near.prior.invertible and (near is single or _nats(first, near) < _FEW_NATS):
-                return near
+        near = repartitioned(problem, theta, clustered=clustered)
+        return near if near.prior.invertible else None
     except (ParameterError, np.linalg.LinAlgError):
-        pass
-    return None
+        return None
 
 
 def _nats(first: NestedResult, near: Repartitioned) -> float:
@@ -254,9 +280,9 @@ def _suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -
 
 
 def _overlooks(estimates: list[NestedResult], first: NestedResult, longer: NestedResult) -> bool:
-    """Whether a second pass lies below two runs that agree although one has chains twice as long.
+    """Whether a second pass about a curved posterior lies below two runs that agree, one with chains twice as long.
 
-    A second pass can overlook a part of the posterior where its prior is thin, and is then low; chains that are too
+    Along a curve its prior is thin where the posterior is not: it overlooks a part and is then low. Chains that are too
     short bias two runs differently.
     """
     below = min(_distance(run, estimates) for run in (first, longer))
@@ -280,7 +306,9 @@ def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_c
         why = estimates[-1].warnings[0]
         warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
-        # A poorly known share of possible hypotheses no longer matters once a second estimate agrees.
-        counted = few_possible(now.log_start, now.log_start_error, now.n_live)
-        warnings = tuple(note for note in warnings if note != counted)
+        # A poorly known share of possible hypotheses, or error, no longer matters once a second estimate agrees.
+        settled = [few_possible(now.log_start, now.log_start_error, now.n_live)]
+        if error < now.log_z_error:
+            settled.append(few_lineages(now.memory))
+        warnings = tuple(note for note in warnings if note not in settled)
     return replace(now, n_calls=spent, check=check, warnings=warnings)

@@ -25,11 +25,13 @@ from probewise.nested.evidence import log_volumes
 from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.atomic import write_bytes_atomically
 
-__all__ = ["Agreement", "Check", "NestedResult", "few_possible", "versions"]
+__all__ = ["Agreement", "Check", "NestedResult", "few_lineages", "few_possible", "versions"]
 
 _FORMAT = "nested-result/4"
 _PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
 _COUNTS = ("parent", "n_at_death", "insertion_rank", "insertion_n_ranked")
+# Lineage variance above which the run descends from too few lineages to estimate its own error.
+_MOST_MEMORY = 10.0
 _ARRAYS = ("theta", *_PER_POINT, *_COUNTS)
 
 
@@ -108,6 +110,16 @@ def few_possible(log_start: float, log_start_error: float, n_live: int) -> str |
     if found >= n_live:
         return None
     return f"only {found} of {round(found / share)} hypotheses drawn from the prior are possible"
+
+
+def few_lineages(memory: float) -> str | None:
+    """Return a warning if a run's `memory` is so large that the error derived from it is uncertain, else None."""
+    if memory <= _MOST_MEMORY:
+        return None
+    return (
+        f"memory is {memory:.0f}: so few lineages lead to the posterior that the error is itself uncertain; "
+        "use more steps_per_param or more n_live"
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import NestedResult, few_possible, versions
+from probewise.nested.result import NestedResult, few_lineages, few_possible, versions
 from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
 __all__ = ["LIVE_PER_PARAM", "PRIOR_VOLUME", "Dead", "Live", "least_live", "plain_state", "search", "step"]
@@ -42,8 +42,6 @@ PRIOR_VOLUME = 0.05
 
 _FEW_EFFECTIVE = 30.0
 _STUCK_SHARE = 0.02
-# Lineage variance above which the run descends from too few lineages to estimate its own error.
-_MOST_MEMORY = 10.0
 
 
 def least_live(n_params: int) -> int:
@@ -347,12 +345,8 @@ def _result(
             f"insertion ranks are not uniform (p = {p_value:.1g}): chains are too short or a mode was lost; "
             "use more steps_per_param or more n_live",
         )
-    if remembered > _MOST_MEMORY:
-        notes = (
-            *notes,
-            f"memory is {remembered:.0f}: so few lineages lead to the posterior that the error is itself uncertain; "
-            "use more steps_per_param or more n_live",
-        )
+    if (uncertain := few_lineages(remembered)) is not None:
+        notes = (*notes, uncertain)
     if evidence.n_eff < _FEW_EFFECTIVE:
         notes = (*notes, f"only {evidence.n_eff:.0f} effective samples: use more n_live")
     return NestedResult(

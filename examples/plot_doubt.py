@@ -35,7 +35,11 @@ model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
 def explored(trust):
     """Let the robot find the circle, with a prior probability `trust` that nothing is left out."""
     rng = np.random.default_rng(seed)
-    arm = SimulatedArm(lambda at, time_s, height_mm: world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng))
+
+    def light(at, time_s, height_mm):
+        return world.read(hidden, at.x_mm, at.y_mm, time_s=time_s, rng=rng)
+
+    arm = SimulatedArm(light, scale=None)  # readings are not rounded
     experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, trust=trust)
     with arm:
         return experiment, run(arm, experiment, rng=rng, max_readings=30)

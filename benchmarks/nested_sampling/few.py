@@ -23,7 +23,7 @@ if __name__ == "__main__":
 import numpy as np
 
 from nested_sampling.problems import problem
-from nested_sampling.samplers import Counted
+from nested_sampling.sampler import Counted
 from nested_sampling.seeds import document
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested import run_slow

@@ -62,7 +62,8 @@ def measure(
     import numpy as np
 
     from nested_sampling.problems import problem
-    from nested_sampling.samplers import Counted, sampler
+    from nested_sampling.sampler import Counted
+    from nested_sampling.samplers import sampler
 
     warnings.simplefilter("ignore")
     chosen = sampler(sampler_name)

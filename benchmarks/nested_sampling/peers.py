@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from nested_sampling.samplers import Counted, Outcome, Sampler
+from nested_sampling.sampler import Counted, Outcome, Sampler
 
 _REMAINING = 0.01  # nats: the remaining evidence at which the peers that are told stop; their usual choice
 

@@ -28,8 +28,9 @@ import numpy as np
 
 from nested_sampling import ssf as ssf_problem
 from nested_sampling.one import cpu_seconds, peak_megabytes
+from nested_sampling.ours import ours_result
 from nested_sampling.problems import Known, box, gaussian
-from nested_sampling.samplers import Counted, ours_result
+from nested_sampling.sampler import Counted
 from probewise.nested import NestedResult, State, run
 
 _FOLDER = Path(__file__).resolve().parent.parent

@@ -31,8 +31,9 @@ import numpy as np
 from scipy.stats import chi2, kstest, norm, t
 
 from nested_sampling.one import cpu_seconds
+from nested_sampling.ours import ours
 from nested_sampling.problems import Known, problem
-from nested_sampling.samplers import Counted, ours
+from nested_sampling.sampler import Counted
 
 # Agreed limits where there are any: number of seeds -> most of abs(mean), least and most sd.
 _AGREED = {1000: (0.1, 0.93, 1.07), 100: (0.35, 0.8, 1.25)}

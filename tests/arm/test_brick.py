@@ -150,7 +150,7 @@ def test_a_voltage_that_is_another_every_time_is_told_of(brick, paper_brick):
         return carry_out(opcode, body)
 
     paper_brick.carry_out = wild
-    with pytest.raises(LinkError, match="a different battery voltage each of 6 times"):
+    with pytest.raises(LinkError, match="another battery voltage each of 6 times"):
         brick.battery_mv()
 
 

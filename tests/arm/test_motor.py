@@ -131,7 +131,7 @@ def test_a_counter_that_is_another_every_time_is_told_of(motor, paper_brick):
     motor.move_to(0, 1)
     for k in range(20):
         paper_brick.alter[len(paper_brick.commands) + k] = changed(22, k + 1)
-    with pytest.raises(MotorError, match="reported differently each of 6 times"):
+    with pytest.raises(MotorError, match="reports another state each of 6 times"):
         motor.counts()
 
 

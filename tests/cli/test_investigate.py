@@ -27,7 +27,15 @@ def test_one_round_leaves_a_diagnosis_and_all_it_was_made_of(few, tmp_path, caps
     options = ("--plan", few, "--truth", "nothing", "--rounds", 1, "--seed", 1)
     assert run("investigate", *options, "--out", out) == 0
     names = {path.name for path in out.iterdir()}
-    assert {"diagnosis.json", "sensor.json", "calibrated.json", "recording.csv", "report.html", "rounds"} <= names
+    assert {
+        "diagnosis.json",
+        "sensor.json",
+        "calibrated.json",
+        "recording.csv",
+        "report.html",
+        "rounds",
+        "by_round.png",
+    } <= names
     assert len(read_recording(out / "recording.csv")) == len(read_recording(out / "rounds" / "1.csv"))
     assert json.loads((out / "diagnosis.json").read_text())["verdict"]
     said = capsys.readouterr().out

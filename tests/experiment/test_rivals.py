@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.stats import norm
 
 from probewise import scene
 from probewise.arm import Pose, Reading
@@ -19,12 +20,14 @@ from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLa
 from probewise.experiment.posterior import prior_posterior, updated
 from probewise.experiment.refitted import refitted
 from probewise.experiment.rivals import rivals_of
+from probewise.experiment.settling import ENOUGH_BITS, _bits_of_names
 from probewise.inquiry import prior_entropy
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
 from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
+from probewise.study.concealed import _arm
 from probewise.study.rows import REFERENCE
-from probewise.study.trial import Trial
+from probewise.study.trial import Trial, timed_steps
 
 
 @pytest.fixture(scope="module")
@@ -172,6 +175,41 @@ def test_what_leads_is_said_with_its_numbers(stepped):
     assert "gear play of" in said.sentence
 
 
+def test_a_name_that_the_warier_odds_leave_open_is_in_the_credible_set(stepped):
+    """Two routes: the odds of a name by hand, twelve times those of a run that expects a fault one time in ten."""
+    last = leading(stepped[-1], "")
+    for name, log_z in (("dropouts", 0.0), ("halo", -2.5)):
+        particles = tuple(
+            replace(p, weighted=replace(p.weighted, log_z=log_z)) if kind.left_out == name else p
+            for kind, p in zip(last.kinds.kinds, last.kinds.particles, strict=True)
+        )
+        last = replace(last, kinds=replace(last.kinds, particles=particles))
+    last = replace(last, left_out=last.kinds.left_out)
+    share = 0.1 / (len({kind.left_out for kind in last.kinds.kinds}) - 1)
+    plain, wary = share / (0.9 + share), 12.0 * share / (0.9 + 12.0 * share)
+    said = left_out_of(last, 0.9)
+    assert said.probability["dropouts"] == pytest.approx(plain, rel=0.01)
+    assert plain < 0.05 < wary
+    assert said.credible_set == (CLEAN, "dropouts")
+
+
+def test_a_reading_tells_names_by_what_they_predict():
+    """Expected information about a name: none where names agree, its entropy where they do not, else by quadrature."""
+    weight, names = np.full(400, 1 / 400), np.repeat(["", "halo"], 200)
+    even = norm.ppf((np.arange(200) + 0.5) / 200)
+    alike = np.tile(20.0 + 3.0 * even, 2)
+    apart = np.concatenate([20.0 + 3.0 * even, 90.0 + 3.0 * even])
+    near = np.concatenate([20.0 + 0.5 * even, 23.0 + 2.0 * even])
+    bits = _bits_of_names(weight, np.stack([alike, apart, near], axis=1), names, 1.0)
+    at = np.linspace(-20.0, 60.0, 20_001)
+    given = [norm.pdf(at, mean, math.hypot(sd, 1.0)) for mean, sd in ((20.0, 0.5), (23.0, 2.0))]
+    both = 0.5 * (given[0] + given[1])
+    exact = sum(0.5 * np.trapezoid(each * np.log2(np.maximum(each, 1e-300) / both), at) for each in given)
+    assert bits[0] == pytest.approx(0.0, abs=1e-9)
+    assert bits[1] == pytest.approx(1.0, abs=1e-6)
+    assert bits[2] == pytest.approx(exact, abs=0.01)
+
+
 def test_a_repaired_sensor_holds_the_effect_that_leads(sensor, stepped):
     rng = np.random.default_rng(1)
     assert repaired(sensor, stepped[-1], rng=rng) is sensor
@@ -192,6 +230,19 @@ def test_a_robot_that_doubts_finds_the_circle_and_what_is_wrong_with_its_sensor(
     assert found["known"]
     assert found["error_mm"] < 12.0
     assert effect in found["credible"]
+
+
+@pytest.mark.slow
+def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
+    """A step of the light that had moved the circle by 8 mm at a claimed 2.4 mm: two readings more find both."""
+    trial = ConcealedTrial("ambient_step", 1, 0, 0.9, 40, 8101)
+    experiment = replace(experiment_of(REFERENCE), trust=0.9)
+    steps = [s for s, _ in timed_steps(_arm(trial), experiment, seed=8101, circle=0, max_readings=40)]
+    known = [step.number for step in steps if step.widest_mm < 4.0 and step.chance_off < 0.01]
+    assert known[0] < steps[-1].number
+    assert steps[-1].map.highest < ENOUGH_BITS
+    assert left_out_of(steps[-1], 0.9).credible_set == ("ambient_step",)
+    assert np.abs(steps[-1].mean - trial.truth).max() < 2.0
 
 
 def test_rows_of_the_study_are_summed_up():

@@ -219,7 +219,7 @@ def test_a_data_set_is_a_scan_unless_told_otherwise() -> None:
 def test_shapes_and_bounds_are_checked() -> None:
     with pytest.raises(ParameterError, match="floor"):
         StudentT(np.zeros(3), 1.0, 1.0)
-    with pytest.raises(ShapeError, match="4 readings against 3 groups"):
+    with pytest.raises(ShapeError, match="groups has 3 values for 4 readings"):
         StudentT(np.zeros(3), 0.1, 1.0).log_prob(np.zeros(4), np.zeros((2, 4)))
     with pytest.raises(ShapeError, match=r"\(n_samples, n_points\)"):
         GaussianKnown(1.0).log_prob(np.zeros(4), np.zeros((2, 3)))

@@ -179,7 +179,7 @@ def test_unknown_names_list_those_that_are_known(made):
         utility_named("entropie")
     with pytest.raises(ParameterError, match="one of row"):
         InformationAbout(ParameterValue("radius_mm"))(made.listed(APART))
-    with pytest.raises(ParameterError, match="a set of shapes"):
+    with pytest.raises(ParameterError, match="the hypotheses of two shapes"):
         InformationAbout(WhichShape())(made.listed(APART))
 
 

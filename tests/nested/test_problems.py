@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from nested_sampling import compare, few, problems, records, references, seeds, ssf
-from nested_sampling.samplers import Counted, Outcome, ours
+from nested_sampling.ours import ours
+from nested_sampling.sampler import Counted, Outcome
 from scipy.special import logsumexp
 
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 from nested_sampling import hard, problems
-from nested_sampling.samplers import Counted
+from nested_sampling.sampler import Counted
 
 from probewise.errors import ParameterError
 from probewise.nested import run_slow

@@ -150,7 +150,7 @@ def test_what_cannot_be_a_recording_is_refused_in_words(changes, message):
     ("table", "message"),
     [
         ([1, 2, 3], "table is .*; allowed: columns by name: a dict of arrays, or a data frame"),
-        ({"x": [1], "y_mm": [2], "reading": [3]}, "also x_mm; rename the table's columns"),
+        ({"x": [1], "y_mm": [2], "reading": [3]}, "x_mm among them; rename the table's columns"),
         (
             {"x_mm": [1], "y_mm": [2], "reading": [3], "orientation_deg": [0], "orientation_rad": [0]},
             "one of orientation_deg and orientation_rad",

@@ -14,8 +14,11 @@ from probewise.experiment import Experiment, run_from
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
+from probewise.report import doubt
 from probewise.report.demo import HEADER, comparison_lines
 from probewise.report.paper_view import fine_map, paper_view, window_mm
+from probewise.report.plots import PAGE_IN
+from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import side_by_side
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -120,3 +123,19 @@ def test_the_demos_comparison_is_two_tables_each_with_its_caption(monkeypatch):
         assert all(name in names for name in header)
         assert [line.split()[0] for line in lines] == ["naive", "SSF"]
         assert max(map(len, text.splitlines())) <= 120
+
+
+def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
+    """Their pictures, how both ended, and what the second one reports of its sensor."""
+    angle = np.linspace(0, 2 * np.pi, 60)
+    outline = np.array([600.0, 260.0]) + 90.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
+    searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("trusting", "doubting")]
+    drawn = doubt.figures(searches)
+    assert list(drawn) == ["doubt.png", "belief.png"]
+    assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
+    said = "".join(doubt.section(searches, drawn).body)
+    for row in ("trusting", "doubting"):
+        assert f">{row}<" in said
+    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubt.answer(searches)
+    assert found.stop_reason in said

@@ -71,7 +71,7 @@ def test_many_hypotheses_and_poses_equal_one_by_one():
         assert np.allclose(together[i], alone[0])
     shared = seen_discrete(discs, field, poses_about(4))
     assert shared.shape == (3, 4)
-    with pytest.raises(ShapeError, match="poses of 3 hypotheses over 2 regions"):
+    with pytest.raises(ShapeError, match="poses of 3 hypotheses, 2 regions"):
         seen_discrete(disc_region(np.zeros((2, 2)), np.array([5.0, 9.0])), field, poses)
 
 

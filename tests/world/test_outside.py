@@ -14,7 +14,7 @@ from probewise.world.concealed import (
     BentRail,
     Chirp,
     CrossTalk,
-    Floor,
+    DeadZone,
     Ghost,
     PeakMemory,
     PlaceStep,
@@ -84,7 +84,7 @@ def test_cross_talk_is_a_gain_that_follows_the_orientation(plan, clean):
 
 
 def test_light_below_the_floor_is_not_seen(plan, clean):
-    np.testing.assert_allclose(read(plan, Floor(0.2)), np.where(clean - 10 < 0.2 * 50, 10.0, clean))
+    np.testing.assert_allclose(read(plan, DeadZone(0.2)), np.where(clean - 10 < 0.2 * 50, 10.0, clean))
 
 
 def test_the_photodiode_remembers_the_brightest_light_of_the_scan(plan, clean):

@@ -28,7 +28,16 @@ from probewise.errors import ParameterError
 from probewise.recordings import Recording, paper_plan, write_text_atomically
 from probewise.world import Blob, World, gaussian_spot
 
-__all__ = ["Coverage", "Truth", "coverage", "draw_truth", "order_lead", "simulate_truth", "wilson_interval"]
+__all__ = [
+    "Coverage",
+    "Truth",
+    "coverage",
+    "draw_truth",
+    "intervals_that_hold",
+    "order_lead",
+    "simulate_truth",
+    "wilson_interval",
+]
 
 _MASS = 0.95
 
@@ -130,7 +139,13 @@ def _held(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]
     """Simulate and calibrate one recording; return for each quantity whether its interval holds the truth."""
     truth = draw_truth(rng=rng)
     recording = simulate_truth(truth, rng=rng)
-    samples = calibrate(recording, orders=(1,), n_live=n_live, quick=quick, rng=rng).sensor.samples
+    return intervals_that_hold(
+        truth, calibrate(recording, orders=(1,), n_live=n_live, quick=quick, rng=rng).sensor.samples
+    )
+
+
+def intervals_that_hold(truth: Truth, samples: FloatArray) -> dict[str, bool]:
+    """Tell for each quantity whether the 95 % interval of samples of one Gaussian, (n, 8), holds the truth."""
     found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
     held = {}
     for name, value in _quantities(truth).items():

@@ -42,6 +42,6 @@ class DistinctRows:
             If `plan` is another plan.
         """
         if plan is not self._plan:
-            raise ParameterError("plan", plan, "the plan that DistinctRows was made for")
+            raise ParameterError("plan", plan, "the plan that DistinctRows was made for; make another for this one")
         distinct = self._model.predict(theta, self._distinct)
         return distinct if self._rows is None else np.take(distinct, self._rows, axis=1)

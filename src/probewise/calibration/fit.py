@@ -189,7 +189,7 @@ def calibrate(
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
     require_flag("quick", quick)
     if quick and not refined:
-        raise ParameterError("refined", refined, "True with quick=True, whose evidences are bridged")
+        raise ParameterError("refined", refined, "True with quick=True, or leave quick out")
     posing = Posing(recording, prior, data_sets)
     search = partial(search_order, posing, n_live=n_live, stop=stop, refined=refined, progress=progress)
     one = partial(_fit_order, posing, search, pixel_mm=pixel_mm, n_samples=n_samples)

@@ -104,7 +104,7 @@ class Reference:
 
     def __post_init__(self) -> None:
         if self.prior.n_gaussians < 2 or not has_reference(self.prior):
-            raise ParameterError("prior", self.prior, "of 2 Gaussians or more, mass uniform from 0 to 1 unit")
+            raise ParameterError("prior", self.prior, "a prior of 2 Gaussians or more, with masses uniform from 0 to 1")
 
     @cached_property
     def ways(self) -> tuple[Way, ...]:
@@ -219,7 +219,7 @@ class Reference:
     @property
     def _compensation(self) -> Compensation:
         if self.compensation is None:
-            raise ParameterError("compensation", None, "a Compensation")
+            raise ParameterError("compensation", None, "a Compensation; give one to the reference")
         return self.compensation
 
     def _drawn_near_one(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:

@@ -163,7 +163,7 @@ class FittedSensor(ShowsItself):
             )
         det = _determinants(samples, self.n_gaussians)
         if not (det > 0).all():
-            raise ParameterError("A B - C^2", float(det.min()), "greater than 0 in every sample")
+            raise ParameterError("A B - C^2 of a Gaussian", float(det.min()), "greater than 0 in every sample")
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "noise_sd", noise_sd)
 
@@ -374,7 +374,9 @@ class FittedSensor(ShowsItself):
         except FileError:
             raise
         except (ProbewiseError, ValueError, TypeError) as error:
-            raise FileError(path, f"inconsistent contents ({error})", "an undamaged sensor.json") from error
+            raise FileError(
+                path, f"inconsistent contents ({error})", "an undamaged sensor.json; calibrate the recording anew"
+            ) from error
         return sensor
 
     def unit(self, name: str) -> str:

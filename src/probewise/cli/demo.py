@@ -12,20 +12,23 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from concurrent.futures import Executor, Future
 
+    from probewise.arm import Pose
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis
     from probewise.experiment import Exploration, Model
     from probewise.progress import Progress
-    from probewise.report.demo import RobotSearch
+    from probewise.report.robot_search import RobotSearch
     from probewise.scene import Circle
 
 __all__ = ["VERB"]
 
 MODELS: tuple[Model, ...] = ("naive", "ssf")
 MODEL_NAMES: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
+TRUSTS = {"trusting": 1.0, "doubting": 0.9}
 N_LIVE = 100  # live points of the calibration; --full uses the paper's 300
 N_LIVE_ROBOT = 100
 MAX_READINGS = 80
+MAX_READINGS_DOUBT = 20  # bounds the time of the demo
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -60,6 +63,7 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
     from probewise.recordings import read_recording, shipped, write_bytes_atomically, write_text_atomically
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
+    from probewise.report import doubt as doubt_report
     from probewise.world.shipped import truth as world_behind
 
     started = time.monotonic()
@@ -67,22 +71,26 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
     out = check_out_directory(arguments.out)
     truth = hidden_circle(seed)
     with workers(2) as pool:
-        progress("calibrating and diagnosing", 0, 6)
+        progress("calibrating and diagnosing", 0, 8)
         diagnosing = pool.submit(_diagnose, seed)
         calibration = _calibrate(seed, arguments.full, pool)
         sensor = calibration.sensor
+        doubting = [pool.submit(search_with_a_fault, sensor, trust, truth, seed) for trust in TRUSTS.values()]
         starting = [pool.submit(start_alike, sensor, model, truth, seed) for model in MODELS]
         searching = [pool.submit(_search, sensor, model, truth, seed) for model in MODELS]
-        parts: tuple[Future[Any], ...] = (diagnosing, *starting, *searching)
+        parts: tuple[Future[Any], ...] = (diagnosing, *doubting, *starting, *searching)
         for done, future in enumerate(parts, start=1):
-            progress("searching and diagnosing", done, 6)
+            progress("searching and diagnosing", done, 8)
             future.result()
     progress("drawing the report")
     diagnosis, alike = diagnosing.result(), [future.result() for future in starting]
     runs, frames = zip(*(future.result() for future in searching), strict=True)
     recording = read_recording(shipped("paper"))
     prediction = predict(sensor, recording.plan, recording.readings)
-    searches, started_alike = as_searches(sensor, runs, truth), as_searches(sensor, alike, truth)
+    names = MODEL_NAMES.values()
+    searches = as_searches(sensor, zip(names, runs, strict=True), truth)
+    started_alike = as_searches(sensor, zip(names, alike, strict=True), truth)
+    doubted = as_searches(sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth)
     drawn = report.figures(
         calibration,
         recording,
@@ -91,7 +99,7 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
         started_alike=started_alike,
         geometry=read_geometry(shipped_geometry()),
     )
-    drawn |= report.diagnosis_figures(diagnosis)
+    drawn |= report.diagnosis_figures(diagnosis) | doubt_report.figures(doubted)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
     witnesses = diagnosis_report.figures(diagnosis)
     diagnosis_page = diagnosis_report.write_page(diagnosis, witnesses, source="concealed.csv", seed=seed)
@@ -112,37 +120,39 @@ def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[st
             started_alike=started_alike,
             frames=frames,
             diagnosis=diagnosis,
+            doubt=doubted,
             drawn=drawn,
             concealed=concealed,
             seed=seed,
             seconds=seconds,
         )
         write_text_atomically(stage / "report.html", page)
-        answers = report.answers(started_alike, diagnosis, concealed=concealed, seed=seed)
+        answers = report.answers(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
         write_text_atomically(stage / "answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
     return (
         *report.comparison_lines(searches),
         report.answer(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
+        f"a concealed saturation: {doubt_report.answer(doubted)}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
     )
 
 
-def as_searches(sensor: FittedSensor, runs: Iterable[Exploration], truth: tuple[float, ...]) -> list[RobotSearch]:
-    """Combine each model's run with the true circle."""
+def as_searches(
+    sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
+) -> list[RobotSearch]:
+    """Combine each run, with its robot's name, with the true circle."""
     import numpy as np
 
-    from probewise.report.demo import RobotSearch
+    from probewise.report.robot_search import RobotSearch
     from probewise.scene import outlines
 
     means, circle = sensor.mean(), hypothesis()
     known = dict(zip(circle.prior.names, truth, strict=True))
     outline_mm = outlines(circle.region(np.array([truth])))[0]
     levels = (means["I_min"], means["I_max"])
-    return [
-        RobotSearch(MODEL_NAMES[model], run, known, outline_mm, levels) for model, run in zip(MODELS, runs, strict=True)
-    ]
+    return [RobotSearch(name, run, known, outline_mm, levels) for name, run in runs]
 
 
 def hypothesis() -> Circle:
@@ -217,7 +227,6 @@ def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], se
     """RobotSearch for the circle by the paper's rule, from a first reading on it that all models share."""
     import numpy as np
 
-    from probewise.arm import Pose
     from probewise.experiment import arm_over, experiment_for, run_from, surface_of
     from probewise.inquiry import ReadingEntropy
     from probewise.scene import Field
@@ -225,13 +234,41 @@ def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], se
 
     field = Field()
     experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy())
-    x_mm, y_mm, radius_mm = truth
-    away, turn = np.random.default_rng([seed, 5]).random(2)
-    away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn  # uniform over the circle
-    first = Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
-    surface = surface_of("circle", np.array(truth), field)
+    first, surface = on_white(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
+
+
+def on_white(truth: tuple[float, ...], seed: int) -> Pose:
+    """Draw a place on the circle, uniformly: the first reading of robots that are to start alike."""
+    import numpy as np
+
+    from probewise.arm import Pose
+
+    x_mm, y_mm, radius_mm = truth
+    away, turn = np.random.default_rng([seed, 5]).random(2)
+    away_mm, turn_rad = radius_mm * np.sqrt(away), 2 * np.pi * turn
+    return Pose(float(x_mm + away_mm * np.cos(turn_rad)), float(y_mm + away_mm * np.sin(turn_rad)))
+
+
+def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, ...], seed: int) -> Exploration:
+    """Search for the circle with a sensor that saturates, which its model leaves out, from a first reading on it."""
+    from dataclasses import replace
+
+    import numpy as np
+
+    from probewise.experiment import arm_over, experiment_for, run_from, surface_of
+    from probewise.report.doubt import SATURATION
+    from probewise.scene import Field
+    from probewise.world import Saturation
+    from probewise.world.shipped import truth as world_behind
+
+    field = Field()
+    experiment = experiment_for(sensor, hypothesis(), field, n_live=N_LIVE_ROBOT, trust=trust)
+    world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
+    first, surface = on_white(truth, seed), surface_of("circle", np.array(truth), field)
+    with arm_over(world, surface, field, seed=seed) as arm:
+        return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT)
 
 
 def _diagnose(seed: int) -> Diagnosis:

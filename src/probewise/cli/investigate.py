@@ -111,7 +111,13 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.cli.diagnose import OF_ONE_RUN, write_results
     from probewise.diagnosis import join
     from probewise.investigation import Budget, Investigation, RoundsFolder, SimulatedRecorder, investigate
-    from probewise.recordings import Recording, fingerprint, write_recording, write_text_atomically
+    from probewise.recordings import (
+        Recording,
+        fingerprint,
+        write_bytes_atomically,
+        write_recording,
+        write_text_atomically,
+    )
     from probewise.report import diagnosis as of_a_diagnosis
     from probewise.report import investigation as report
 
@@ -170,6 +176,7 @@ def run(arguments: argparse.Namespace) -> int:
         drawn = of_a_diagnosis.figures(diagnosis)
         write_results(diagnosis, drawn, stage.folder, rng=np.random.default_rng(files_seed))
         write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
+        write_bytes_atomically(stage / "by_round.png", report.believed_picture(found))
         concealed = None if world is None else tuple(effect.name for effect in world.concealed)
         page = report.write_page(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
         write_text_atomically(stage / "report.html", page)

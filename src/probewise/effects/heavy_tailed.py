@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy.special import erfc
@@ -56,12 +56,6 @@ class HeavyTailed:
         """Probability above x of the two-sided mixture."""
         return np.asarray(0.5 * erfc(x[..., None] / (self._sds * math.sqrt(2))).mean(axis=-1))
 
-    @cached_property
-    def _table(self) -> tuple[FloatArray, FloatArray]:
-        """Tabulate -log(2 x upper tail) and the size it belongs to: smooth, monotone, from 0."""
-        x = self.typical * np.concatenate([[0.0], np.geomspace(1e-5, 300.0, 600)])
-        return -np.log(2 * self._upper(x)), x
-
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Quantile function, any shape: a table lookup, then Newton steps on the log of the tail."""
         u = np.asarray(u, dtype=np.float64)
@@ -69,16 +63,8 @@ class HeavyTailed:
             tail, sign = (1.0 - u) / 2, np.ones_like(u)
         else:
             tail, sign = np.minimum(u, 1.0 - u), np.where(u < 0.5, -1.0, 1.0)
-        tail = np.clip(tail, 1e-15, 0.5)
-        goal = -np.log(2 * tail)
-        depth, size = self._table
-        x = np.interp(goal, depth, size)
-        two_sided = replace(self, positive=False)
-        for _ in range(3):
-            upper = np.maximum(self._upper(x), 1e-300)
-            slope = np.exp(two_sided.log_prob(x)) / upper
-            x = np.clip(x - (-np.log(2 * upper) - goal) / slope, 0.0, size[-1])
-        return np.asarray(sign * x)
+        goal = -np.log(2 * np.clip(tail, 1e-15, 0.5))
+        return np.asarray(sign * self.typical * _quantiles(self.smallest).at(goal))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Cumulative distribution function, any shape."""
@@ -91,6 +77,34 @@ class HeavyTailed:
     def __str__(self) -> str:
         kind = "positive heavy-tailed" if self.positive else "heavy-tailed about 0"
         return f"{kind}, typical {self.typical:g}"
+
+
+@dataclass(frozen=True, eq=False)
+class _Quantiles:
+    """Quantiles of the mixture of typical size one: a table of -log(2 x upper tail), and the size it belongs to."""
+
+    sds: FloatArray
+    depth: FloatArray
+    size: FloatArray
+
+    def at(self, goal: FloatArray) -> FloatArray:
+        """Return the sizes at which the tail has this depth, any shape."""
+        x = np.interp(goal, self.depth, self.size)
+        for _ in range(3):
+            scaled = x[..., None] / (self.sds * math.sqrt(2))
+            upper = np.maximum(0.5 * erfc(scaled).mean(axis=-1), 1e-300)
+            density = (np.exp(-(scaled**2)) / (self.sds * math.sqrt(2 * math.pi))).mean(axis=-1)
+            x = np.clip(x + (np.log(2 * upper) + goal) * upper / density, 0.0, self.size[-1])
+        return np.asarray(x)
+
+
+@lru_cache(maxsize=16)
+def _quantiles(smallest: float) -> _Quantiles:
+    """Tabulate the quantiles once for every typical size: smooth, monotone, from 0."""
+    sds = np.geomspace(smallest, SMALLEST_AND_LARGEST[1], _N_SCALES)
+    size = np.concatenate([[0.0], np.geomspace(1e-5, 300.0, 600)])
+    upper = 0.5 * erfc(size[:, None] / (sds * math.sqrt(2))).mean(axis=-1)
+    return _Quantiles(sds, -np.log(2 * upper), size)
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ class Estimated(Known[V]):
     def __post_init__(self) -> None:
         super().__post_init__()
         if len(self.marginals) != len(self.values):
-            raise ParameterError("marginals", self.marginals, "one for each of the values")
+            raise ParameterError("marginals", self.marginals, "as many as values, one for each")
 
     @property
     def informed(self) -> Informed[V]:

@@ -75,7 +75,7 @@ def with_arm_error(
         arm,
         run.readings,
         last.posterior,
-        last.kinds,
+        last.kinds.wary,
         mean=last.mean,
         sd=last.sd,
         likely_shape=last.likely_shape,
@@ -103,7 +103,7 @@ def arm_error(
     experiment, arm, readings
         The experiment, the arm, the readings so far.
     posterior, kinds
-        The posterior given them, joined and kind by kind.
+        The posterior given them, joined and kind by kind, by the same odds.
     mean, sd, likely_shape
         Moments of the shape's parameters, (n_params,) each, and the label of the most probable shape, see `Step`.
     rng

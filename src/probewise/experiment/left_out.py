@@ -29,10 +29,14 @@ _ALIASES = (
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Probability of each effect by name, most probable first, with a sentence; `leading` is the most probable."""
+    """Probability of each effect by name, most probable first, the same by the warier odds, and a sentence.
+
+    `leading` is the most probable.
+    """
 
     probability: Mapping[str, float]
-    sentence: str
+    wary: Mapping[str, float]
+    sentence: str = ""
 
     @property
     def leading(self) -> str:
@@ -41,13 +45,12 @@ class LeftOut:
 
     @property
     def credible_set(self) -> tuple[str, ...]:
-        """Names in the 95 % credible set."""
+        """Names that hold 95 % of the probability, and every other that holds 5 % of it by the warier odds."""
         held, names = 0.0, []
         for name, p in self.probability.items():
-            names.append(name)
+            if held < _CREDIBLE or self.wary[name] >= 1.0 - _CREDIBLE:
+                names.append(name)
             held += p
-            if held >= _CREDIBLE:
-                break
         return tuple(names)
 
     def as_json(self) -> dict[str, Any]:
@@ -62,22 +65,24 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
     """Summarise the probabilities after a step, in a run with this prior trust in its sensor."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     probability = {name: p for p, name in shares}
+    wary = {name or CLEAN: p for name, p in last.kinds.wary.left_out.items()}
     if trust == 1:
-        return LeftOut(probability, "The sensor model was taken for complete, as it was told to be.")
+        return LeftOut(probability, wary, "The sensor model was taken for complete, as it was told to be.")
     name, p = next(iter(probability.items()))
-    others = [spoken_name(n) for n in LeftOut(probability, "").credible_set[1:] if n != CLEAN]
+    others = [spoken_name(n) for n in LeftOut(probability, wary).credible_set[1:] if n != CLEAN]
     aliases = _ALIASES if WITH_CARDS.keys().isdisjoint(last.left_out) else ""
     beside = f" Not excluded: {', '.join(others)}." if others else ""
     if name == CLEAN:
         return LeftOut(
             probability,
+            wary,
             f"The sensor model leaves nothing out that shows (probability {p:.3g}).{beside} {aliases}".strip(),
         )
     if p < _NAMED:
         said = f"Something may be left out, most probably {spoken_name(name)} (probability {p:.3g})."
     else:
         said = f"The sensor model leaves something out: {_said(last, name)} (probability {p:.3g})."
-    return LeftOut(probability, f"{said}{beside} {aliases}".strip())
+    return LeftOut(probability, wary, f"{said}{beside} {aliases}".strip())
 
 
 def _said(last: Step, name: str) -> str:

@@ -32,19 +32,14 @@ from probewise.experiment.journal import (
 )
 from probewise.experiment.judging import OFF_SDS, chance_off, doubt, fit, information, learnt, moments, stop_reason
 from probewise.experiment.pace import Pace
-from probewise.experiment.posterior import Posterior, prior_posterior, reconsidered
+from probewise.experiment.posterior import prior_posterior, reconsidered
 from probewise.experiment.setting import Experiment, widest_mm
-from probewise.experiment.settling import settling
+from probewise.experiment.settling import ENOUGH_BITS, settling
 from probewise.experiment.values import ArmError, Exploration, State, Step
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
 __all__ = ["begin", "explore", "run", "step"]
-
-WARY = 12.0
-"""Factor on the odds that the sensor model is incomplete, wherever the shape is at stake: choice of readings, stopping
-rule and reported shape. By the plain odds a fault that a dozen readings can hardly show would be right one time in ten,
-and the intervals of a run that has it would miss; the probabilities of the faults themselves keep those odds."""
 
 
 def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> State:
@@ -122,10 +117,12 @@ def step(
         # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         carried = experiment.learning.updated(state.posterior, problem.recording, rng=rng)
-    wary, posterior = _wary(experiment, carried, rng)
+    wary = carried.wary
+    posterior = wary.joined(rng=rng)
     if experiment.trust < 1 and _is_known(experiment, posterior, None, "", rng)[0]:
         carried = reconsidered(carried, problem.recording, experiment.n_particles, rng=rng)
-        wary, posterior = _wary(experiment, carried, rng)
+        wary = carried.wary
+        posterior = wary.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)
     leader = carried.kinds[carried.leader]
     p_value, worst = fit(experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording))
@@ -140,18 +137,21 @@ def step(
     def arms() -> ArmError | None:
         if experiment.fitted_arm is None:
             return None
-        of = (experiment, experiment.fitted_arm, readings, posterior, carried)
+        of = (experiment, experiment.fitted_arm, readings, posterior, wary)
         return arm_error(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
 
     arm = arms() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
     prospect, outlook = inquire(experiment, posterior, drawn, field, at=reading, goal=_left(experiment, arm))
+    asks = False
     if experiment.trust < 1:
-        outlook = settling(experiment, wary, prospect, outlook, readings, rng=rng)
+        known, _ = _is_known(experiment, posterior, arm, likely, rng)
+        outlook = settling(experiment, wary, prospect, outlook, readings, rng=rng, known=known)
+        asks = known and outlook.highest >= ENOUGH_BITS and (max_readings is None or len(readings) < max_readings)
     if arm is None and (outlook.flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = arms()
     known, off = _is_known(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
-    reason = stop_reason(experiment, sd, known, p_value, outlook, len(readings), max_readings, arm_sd)
+    reason = stop_reason(experiment, sd, known and not asks, p_value, outlook, len(readings), max_readings, arm_sd)
     pose, *planned = state.planned or next_poses(experiment, prospect, outlook, rng=rng)
     info = Step(
         number=len(readings),
@@ -176,12 +176,6 @@ def step(
         arm=arm,
     )
     return State(readings, carried, pose, tuple(planned)), info
-
-
-def _wary(experiment: Experiment, carried: Posterior, rng: np.random.Generator) -> tuple[Posterior, Weighted]:
-    """Return the posterior by the warier odds, as kinds and joined."""
-    wary = carried if experiment.trust == 1 else carried.doubting(WARY)
-    return wary, wary.joined(rng=rng)
 
 
 def _left(experiment: Experiment, arm: ArmError | None) -> Goal | None:

@@ -37,7 +37,7 @@ from probewise.nested.importance import Weighted
 from probewise.nested.result import NestedResult
 from probewise.recordings.plan import Recording
 
-__all__ = ["Posterior", "prior_posterior", "reconsidered", "updated"]
+__all__ = ["WARY", "Posterior", "prior_posterior", "reconsidered", "updated"]
 
 FromScratch = Callable[[SensorProblem], NestedResult]
 
@@ -57,6 +57,11 @@ _BEHIND = 9.0  # nats behind the best kind, from which on a rival is not sampled
 _FEWEST = 4.0  # effective draws below which a sample replaces none
 _LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
 _LOST = 0.01  # probability of a kind that must not be missed
+
+WARY = 12.0
+"""Factor on the odds that the sensor model is incomplete, wherever something is concluded: choice of readings, stopping
+rule, reported shape and its error, credible set. By the plain odds a fault that a dozen readings can hardly show would
+be right one time in ten, and whatever is concluded of a run that has it would miss."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +105,11 @@ class Posterior:
         log_prior -= logsumexp(log_prior)
         kinds = tuple(replace(k, log_prior=p) for k, p in zip(self.kinds, log_prior.tolist(), strict=True))
         return replace(self, kinds=kinds)
+
+    @property
+    def wary(self) -> Posterior:
+        """The posterior by the warier odds; itself in a run that trusts its sensor."""
+        return self.doubting(WARY) if any(kind.left_out for kind in self.kinds) else self
 
     def joined(self, *, rng: np.random.Generator) -> Weighted:
         """Combine the samples of all kinds to one weighted posterior."""

@@ -3,14 +3,17 @@
 Several kinds of hypotheses may explain all readings and differ in the shape. The utility is the expected information
 about all of them together. If some reading may be the last, it is the probability of that: every length known under the
 mixture, with little chance that one is wrong. Kinds that are aliased but agree on the shape then need not be
-distinguished.
+distinguished. Once the lengths are known, the utility is the information about the name of what the sensor leaves out,
+and the run goes on while a reading promises enough of it.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
@@ -24,19 +27,25 @@ from probewise.recordings.plan import Plan
 from probewise.scene import outlines
 from probewise.scene.regions import EllipseRegion, PolygonRegion
 
-__all__ = ["settling"]
+__all__ = ["ENOUGH_BITS", "settling"]
+
+ENOUGH_BITS = 0.08
+"""Expected information about the name of what is left out for which a reading is taken after the shape is known."""
 
 _NEAR = 15.0  # times the target sd: beyond it, the ordinary information is used
 _HYPOTHESES = 800
 _FAIRNESS = 0.75  # power of a kind's probability in its share of the drawn hypotheses
 _LEAST_EACH = 6
+_LEAST_OF_NAMES = 30  # for their moments
 _COUNTS = 1e-5  # least probability of a kind to be included
 _BEST = 60  # places with the largest information about all parameters
 _AT_EDGES = 40
 _ANYWHERE = 20
 _LEAST_CHANCE = 0.25  # probability of ending the run from which only that counts
+_NODES = 12  # of the reading expected under a name
 _ENDING = 60  # most informative places, tested for ending the run
 _LABEL = "expected information about the shape and what the sensor leaves out (bits)"
+_NAMES = "expected information about what the sensor leaves out (bits)"
 _ENDS = "probability that a reading there ends the run, whatever the sensor leaves out"
 
 
@@ -48,15 +57,18 @@ def settling(
     readings: tuple[Reading, ...],
     *,
     rng: np.random.Generator,
+    known: bool = False,
 ) -> UtilityMap:
     """Return the map of the utility over designs for all kinds; far from the end, the given map.
+
+    `known` says whether the posterior knows the shape, so that only the name of what is left out is open.
 
     Candidates are the designs with the largest information, those at edges and centres of probable shapes, earlier
     places, and some random ones.
     """
     if prospect.goal is None:
         return outlook
-    theta, lengths, weight = _drawn(experiment, posterior, rng)
+    theta, lengths, weight = _drawn(experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng)
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return outlook
@@ -65,6 +77,12 @@ def settling(
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
+    if known:
+        names = [kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own]
+        values = np.zeros(len(prospect.designs))
+        values[prospect.rows[rows]] = _bits_of_names(weight, answers, np.array(names), prospect.readout.noise_sd)
+        values.flags.writeable = False
+        return UtilityMap(prospect.designs, values, outlook.reachable, _NAMES)
     worth, label = _bits(weight, answers, prospect), _LABEL
     best = np.argsort(-worth, kind="stable")[:_ENDING]
     chance = _ends(lengths, weight, answers[:, best], prospect, prospect.goal.sd, OFF_SDS * experiment.stop_sd_mm)
@@ -78,7 +96,7 @@ def settling(
 
 
 def _drawn(
-    experiment: Experiment, posterior: Posterior, rng: np.random.Generator
+    experiment: Experiment, posterior: Posterior, least: int, rng: np.random.Generator
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
     """Draw hypotheses of each kind, with the lengths, (n, n_lengths), and weights, (n,), of all.
 
@@ -86,7 +104,7 @@ def _drawn(
     """
     probability = posterior.probability
     asked = np.where(probability > _COUNTS, probability**_FAIRNESS, 0.0)
-    counts = np.where(asked > 0, np.maximum(_HYPOTHESES * asked / asked.sum(), _LEAST_EACH), 0).astype(int)
+    counts = np.where(asked > 0, np.maximum(_HYPOTHESES * asked / asked.sum(), least), 0).astype(int)
     columns = np.array(experiment.goal.columns) if experiment.goal is not None else np.empty(0, dtype=int)
     theta, lengths, weight = [], [], []
     for kind, particles, n, p in zip(posterior.kinds, posterior.particles, counts, probability, strict=True):
@@ -164,3 +182,30 @@ def _ends(
         ends &= np.where(off, joint, 0.0).sum(axis=0) < MOST_OFF * mass
         out[design] = mass[ends].sum() / mass.sum()
     return out
+
+
+def _bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], noise_sd: float) -> FloatArray:
+    """Return the expected information about the name alone, in bits, (n_designs,), by a Gaussian for each name.
+
+    Histograms of the few hypotheses that a name has would tell names apart that agree.
+    """
+    share, mean, sd = [], [], []
+    for name in np.unique(names):
+        own = names == name
+        part = float(weight[own].sum())
+        average = weight[own] @ answers[own] / part
+        share.append(part)
+        mean.append(average)
+        sd.append(np.sqrt(weight[own] @ (answers[own] - average) ** 2 / part + noise_sd**2))
+    p, middle, width = np.array(share)[:, None], np.array(mean), np.array(sd)
+    # The entropy of the mixture, by Gauss-Hermite nodes about each name's Gaussian.
+    nodes, node_weight = np.polynomial.hermite_e.hermegauss(_NODES)
+    node_weight = node_weight / node_weight.sum()
+    told = np.zeros(answers.shape[1])
+    for k, part in enumerate(share):
+        at = middle[k] + width[k] * nodes[:, None]
+        log_density = -0.5 * ((at[:, None] - middle) / width) ** 2 - np.log(width)
+        most = log_density.max(axis=1)
+        of_all = most + np.log((p * np.exp(log_density - most[:, None])).sum(axis=1))
+        told += part * (node_weight @ (log_density[:, k] - of_all))
+    return np.asarray(np.maximum(told / math.log(2.0), 0.0))

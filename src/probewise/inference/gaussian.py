@@ -46,7 +46,9 @@ class GaussianKnown:
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         sd = np.asarray(self.sd)
         if sd.ndim == 1 and sd.size != readings.size:
-            raise ShapeError(f"{readings.size} readings against {sd.size} values of sd; allowed: one each, or a number")
+            raise ShapeError(
+                f"sd has {sd.size} values for {readings.size} readings; allowed: one per reading, or one number"
+            )
         z = residuals(readings, predicted) / sd
         constant = 0.5 * readings.size * _LOG_2PI + float(np.broadcast_to(np.log(sd), readings.shape).sum())
         return np.asarray(-0.5 * np.einsum("ij,ij->i", z, z) - constant)

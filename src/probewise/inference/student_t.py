@@ -169,7 +169,9 @@ class StudentT:
         """Log likelihood of each hypothesis, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         residual = residuals(readings, predicted)
         if residual.shape[1] != self.groups.size:
-            raise ShapeError(f"{residual.shape[1]} readings against {self.groups.size} groups; allowed: one each")
+            raise ShapeError(
+                f"groups has {self.groups.size} values for {residual.shape[1]} readings; allowed: one per reading"
+            )
         square = self.sums(np.square(residual, out=residual))
         integral = log_sigma_integral(square, self.sizes, self.sd_floor, self.sd_ceiling)
         constant = 0.5 * self.groups.size * _LOG_2PI + self.sizes.size * math.log(

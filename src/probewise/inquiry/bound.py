@@ -70,10 +70,10 @@ def fewest_readings(
         Capacity of the sensor, bits per reading (`capacity_bits`).
     """
     if not 0 < most_covered < 1:
-        raise ParameterError("most_covered", most_covered, "between 0 and 1")
+        raise ParameterError("most_covered", most_covered, "greater than 0, less than 1")
     if not prior_bits >= met_bits >= target_bits:
         raise ParameterError(
-            "(prior_bits, met_bits, target_bits)", (prior_bits, met_bits, target_bits), "descending: learning narrows"
+            "(prior_bits, met_bits, target_bits)", (prior_bits, met_bits, target_bits), "in descending order"
         )
     yes = min(most_covered, 0.5)
     chance = np.array([yes, 1.0 - yes])

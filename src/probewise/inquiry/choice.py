@@ -22,9 +22,9 @@ def best_places(utility: FloatArray, reachable: BoolArray) -> BoolArray:
         If no place is reachable.
     """
     if utility.shape != reachable.shape or utility.ndim != 1:
-        raise ShapeError(f"utility {utility.shape} and reachable {reachable.shape}; allowed: both (n_places,)")
+        raise ShapeError(f"utility has shape {utility.shape}, reachable {reachable.shape}; allowed: (n_places,) both")
     if not reachable.any():
-        raise ReachError("reachable", 0, f"at least one of {reachable.size} that can be reached")
+        raise ReachError("reachable places", 0, f"1 or more of the {reachable.size}; move the arm or the places")
     require_finite("utility", utility[reachable])
     best = reachable & (utility >= utility[reachable].max() - TIE)
     return np.asarray(best)

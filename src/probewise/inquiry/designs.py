@@ -56,7 +56,7 @@ class Designs:
         if not self.orientations_rad or not np.isfinite(self.orientations_rad).all():
             raise ParameterError("orientations_rad", self.orientations_rad, "one finite angle or more")
         if not self.repeats or min(self.repeats) < 1:
-            raise ParameterError("repeats", self.repeats, "one number of readings or more, each 1 or greater")
+            raise ParameterError("repeats", self.repeats, "one number or more, each 1 or greater")
         for name, values in self.settings:
             if not values or not np.isfinite(values).all():
                 raise ParameterError(f"settings {name}", values, "one finite value or more")

@@ -298,14 +298,16 @@ def _levels(model: SensorModel, radius_mm: float) -> tuple[float, float]:
     east = np.array([[1.0, 0.0]])
     dark, bright = _asked(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
     if dark == bright:
-        raise ParameterError("levels", (dark, bright), "a sensor that tells the disc from its surroundings")
+        raise ParameterError(
+            "levels", (dark, bright), "two different levels: a sensor that tells the disc from its surroundings"
+        )
     return float(dark), float(bright)
 
 
 def _margin(
     model: SensorModel, low_mm: float, high_mm: float, directions: FloatArray, dark: float, bright: float
 ) -> float:
-    """Return the distance from an edge beyond which the level is constant, for the smallest and the largest disc."""
+    """Return the distance from a disc's edge beyond which the reading is constant, for small and large discs alike."""
     margin = _COARSE_MM
     for radius in (low_mm, high_mm):
         distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)

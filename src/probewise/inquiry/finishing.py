@@ -40,7 +40,7 @@ class Finishing:
 
     def __post_init__(self) -> None:
         if not 0 < self.least <= 1:
-            raise ParameterError("least", self.least, "greater than 0, up to 1")
+            raise ParameterError("least", self.least, "greater than 0, 1 or less")
 
     @property
     def label(self) -> str:

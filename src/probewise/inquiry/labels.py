@@ -70,7 +70,7 @@ class WhichShape:
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """See `Label`."""
         if "shape" not in names:
-            raise ParameterError("shape", names, "a set of shapes, two or more, to be told apart")
+            raise ParameterError("names", names, "shape among them: the hypotheses of two shapes or more")
         return np.floor(theta[:, names.index("shape")]).astype(np.int64)
 
 

@@ -67,7 +67,8 @@ class Prospect:
     def __post_init__(self) -> None:
         if self.theta.ndim != 2 or self.weight.shape != (len(self.theta),) or 0 in self.theta.shape:
             raise ShapeError(
-                f"theta {self.theta.shape}, weight {self.weight.shape}; allowed: (n_samples, n_params), (n_samples,)"
+                f"theta has shape {self.theta.shape}, weight {self.weight.shape}; "
+                "allowed: (n_samples, n_params), (n_samples,)"
             )
         if len(self.plan) != len(self.designs) or self.cost_s.shape != self.rows.shape:
             raise ShapeError(

@@ -61,7 +61,9 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
     """
     total = sum(rival.probability for rival in rivals)
     if len(rivals) < 2 or not total > 0:
-        raise ParameterError("rivals", [rival.probability for rival in rivals], "two models or more, one probable")
+        raise ParameterError(
+            "rivals", [rival.probability for rival in rivals], "two models or more, one of them above 0"
+        )
     answers = [predicted(rival.model, rival.theta, plan) for rival in rivals]
     low, high = min(a.min() for a in answers), max(a.max() for a in answers)
     levels = spread_levels(float(low), float(high), readout.noise_sd / _PER_SD, most=MOST_LEVELS)

@@ -5,6 +5,7 @@ Metropolis-Hastings steps) and its section on estimating the SSF's parameters (t
 the stopping rule on consecutive values of log Z).
 """
 
+from probewise.nested.dead_points import DeadPoints
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.dynamic import Goal, intensified
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
@@ -35,6 +36,7 @@ __all__ = [
     "Agreement",
     "Bound",
     "Check",
+    "DeadPoints",
     "DiversifyTally",
     "Evaluator",
     "EvidenceChange",

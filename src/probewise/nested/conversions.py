@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import json
+from collections.abc import Mapping
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-
-if TYPE_CHECKING:
-    from probewise.nested.result import NestedResult
+from probewise.nested.dead_points import DeadPoints
 
 __all__ = ["to_anesthetic", "to_arviz"]
 
 
-def to_anesthetic(result: NestedResult) -> Any:
+def to_anesthetic(result: DeadPoints) -> Any:
     """Convert to `anesthetic.NestedSamples`: parameters, `logL` and `logL_birth` of every dead point.
 
     anesthetic recomputes the number of live points from births and deaths, and has no labels. On plateaus
@@ -40,17 +38,19 @@ def to_anesthetic(result: NestedResult) -> Any:
     )
 
 
-def to_arviz(result: NestedResult, *, rng: np.random.Generator, n: int | None = None) -> Any:
-    """Convert to ArviZ's container: `n` equally weighted samples as one chain, with the evidence in the attributes.
+def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.random.Generator, n: int) -> Any:
+    """Convert to ArviZ's container: `n` equally weighted samples as one chain, and what the run says of itself.
 
     Parameters
     ----------
     result
-        The result to convert.
+        The dead points to draw from.
+    attributes
+        What the container says of the whole: the evidence, its error, versions.
     rng
         Source of randomness, for drawing the samples.
     n
-        Number of samples; by default the effective sample size, so that few are repeated.
+        Number of samples.
 
     Returns
     -------
@@ -67,7 +67,7 @@ def to_arviz(result: NestedResult, *, rng: np.random.Generator, n: int | None = 
     arviz = _optional("arviz")
     if not result.names:
         raise ParameterError("names", result.names, "one parameter or more; without any there are no samples")
-    rows = result.rows(max(1, int(result.n_eff)) if n is None else n, rng=rng)
+    rows = result.rows(n, rng=rng)
     groups = {
         "posterior": {name: result.theta[None, rows, i] for i, name in enumerate(result.names)},
         "sample_stats": {
@@ -76,25 +76,13 @@ def to_arviz(result: NestedResult, *, rng: np.random.Generator, n: int | None = 
             "row": rows[None, :],
         },
     }
-    attributes = {
-        "inference_library": "probewise",
-        "inference_library_version": result.versions["probewise"],
-        "log_z": result.log_z,
-        "log_z_error": result.log_z_error,
-        "information_nats": result.information,
-        "n_eff": result.n_eff,
-        "n_calls": result.n_calls,
-        "n_live": result.n_live,
-        "stop_reason": result.stop_reason,
-        "warnings": json.dumps(result.warnings),
-    }
     # ArviZ 1.0 takes all groups as one mapping, earlier versions one argument per group.
     if "data" in inspect.signature(arviz.from_dict).parameters:
-        return arviz.from_dict(groups, attrs={"/": attributes})
-    return arviz.from_dict(**groups, attrs=attributes)
+        return arviz.from_dict(groups, attrs={"/": dict(attributes)})
+    return arviz.from_dict(**groups, attrs=dict(attributes))
 
 
-def _strict_levels(result: NestedResult) -> tuple[FloatArray, FloatArray]:
+def _strict_levels(result: DeadPoints) -> tuple[FloatArray, FloatArray]:
     """Log likelihoods at death and birth, (n_dead,), with ties broken in the order of the labels."""
     order = np.lexsort((result.label, result.log_likelihood))
     strict = result.log_likelihood[order] + result.log_start

@@ -382,7 +382,7 @@ class _Metrics:
         )
 
     def measure(self, rows: IntArray, home: IntArray) -> IntArray:
-        """Return the row of cluster `home` for the chains `rows`."""
+        """Return the row of cluster `home`'s metric for chains `rows`; a start's own cluster is taken without it."""
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
     def hop(self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:

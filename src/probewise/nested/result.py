@@ -7,7 +7,7 @@ import json
 import math
 import platform
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -15,24 +15,21 @@ from typing import Any
 import numpy as np
 import scipy
 
-from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
-from probewise._display import ShowsItself
-from probewise._kinds import require_number, require_path, require_rng, require_whole
+from probewise._arrays import IntArray, frozen_int
+from probewise._kinds import require_path
 from probewise._version import __version__
-from probewise.errors import FileError, ParameterError, ShapeError
+from probewise.errors import FileError
 from probewise.nested import conversions
-from probewise.nested.evidence import log_volumes
-from probewise.nested.weights import weighted_quantiles
+from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, of_length
 from probewise.recordings.atomic import write_bytes_atomically
 
 __all__ = ["Agreement", "Check", "NestedResult", "few_lineages", "few_possible", "versions"]
 
 _FORMAT = "nested-result/4"
-_PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
-_COUNTS = ("parent", "n_at_death", "insertion_rank", "insertion_n_ranked")
 # Lineage variance above which the run descends from too few lineages to estimate its own error.
 _MOST_MEMORY = 10.0
-_ARRAYS = ("theta", *_PER_POINT, *_COUNTS)
+_PER_INSERTION = ("insertion_rank", "insertion_n_ranked")
+_ARRAYS = ("theta", *PER_POINT, *COUNTS, *_PER_INSERTION)
 
 
 def versions() -> dict[str, str]:
@@ -123,27 +120,15 @@ def few_lineages(memory: float) -> str | None:
 
 
 @dataclass(frozen=True, eq=False)
-class NestedResult(ShowsItself):
+class NestedResult(DeadPoints):
     """The evidence, the weighted samples and the record of the run.
+
+    The samples, their means and quantiles, are those of `DeadPoints`, whose attributes come first.
 
     Attributes
     ----------
-    names
-        Parameter names, one per column of theta.
-    theta
-        Dead points in order of death, followed by the last live points, (n_dead, n_params).
-    log_likelihood, label, log_weight
-        Of each: log likelihood, the number from 0 to 1 that orders points of equal likelihood,
-        and log posterior weight (the weights sum to one), all (n_dead,).
-    log_birth, birth_label
-        Log likelihood and label of the dead point above which each was drawn, (n_dead,);
-        minus infinity and 1 for draws from the whole prior.
-    parent
-        Row of the point at which each point's chain began; -1 for the initial draws from the prior, (n_dead,).
-    n_at_death
-        Number of points alive when each died, itself included, (n_dead,).
-    log_start, log_start_error
-        Natural log of the share of the prior with nonzero likelihood, and its standard error.
+    log_start_error
+        Standard error of `log_start`.
     log_z, log_z_error
         Natural log of the evidence, and its standard error: from simulated shrinkages, times the root of `memory`.
     memory
@@ -175,16 +160,6 @@ class NestedResult(ShowsItself):
         A second estimate of the evidence; None if there is none.
     """
 
-    names: tuple[str, ...]
-    theta: FloatArray
-    log_likelihood: FloatArray
-    label: FloatArray
-    log_weight: FloatArray
-    log_birth: FloatArray
-    birth_label: FloatArray
-    parent: IntArray
-    n_at_death: IntArray
-    log_start: float
     log_start_error: float
     log_z: float
     log_z_error: float
@@ -205,37 +180,10 @@ class NestedResult(ShowsItself):
     check: Check | None = None
 
     def __post_init__(self) -> None:
-        theta = frozen(self.theta)
-        if theta.ndim != 2 or theta.shape[1] != len(self.names):
-            raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_dead, {len(self.names)}) for {self.names}")
-        object.__setattr__(self, "theta", theta)
-        for name in _PER_POINT:
-            self._freeze(name, frozen(getattr(self, name)), len(theta), "row of theta")
-        for name in ("parent", "n_at_death"):
-            self._freeze(name, frozen_int(getattr(self, name)), len(theta), "row of theta")
-        rank = frozen_int(self.insertion_rank)
-        self._freeze("insertion_rank", rank, rank.size, "inserted point")
-        self._freeze("insertion_n_ranked", frozen_int(self.insertion_n_ranked), rank.size, "inserted point")
-
-    def _freeze(self, name: str, values: FloatArray | IntArray, n: int, one: str) -> None:
-        if values.shape != (n,):
-            raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n},), one per {one}")
-        object.__setattr__(self, name, values)
-
-    @property
-    def weight(self) -> FloatArray:
-        """Posterior weights, summing to one, (n_dead,)."""
-        return np.asarray(np.exp(self.log_weight))
-
-    @property
-    def n_dead(self) -> int:
-        """Number of weighted samples."""
-        return len(self.theta)
-
-    @property
-    def log_volume(self) -> FloatArray:
-        """Expected natural log of the prior share above each sample, ln X, (n_dead,)."""
-        return log_volumes(self.n_at_death, self.log_start)
+        super().__post_init__()
+        for name in _PER_INSERTION:
+            values = of_length(name, frozen_int(getattr(self, name)), np.size(self.insertion_rank), "inserted point")
+            object.__setattr__(self, name, values)
 
     @property
     def calls_per_live_point_and_nat(self) -> float:
@@ -245,77 +193,6 @@ class NestedResult(ShowsItself):
         The excess is the cost of drawing above a bound.
         """
         return self.n_calls / (self.n_live * self.information) if self.information > 0 else math.inf
-
-    def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
-        """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
-        require_rng(rng)
-        n = require_whole("n", n)
-        ladder = np.cumsum(self.weight)
-        rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
-        return np.asarray(rng.permutation(np.minimum(rows, len(ladder) - 1)))
-
-    def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
-
-        Systematic resampling: a point of weight w occurs n w times, rounded up or down, so points
-        repeat only where a weight exceeds 1 / n; `diversify` makes repeated samples distinct.
-        """
-        return np.asarray(self.theta[self.rows(n, rng=rng)])
-
-    def mean(self, f: Callable[[FloatArray], FloatArray] | None = None, *, block: int | None = None) -> FloatArray:
-        """Average the parameters, or any function of them, over the posterior.
-
-        Parameters
-        ----------
-        f
-            Function from rows of theta, (n, n_params), to values, (n, ...), for instance an SSF field
-            (n, n_v, n_u); by default the parameters themselves.
-        block
-            Largest number of rows passed to `f` at a time, to bound memory; by default all.
-
-        Returns
-        -------
-        The posterior mean, with the shape of one row's value; (n_params,) without `f`.
-        """
-        if block is not None and block < 1:
-            raise ParameterError("block", block, "1 or more")
-        if f is None:
-            return np.asarray(self.weight @ self.theta)
-        size = self.n_dead if block is None else block
-        total: FloatArray | None = None
-        for first in range(0, self.n_dead, size):
-            theta, weight = self.theta[first : first + size], self.weight[first : first + size]
-            values = np.asarray(f(theta))
-            if values.shape[:1] != (len(theta),):
-                raise ShapeError(f"f(theta) has shape {values.shape}; allowed: {len(theta)} rows, as many as theta has")
-            part = np.asarray(np.tensordot(weight, values, axes=(0, 0)))
-            total = part if total is None else total + part
-        return np.zeros(0) if total is None else total
-
-    def covariance(self) -> FloatArray:
-        """Posterior covariance of the parameters, (n_params, n_params)."""
-        centred = self.theta - self.mean()
-        return np.asarray((centred * self.weight[:, None]).T @ centred)
-
-    def sd(self) -> FloatArray:
-        """Posterior standard deviation of the parameters, (n_params,)."""
-        return np.asarray(np.sqrt(self.weight @ (self.theta - self.mean()) ** 2))
-
-    def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
-        """Weighted quantiles of each parameter, (n_q,) -> (n_q, n_params)."""
-        return weighted_quantiles(self.theta, self.weight, q)
-
-    def interval(self, mass: float = 0.95) -> FloatArray:
-        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
-        share = "greater than 0, less than 1"
-        columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
-        if not 0 < require_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
-            raise ParameterError("mass", mass, share)
-        return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
-
-    def best(self) -> FloatArray:
-        """Parameters of the greatest likelihood, (n_params,)."""
-        return np.asarray(self.theta[int(np.argmax(self.log_likelihood))])
 
     def summary(self) -> str:
         """Describe the run and its posterior in plain text."""
@@ -359,8 +236,23 @@ class NestedResult(ShowsItself):
         return conversions.to_anesthetic(self)
 
     def to_arviz(self, *, rng: np.random.Generator, n: int | None = None) -> Any:
-        """Convert to ArviZ's container of samples; see `probewise.nested.conversions.to_arviz`."""
-        return conversions.to_arviz(self, rng=rng, n=n)
+        """Convert to ArviZ's container of `n` samples; see `probewise.nested.conversions.to_arviz`.
+
+        By default as many as the effective sample size, so that few are repeated.
+        """
+        attributes = {
+            "inference_library": "probewise",
+            "inference_library_version": self.versions["probewise"],
+            "log_z": self.log_z,
+            "log_z_error": self.log_z_error,
+            "information_nats": self.information,
+            "n_eff": self.n_eff,
+            "n_calls": self.n_calls,
+            "n_live": self.n_live,
+            "stop_reason": self.stop_reason,
+            "warnings": json.dumps(self.warnings),
+        }
+        return conversions.to_arviz(self, attributes, rng=rng, n=max(1, int(self.n_eff)) if n is None else n)
 
     def save(self, path: str | Path) -> None:
         """Write the result to one .npz file, atomically."""

@@ -20,7 +20,7 @@ __all__ = ["image_bytes", "read_image"]
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
-_ALLOWED = "a PNG of 8 bits a channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"
+_ALLOWED = "a PNG of 8 bits per channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"
 _LARGEST_PIXELS = 100_000_000
 # By version; 3.0 is only for structured arrays.
 _NPY_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}

@@ -290,7 +290,7 @@ class Recording(ShowsItself):
         self._require_plan()
         readings = frozen(self.readings, "readings")
         if readings.shape != (len(self.plan),):
-            raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), as the plan")
+            raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), one per row")
         object.__setattr__(self, "readings", readings)
 
     def _require_plan(self) -> None:
@@ -425,7 +425,9 @@ class Recording(ShowsItself):
         columns = columns_of(table)
         missing = [name for name in ("reading", "x_mm", "y_mm") if name not in columns]
         if missing:
-            raise ParameterError("columns", tuple(columns), f"also {', '.join(missing)}; rename the table's columns")
+            raise ParameterError(
+                "columns", tuple(columns), f"{', '.join(missing)} among them; rename the table's columns"
+            )
         turn_deg, turn_rad = columns.get("orientation_deg"), columns.get("orientation_rad", 0.0)
         if turn_deg is not None:
             if "orientation_rad" in columns:

@@ -37,12 +37,12 @@ class Prediction(ShowsItself):
     def __post_init__(self) -> None:
         readings = frozen(self.readings) if np.size(self.readings) else frozen(np.full(len(self.plan), np.nan))
         if readings.shape != (len(self.plan),):
-            raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), as the plan")
+            raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), one per row")
         object.__setattr__(self, "readings", readings)
         for name in ("mean", "sd", "log_density"):
             values = frozen(getattr(self, name))
             if values.shape != (len(self.plan),):
-                raise ShapeError(f"{name} has shape {values.shape}; allowed: ({len(self.plan)},), as the plan")
+                raise ShapeError(f"{name} has shape {values.shape}; allowed: ({len(self.plan)},), one per row")
             if name != "log_density":
                 require_finite(name, values)
             elif np.isinf(values).any():

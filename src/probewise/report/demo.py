@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,10 +10,10 @@ from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.calibration import Calibration
 from probewise.diagnosis import Diagnosis
-from probewise.experiment import Exploration
 from probewise.recordings import Prediction, Recording
 from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
+from probewise.report import doubt as doubt_report
 from probewise.report import exploration as exploration_report
 from probewise.report.held_out import most_gained
 from probewise.report.html import (
@@ -42,11 +41,11 @@ from probewise.report.plots import (
     residuals_by_scan,
     sensor_orientations,
 )
+from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import side_by_side
 from probewise.report.words import count, number, readable
 
 __all__ = [
-    "RobotSearch",
     "answer",
     "answers",
     "comparison_lines",
@@ -76,38 +75,6 @@ _SENSOR = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class RobotSearch:
-    """One robot's search: the name of its sensor model, its run, and the true shape."""
-
-    model: str
-    run: Exploration
-    truth: Mapping[str, float]
-    truth_mm: FloatArray
-    levels: tuple[float, float]
-
-    @property
-    def largest_error_mm(self) -> float:
-        """Largest absolute error of a parameter, in mm."""
-        last = self.run.last
-        return max(
-            abs(float(mean) - self.truth[name])
-            for name, mean in zip(last.names, last.mean, strict=True)
-            if name in self.truth and name.endswith("_mm")
-        )
-
-    @property
-    def first_white(self) -> int:
-        """Number of the first reading closer to white than to black: reaching it is luck, whatever the model."""
-        middle = sum(self.levels) / 2
-        seen = [r.value > middle for r in self.run.readings]
-        return seen.index(True) + 1 if any(seen) else len(seen)
-
-    def step_at(self, n: int) -> int:
-        """Return the number of the step after `n` readings, or of the last step if the run ended earlier."""
-        return min(n, len(self.run.steps))
-
-
 def answer(searches: Sequence[RobotSearch]) -> str:
     """Summarise in one sentence how many readings the SSF model saves, after the same first reading."""
     naive, ssf = (len(s.run.steps) - 1 for s in searches)
@@ -130,7 +97,12 @@ def equal_start(searches: Sequence[RobotSearch]) -> str:
 
 
 def answers(
-    started_alike: Sequence[RobotSearch], diagnosis: Diagnosis, *, concealed: str, seed: int
+    started_alike: Sequence[RobotSearch],
+    diagnosis: Diagnosis,
+    doubt: Sequence[RobotSearch],
+    *,
+    concealed: str,
+    seed: int,
 ) -> dict[str, str | int]:
     """Return the page's main findings, for other pages to quote."""
     return {
@@ -142,6 +114,7 @@ def answers(
         "concealed": concealed,
         "diagnosis": diagnosis_report.answer(diagnosis),
         "reason": readable(diagnosis.reason),
+        "doubt": doubt_report.answer(doubt),
     }
 
 
@@ -270,6 +243,7 @@ def write_page(
     started_alike: Sequence[RobotSearch],
     frames: Sequence[Sequence[bytes]],
     diagnosis: Diagnosis,
+    doubt: Sequence[RobotSearch],
     drawn: Mapping[str, bytes],
     concealed: str,
     seed: int,
@@ -285,8 +259,10 @@ def write_page(
         PNG of each step of each search.
     diagnosis
         Of the second recording.
+    doubt
+        The search of the robot that trusts its sensor model, and of the one that doubts it.
     drawn
-        From `figures` and `diagnosis_figures`.
+        From `figures`, `diagnosis_figures` and `report.doubt.figures`.
     concealed
         Effect that the simulated world concealed in the second recording.
     seed, seconds
@@ -296,6 +272,7 @@ def write_page(
         _sensor_section(calibration, recording, prediction, drawn, seed),
         _search_section(searches, started_alike, frames, drawn),
         _diagnosis_section(diagnosis, drawn, concealed),
+        doubt_report.section(doubt, drawn),
         Section(
             "This run",
             (

@@ -15,17 +15,21 @@ from probewise.report.plots import beliefs_by_round, png
 from probewise.report.terms import explained, terms_of
 from probewise.report.words import count, probability, readable
 
-__all__ = ["answer", "believed", "write_page"]
+__all__ = ["answer", "believed", "believed_picture", "write_page"]
 
 _MOST_TOLD = 4
 _LEAST_TOLD = 0.005
 
 
+def believed_picture(found: Investigation) -> bytes:
+    """Draw the probability of each explanation after each round, as a PNG."""
+    return png(beliefs_by_round({_title(each): _beliefs(each) for each in found.rounds}))
+
+
 def believed(found: Investigation) -> Markup:
-    """Draw the probability of each explanation after each round."""
+    """Show the probability of each explanation after each round."""
     return figure(
-        png(beliefs_by_round({_title(each): _beliefs(each) for each in found.rounds})),
-        "Probability of each explanation after each round, given all readings so far.",
+        believed_picture(found), "Probability of each explanation after each round, given all readings so far."
     )
 
 

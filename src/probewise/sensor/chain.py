@@ -120,7 +120,7 @@ class Chain:
     the levels', the scene's, then the effects' as "effect.parameter".
 
     `n_nodes` is the number of quadrature nodes over curved edges (the default is accurate to 1e-8 of
-    I_max - I_min, `FAST_NODES` to 1e-4).
+    I_max - I_min, `FAST_NODES` to 1e-4, mostly 1e-5).
     """
 
     ssf: SSFModel

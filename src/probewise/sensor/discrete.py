@@ -44,7 +44,7 @@ def seen_discrete(region: Region, field: SSFField, poses: Poses) -> FloatArray:
     x, y, turn = np.broadcast_arrays(poses.x_mm, poses.y_mm, poses.orientation_rad)
     n_poses, n_points = x.shape
     if n_poses not in (1, region.n_regions) and region.n_regions != 1:
-        raise ShapeError(f"poses of {n_poses} hypotheses over {region.n_regions} regions; allowed: as many, or 1")
+        raise ShapeError(f"poses of {n_poses} hypotheses, {region.n_regions} regions; allowed: equal numbers, or 1")
     if n_poses > 1:
         # Each hypothesis has its own poses: evaluate one hypothesis at a time.
         out = np.empty((n_poses, n_points))

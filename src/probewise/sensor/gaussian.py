@@ -9,6 +9,7 @@ Gaussian of the SSF over the region. The other, the paper's sum over pixels, is
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, singledispatch
 
@@ -30,7 +31,7 @@ from probewise.scene.regions import (
     StripesRegion,
     UniformRegion,
 )
-from probewise.sensor._normal import normal_cdf
+from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_in_place
 
 __all__ = [
     "ACCURATE_NODES",
@@ -389,11 +390,95 @@ def _seen_of_unit_disc(
 ) -> FloatArray:
     """Mass of Gaussians, arrays broadcasting to (n_samples, n_points), inside the unit circle.
 
-    Only the (sample, reading) pairs whose edge is within reach are integrated. Each frame is turned so
-    that y runs along the edge nearest to the mean; given y, the integral over x is a difference of two
-    cumulatives. Where the footprint covers most of the disc, y = sin t removes the square-root
-    singularity at the chord's end.
+    Readings of a scan along a line share the chords along it, where these are smooth.
     """
+    line = None if max(var_p.shape[1], var_q.shape[1], cov_pq.shape[1]) > 1 else _line(p, q)
+    if line is None:
+        return _seen_of_each(p, q, var_p, var_q, cov_pq, n_nodes)
+    along, across, c, s = line
+    cross = 2 * c * s * cov_pq
+    var_y = s * s * var_p + c * c * var_q - cross
+    cov = c * s * (var_q - var_p) + (c * c - s * s) * cov_pq
+    sd_y = np.sqrt(var_y)
+    per_sd = sd_y / np.sqrt(var_p * var_q - cov_pq**2)
+    y, sd_y, slope, per_sd = np.broadcast_arrays(across, sd_y, cov / var_y, per_sd)
+    half = np.sqrt(np.maximum(1 - y * y, 1e-12))
+    tilt = (np.abs(slope) + np.abs(y) / half) * sd_y * per_sd
+    tilt += _BEND * sd_y * sd_y * per_sd / half**3
+    out, left = np.empty((len(y), along.shape[1])), np.ones(len(y), dtype=np.bool_)
+    along = np.broadcast_to(along, out.shape)
+    for n, most in ((n_nodes // 3, 0.8), (2 * n_nodes // 5, 1.0), (3 * n_nodes // 5, 1.35)):
+        smooth = (np.abs(y) + _hermite(n)[0][-1] * sd_y < 1) & (tilt < most)
+        rows = np.flatnonzero(left & smooth[:, 0])
+        left[rows] = False
+        node, weight = _hermite(n)
+        for r in _blocks(rows, out.shape[1]):
+            ends = np.sqrt(1 - (y[r] + sd_y[r] * node) ** 2) * per_sd[r]
+            turns = slope[r] * sd_y[r] * node * per_sd[r]
+            out[r] = _shared_chords(along[r] * per_sd[r], ends, turns, np.broadcast_to(weight, ends.shape))
+    rows = np.flatnonzero(left)
+    if rows.size:
+        found = _across_disc(y[rows, 0], sd_y[rows, 0], _reach_of(n_nodes), _legendre(n_nodes))
+        node, x, weight = (part.T for part in found)
+        ends, turns = x * per_sd[rows], slope[rows] * (node - y[rows]) * per_sd[rows]
+        smooth = np.ptp(ends, axis=1) + np.ptp(turns, axis=1) < _MOST_SDS
+        left[rows[smooth]] = False
+        for r in _blocks(np.flatnonzero(smooth), out.shape[1]):
+            own = rows[r]
+            out[own] = _shared_chords(along[own] * per_sd[own], ends[r], turns[r], weight[r])
+    if left.any():
+        p, q = (np.broadcast_to(a, out.shape)[left] for a in (p, q))
+        var_p, var_q, cov_pq = (np.broadcast_to(a, y.shape)[left] for a in (var_p, var_q, cov_pq))
+        out[left] = _seen_of_each(p, q, var_p, var_q, cov_pq, n_nodes)
+    return np.clip(out, 0.0, 1.0)
+
+
+def _line(p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray, float, float] | None:
+    """Coordinates along the line on which all readings lie, (n, n_points), and across, (n, 1); cosine and sine."""
+    p, q = np.broadcast_arrays(p, q)
+    if p.shape[1] < _FEW_READINGS:
+        return None
+    dp, dq = float(p[0, -1] - p[0, 0]), float(q[0, -1] - q[0, 0])
+    length = float(np.hypot(dp, dq))
+    if length == 0.0:
+        return None
+    c, s = dp / length, dq / length
+    across = c * q - s * p
+    if np.abs(across - across[:, :1]).max() > _SAME:
+        return None
+    return c * p + s * q, across[:, :1], c, s
+
+
+def _shared_chords(along: FloatArray, ends: FloatArray, turns: FloatArray, weight: FloatArray) -> FloatArray:
+    """Integrate over chords that all readings share; lengths are in sds along them.
+
+    Readings at `along`, (n, n_points); half the chords' lengths, how far the mean moves from one to the next, and their
+    weights, (n, n_nodes).
+    """
+    side = np.copysign(PER_SD, along)
+    distance = np.abs(along) * PER_SD
+    # Of most footprints one end of the chord is out of reach.
+    wide = np.flatnonzero(ends.min(axis=1) - np.abs(turns).max(axis=1) < _REACH)
+    near, back = CENTRE + ends * PER_SD, CENTRE - ends[wide] * PER_SD
+    found = np.zeros(along.shape)
+    for k in range(ends.shape[1]):
+        shift = side * turns[:, k : k + 1]
+        shift += distance
+        cells = near[:, k : k + 1] - shift
+        normal_cdf_in_place(cells)
+        if wide.size:
+            cells_back = back[:, k : k + 1] - shift[wide]
+            normal_cdf_in_place(cells_back)
+            cells[wide] -= cells_back
+        cells *= weight[:, k : k + 1]
+        found += cells
+    return found
+
+
+def _seen_of_each(
+    p: FloatArray, q: FloatArray, var_p: FloatArray, var_q: FloatArray, cov_pq: FloatArray, n_nodes: int
+) -> FloatArray:
+    """Integrate each (sample, reading) pair whose edge is within reach by itself; arrays as above."""
     reach = _reach_of(n_nodes)
     largest = np.sqrt(0.5 * (var_p + var_q) + np.hypot(0.5 * (var_p - var_q), cov_pq))
     distance = np.sqrt(p * p + q * q)
@@ -402,81 +487,160 @@ def _seen_of_unit_disc(
     share = np.array(np.broadcast_to(share, near.shape))
     if not near.any():
         return share
-    d = np.broadcast_to(distance, near.shape)[near]
+    p, q, d, var_p, var_q, cov_pq = (
+        np.broadcast_to(a, near.shape)[near] for a in (p, q, distance, var_p, var_q, cov_pq)
+    )
     at_centre = d == 0
     safe = np.where(at_centre, 1.0, d)
-    c = np.where(at_centre, 1.0, np.broadcast_to(p, near.shape)[near] / safe)
-    s = np.broadcast_to(q, near.shape)[near] / safe
-    v1, v2, v12 = (np.broadcast_to(v, near.shape)[near] for v in (var_p, var_q, cov_pq))
+    c = np.where(at_centre, 1.0, p / safe)
+    s = q / safe
     cc, ss, cs = c * c, s * s, c * s
-    var_across = cc * v1 + ss * v2 + 2 * cs * v12
-    var_along = ss * v1 + cc * v2 - 2 * cs * v12
-    cov = cs * (v2 - v1) + (cc - ss) * v12
-    sd_along = np.sqrt(var_along)
-    slope = cov / var_along
-    per_sd = 1 / np.sqrt(var_across - slope * cov)
-    span = reach * sd_along
-    found = np.empty(len(d))
-    wraps = span > 0.95
-    # How many conditional sds the edge moves over one sd along it: footprints oblique to the
-    # edge, or much longer than its radius, need more nodes.
-    wide = np.minimum(sd_along, 1.0)
-    sharpness = wide * per_sd * (np.abs(slope) + wide)
-    doublings = np.clip(np.ceil(np.log2(np.maximum(sharpness / _SHARP, 1.0))), 0, 5).astype(np.int64)
-    for key in np.unique(2 * doublings + wraps):
-        rows = np.flatnonzero(2 * doublings + wraps == key)
-        times, wrapped = 2 ** (int(key) // 2), bool(key % 2)
-        for start in range(0, len(rows), _BLOCK // times):
-            r = rows[start : start + _BLOCK // times]
-            found[r] = _strips(d[r], sd_along[r], slope[r], per_sd[r], reach, n_nodes * times, wrapped=wrapped)
-    share[near] = found
+    cross = 2 * cs * cov_pq
+    var_r, var_t = cc * var_p + ss * var_q + cross, ss * var_p + cc * var_q - cross
+    share[near] = _mass_in_disc(d, var_r, var_t, cs * (var_q - var_p) + (cc - ss) * cov_pq, reach, n_nodes)
     return np.clip(share, 0.0, 1.0)
 
 
-_BLOCK = 2048  # pairs at a time: with their nodes they fit the cache
-_SHARP = 1.2  # the sharpness up to which n_nodes suffice
+_BLOCK = 2**13  # nodes at a time: they fit the cache
+_FEW_READINGS, _SAME = 8, 1e-9  # a scan along a line: so many readings, so straight
+_MOST_SDS = 10.0  # that the ends of chords may move, for as many nodes as there are
+_BEND = 2.5  # curvature of an edge asks for nodes as so much slope does
+_FLAT, _BENT = 0.01, 0.4  # curvature of an edge, in footprints of sd 1, up to which few and some nodes suffice
 
 
 def _reach_of(n_nodes: int) -> float:
     """Choose how many standard deviations n_nodes cover, so that truncation and quadrature errors balance."""
-    return float(np.clip(4.0 + (n_nodes - 24) / 16, 4.0, 6.5))
+    return float(np.clip(4.3 + (n_nodes - 20) / 20, 4.0, 6.5))
 
 
-def _strips(
-    d: FloatArray,
-    sd_along: FloatArray,
-    slope: FloatArray,
-    per_sd: FloatArray,
-    reach: float,
-    n_nodes: int,
-    *,
-    wrapped: bool,
+def _mass_in_disc(
+    d: FloatArray, var_r: FloatArray, var_t: FloatArray, cov: FloatArray, reach: float, n_nodes: int
 ) -> FloatArray:
-    """Integrate Gaussians (n_pairs,), mean at (d, 0), over the unit disc."""
-    node, weight = _legendre(n_nodes)
-    if wrapped:
-        t = 0.5 * np.pi * node
-        y = np.sin(t)[:, None]
-        x = np.cos(t)[:, None]
-        share = (0.5 * np.pi * weight)[:, None] * x * np.exp(-0.5 * (y / sd_along) ** 2)
-    else:
-        y = (reach * node)[:, None] * sd_along
-        x = np.sqrt(1 - y * y)
-        # Dividing by the mass within reach redistributes the truncated tails.
-        mass = 2 * ndtr(reach) - 1
-        share = (reach / mass * weight * np.exp(-0.5 * (reach * node) ** 2))[:, None] * sd_along
-    tilt = slope * y
-    far = (x - d) * per_sd
-    turn = tilt * per_sd
-    inner = normal_cdf(far - turn)
-    inner += normal_cdf(far + turn)
-    back = (-x - d) * per_sd
-    turn = np.abs(turn)
-    if float((back + turn).max()) > -_REACH:
-        inner -= normal_cdf(back - turn)
-        inner -= normal_cdf(back + turn)
-    inner *= share
-    return np.asarray(inner.sum(axis=0) / (np.sqrt(2 * np.pi) * sd_along))
+    """Integrate Gaussians over the unit disc, mean at (d, 0), radial and tangential variances; (n_pairs,) each.
+
+    Along parallel chords the integral is a difference of two cumulatives; across them it is a quadrature. The chords
+    have the direction in which the mean lies from the nearest point of the edge, nearest in sds (to first order).
+    Neighbouring chords then meet the edge equally many sds from their own mean, but for its curvature, so that few
+    Gauss-Hermite nodes suffice. Where the edge curves within a footprint, or the footprint covers much of the disc,
+    chords along the footprint's long axis and Gauss-Legendre nodes take their place.
+    """
+    lean = (1 - d) * cov / var_r  # the nearest point is (1, lean), but for its length
+    x, y = var_r + cov * lean, cov + var_t * lean
+    length = np.copysign(np.hypot(x, y), x)
+    det = var_r * var_t - cov * cov
+    curvature = det * ((1 + lean * lean) / np.abs(x + lean * y)) ** 1.5
+    x, y = x / length, y / length
+    spread, twist = var_r - var_t, 2 * x * y
+    var_y = var_r - x * x * spread - twist * cov
+    sd_y = np.sqrt(var_y)
+    per_sd = sd_y / np.sqrt(det)
+    slope = (x * x - y * y) * cov - 0.5 * twist * spread
+    mean_x, mean_y = d * x, -d * y
+    found = np.empty(len(d))
+    left = np.ones(len(d), dtype=np.bool_)
+    tilt = slope / sd_y * per_sd
+    for n, most in ((n_nodes // 4, _FLAT), (2 * n_nodes // 5, _BENT)):
+        inside = np.abs(mean_y) + _hermite(n)[0][-1] * sd_y < 1
+        rows = np.flatnonzero(left & inside & (curvature < most))
+        left[rows] = False
+        for r in _blocks(rows, n):
+            found[r] = _skewed_chords(mean_x[r], mean_y[r], sd_y[r], per_sd[r], tilt[r], n)
+    rule = _legendre(n_nodes)
+    for r in _blocks(np.flatnonzero(left), n_nodes):
+        found[r] = _long_chords(d[r], var_r[r], var_t[r], cov[r], reach, rule)
+    return found
+
+
+def _blocks(rows: IntArray, n_nodes: int) -> Iterator[IntArray]:
+    step = max(1, _BLOCK // n_nodes)
+    return (rows[start : start + step] for start in range(0, len(rows), step))
+
+
+def _skewed_chords(
+    mean_x: FloatArray, mean_y: FloatArray, sd_y: FloatArray, per_sd: FloatArray, tilt: FloatArray, n_nodes: int
+) -> FloatArray:
+    """Integrate along x over Gaussians whose mean in x moves by `tilt` conditional sds for each sd in y."""
+    node, weight = _hermite(n_nodes)
+    along = node[:, None] * sd_y
+    along += mean_y
+    along *= along
+    np.subtract(1.0, along, out=along)
+    np.sqrt(along, out=along)
+    across = node[:, None] * tilt
+    found = weight @ normal_cdf((along - mean_x) * per_sd - across)
+    back = np.flatnonzero(node[-1] * np.abs(tilt) - mean_x * per_sd > -_REACH)
+    if back.size:
+        found[back] -= weight @ normal_cdf((-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back])
+    return np.asarray(found)
+
+
+def _long_chords(
+    d: FloatArray,
+    var_r: FloatArray,
+    var_t: FloatArray,
+    cov: FloatArray,
+    reach: float,
+    rule: tuple[FloatArray, FloatArray],
+) -> FloatArray:
+    """Integrate along the long axis, then across it."""
+    half, spread = 0.5 * (var_r + var_t), 0.5 * (var_r - var_t)
+    twist = np.hypot(spread, cov)
+    long = np.sqrt(half + twist)
+    short = np.sqrt(var_r * var_t - cov * cov) / long
+    cosine = np.sqrt(0.5 + 0.5 * spread / np.where(twist > 0, twist, 1.0))
+    mean_x, mean_y = d * cosine, d * np.sqrt(1 - cosine * cosine)
+    _, x, weight = _across_disc(mean_y, short, reach, rule)
+    per_long = 1 / long
+    inner = normal_cdf((x - mean_x) * per_long)
+    back = np.flatnonzero(mean_x * per_long < reach)
+    if back.size:
+        inner[:, back] -= normal_cdf((-x[:, back] - mean_x[back]) * per_long[back])
+    inner *= weight
+    return np.asarray(inner.sum(axis=0))
+
+
+def _across_disc(
+    mean: FloatArray, sd: FloatArray, reach: float, rule: tuple[FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Chords of the unit disc within reach of a normal density, (n,): places y, half lengths, weights, (n_nodes, n).
+
+    In y = sin(4 arctan u) half the length, cos(4 arctan u), has no root at the ends.
+    """
+    low, high = (_quarter_tangent((mean + side * reach * sd).clip(-1.0, 1.0)) for side in (-1, 1))
+    node, weight = (np.concatenate([sign * a[::-1], a])[:, None] for sign, a in zip((-1, 1), rule, strict=True))
+    u = node * (0.5 * (high - low))
+    u += 0.5 * (high + low)
+    square = u * u
+    widen = 1 / (1 + square)
+    sine = 2 * u * widen
+    y = sine * (1 - square) * widen
+    y *= 2
+    x = sine * sine
+    x *= -2
+    x += 1
+    density = y - mean
+    density *= 1 / sd
+    density *= density
+    density *= -0.5
+    np.exp(density, out=density)
+    density *= x
+    density *= widen
+    density *= weight
+    density *= (high - low) * 2 / (np.sqrt(2 * np.pi) * sd)
+    return y, x, density
+
+
+def _quarter_tangent(y: FloatArray) -> FloatArray:
+    """Tangent of a quarter of the arc sine."""
+    half = y / (1 + np.sqrt(1 - y * y))
+    return np.asarray(half / (1 + np.sqrt(1 + half * half)))
+
+
+@cache
+def _hermite(n_nodes: int) -> tuple[FloatArray, FloatArray]:
+    """Nodes and weights for the mean over a standard normal."""
+    node, weight = np.polynomial.hermite_e.hermegauss(n_nodes)
+    return node, weight / weight.sum()
 
 
 @seen_by_one.register

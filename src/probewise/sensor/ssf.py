@@ -67,7 +67,9 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     a, u, v, aa, bb, cc = rows
     determinant = aa * bb - cc * cc
     if not ((determinant > 0) & (aa > 0)).all():
-        raise ParameterError("A B - C^2", float(determinant.min()), "greater than 0, with A > 0 and B > 0")
+        raise ParameterError(
+            "A B - C^2 of a Gaussian", float(determinant.min()), "greater than 0, with A > 0 and B > 0"
+        )
     mass = a / np.sqrt(determinant)
     total = mass.sum(axis=0)
     if not (total > 0).all():
@@ -125,7 +127,7 @@ class FixedMixture:
             require_finite(name, values)
             object.__setattr__(self, name, values)
         if (self.weights < 0).any() or not self.weights.sum() > 0:
-            raise ParameterError("weights", self.weights.tolist(), "0 or more, one of them greater")
+            raise ParameterError("weights", self.weights.tolist(), "0 or more, at least one greater than 0")
         object.__setattr__(self, "weights", frozen(self.weights / self.weights.sum()))
         if not (np.linalg.eigvalsh(self.covs_mm2) > 0).all():
             raise ParameterError("covs_mm2", self.covs_mm2.tolist(), "positive definite matrices")
@@ -257,7 +259,7 @@ def field_of(
     The mean field (paper, "logWt-weighted average of the sampled SSF fields").
     """
     if len(u_mm) < 2 or len(v_mm) < 2:
-        raise ShapeError("u_mm and v_mm need two pixels or more each")
+        raise ShapeError(f"u_mm has {len(u_mm)} pixels, v_mm {len(v_mm)}; allowed: 2 or more each")
     pixel = float(u_mm[1] - u_mm[0])
     if not (np.allclose(np.diff(u_mm), pixel) and np.allclose(np.diff(v_mm), pixel) and pixel > 0):
         raise ParameterError(

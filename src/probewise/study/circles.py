@@ -41,5 +41,5 @@ POPULATIONS: Mapping[str, Population] = {
 
 
 def noise_of(circle: int, n: int) -> FloatArray:
-    """Return the noise of the first `n` readings of a run in units of its sd, (n,); it is the same in every row."""
+    """Return the noise of a run's first `n` readings in units of its sd, (n,); the same for every strategy compared."""
     return np.random.default_rng([circle, 99]).standard_normal(n)

@@ -224,8 +224,8 @@ def test_an_inquiry_is_at_the_top_of_the_package():
         ({"settings": {"a": [1, 2], "b": [1]}}, "settings is {'a': 2, 'b': 1}; allowed: one knob"),
         ({"noise": -1.0}, "noise sd is -1.0; allowed: a number greater than 0"),
         ({"goal": {"slop": 0.1}}, "goal is 'slop'; allowed: parameters among slope, offset; did you mean slope"),
-        ({"goal": {"slope": 0.0}}, r"goal\['slope'\] is 0.0; allowed: a sd greater than 0"),
-        ({"goal": 0.1}, "goal is 0.1; allowed: the sds that are asked for"),
+        ({"goal": {"slope": 0.0}}, r"goal\['slope'\] is 0.0; allowed: greater than 0"),
+        ({"goal": 0.1}, "goal is 0.1; allowed: posterior sds by parameter"),
         ({"cost_s": [1, 1, 1, 1, 0.0]}, "allowed: seconds greater than 0"),
         ({"n_samples": 10}, "n_samples is 10; allowed: a whole number, 400 or more"),
     ],
@@ -280,7 +280,7 @@ def test_a_prediction_that_is_not_finite_is_named():
 
 
 def test_settled_without_a_goal_says_how_to_ask_for_one():
-    with pytest.raises(ParameterError, match="goal is None; allowed: the sds that are asked for"):
+    with pytest.raises(ParameterError, match="goal is None; allowed: posterior sds by parameter"):
         _ = inquiry().settled
 
 

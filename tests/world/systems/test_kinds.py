@@ -8,6 +8,7 @@ import pytest
 from probewise.systems import System, read_run_table, read_simulator
 from probewise.world.challenge import Stratum
 from probewise.world.systems import KINDS, SystemCase, draw_system, owners_file, write_system_case
+from probewise.world.systems.formulas import FLOW
 from probewise.world.systems.noise import noise_of
 
 
@@ -60,6 +61,6 @@ def test_there_are_both_ways_in_with_and_without_time_and_runs():
 
 
 def test_what_is_kept_back_is_two_runs_and_the_last_goes_further():
-    drawn = draw_system(KINDS[3], rng=np.random.default_rng(2))
+    drawn = draw_system(FLOW, rng=np.random.default_rng(2))
     flow = drawn.rows.columns["flow_lpm"]
     assert flow[drawn.rows.run == drawn.rows.n_runs - 1].max() > 1.2 * flow[drawn.kept].max()

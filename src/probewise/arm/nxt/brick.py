@@ -118,7 +118,9 @@ class Brick:
             if before is not None and abs(self._last_mv - before) <= STEP_MV:
                 break
         else:
-            raise LinkError(f"the NXT on {self.link.name} reports a different battery voltage each of {N_ASKED} times")
+            raise LinkError(
+                f"the NXT on {self.link.name} reports another battery voltage each of {N_ASKED} times; is it near?"
+            )
         if self._last_mv < LOW_MV and not self._told_low:
             self._told_low = True
             warnings.warn(

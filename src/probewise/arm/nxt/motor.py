@@ -335,7 +335,9 @@ class Motor:
         self._clock.sleep(self.drive.settle_s)
         state = self._state(is_faint)
         if not is_faint(state):
-            raise MotorError(f"motor {self.letter} is not driven as it was told; does a program run on the brick?")
+            raise MotorError(
+                f"motor {self.letter} does not keep the power it was set to; does a program run on the brick?"
+            )
         self._target = state.rotation_counts
         return self.rest()
 
@@ -368,7 +370,7 @@ class Motor:
         while (_datum_of(state) != self._datum or not is_likely(state)) and _essence(state) != before:
             if n_asked == N_ASKED:
                 raise MotorError(
-                    f"motor {self.letter} is reported differently each of {N_ASKED} times; is the brick near?"
+                    f"motor {self.letter} reports another state each of {N_ASKED} times; is the brick near?"
                 )
             before, state = _essence(state), self._asked()
             n_asked += 1

@@ -15,7 +15,7 @@ from probewise.diagnosis.evidence.laplace import Blocks, Linearised, block_log_b
 from probewise.diagnosis.evidence.templates import EffectTemplates
 from probewise.diagnosis.names import Names
 
-__all__ = ["log_mean", "score_effects", "score_pairs", "score_unknown"]
+__all__ = ["log_mean", "score_effects", "score_pairs"]
 
 _BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
 
@@ -30,11 +30,6 @@ def score_effects(problem: Linearised, bank: Bank) -> dict[str, FloatArray]:
     """Return the log Bayes factors of the entries of each effect's bank, by name, (n_entries,)."""
     scores = bank.log_bayes_factors(problem)[:, 0]
     return {name: scores[members] for name, members in bank.members.items()}
-
-
-def score_unknown(problem: Linearised, bases: Bank) -> dict[str, float]:
-    """Return the log Bayes factor of an unknown effect, by family of basis functions."""
-    return {family: log_mean(own) for family, own in score_effects(problem, bases).items()}
 
 
 def score_pairs(

@@ -50,6 +50,7 @@ SWAPPED = 2  # combinations that lead beside what is left, with what was left ou
 FEW_READINGS = 40  # usable readings below which one Gaussian is tried, and no free form
 MAX_ORDER = 3  # Gaussians that are tried; one more where that is not far behind
 NULL_TRIED_AGAIN = 2  # fits of one effect from which a given null is fitted once more
+SAME_MODE = 0.02  # nats by which another fit of the null must be better to be another mode; fits stop at 0.005
 REFITTED_LATE = 0.02  # probability by screening alone, from which on a combination is refitted
 MOST_REFITTED_LATE = 6  # such combinations
 MOST_AT_OTHER_ORDERS = 6  # leading combinations that are refitted at other SSF orders

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.screening import log_mean, score_effects, score_pairs
+from probewise.diagnosis.evidence.screening import log_mean, score_pairs
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import (
     ABSORBED,
@@ -68,15 +68,14 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
     """Weigh all pairs about a null by templates, under the noise models that steer."""
     for noise, evidence in null.steering():
-        problem = Linearised.of(null.found, evidence.law)
-        singles = score_effects(problem, state.bank(null))
+        singles = state.scores(null, evidence.law, null)
         alone = [name for name in singles if first_of(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:PAIRED]
         if not ranked or log_mean(singles[ranked[0]]) < PAIRED_FROM:
             continue
         singles = {name: singles[name] for name in ranked}
         templates = {name: state.templates.of(null.found, state.effects[name]) for name in ranked}
-        for pair, value in score_pairs(problem, templates, singles).items():
+        for pair, value in score_pairs(Linearised.of(null.found, evidence.law), templates, singles).items():
             state.about_null[pair, noise] = evidence.log_z + value
 
 
@@ -87,12 +86,12 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     -------
     The best of these proposals and those already had, by the combination that would come of them.
     """
-    bank = state.bank(state.candidates[parent.n_gaussians, ()])
+    null = state.candidates[parent.n_gaussians, ()]
     against = 0.0 if parent.names else state.complexity_penalty(parent.degrees_of_freedom)
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)
     for noise, evidence in parent.steering():
-        for name, own in score_effects(Linearised.of(parent.found, evidence.law), bank).items():
+        for name, own in state.scores(parent, evidence.law, null).items():
             first = first_of(name)
             if name in parent.names or (first is not None and first not in parent.names):
                 continue
@@ -127,9 +126,10 @@ def _alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Propo
     nothing of what the null takes up all but a little of to first order.
     """
     ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_mean(names)))
-    left = state.bank(null).surviving(Linearised.of(null.found, null.law))
-    most = {name: float(left[members].max()) for name, members in state.bank(null).members.items()}
-    faint = {name for name, share in most.items() if ABSORBED < share < FAINT}
+    faint, about = set[str](), Linearised.of(null.found, null.law)
+    for bank in state.banks(null):
+        left = bank.surviving(about)
+        faint |= {name for name, of in bank.members.items() if ABSORBED < left[of].max() < FAINT}
     # One of two waves alone explains little: the other is noise to it.
     twice = {name for name in state.effects if name + AGAIN in state.effects}
     always = state.tried_always | faint | twice

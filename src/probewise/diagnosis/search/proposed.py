@@ -45,7 +45,8 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
     kept = {name: proposals[name] for name in ranked if odds[name] > best - _WITHIN}
     if not kept:
         return searched
-    again = search(replace(prepared, effects={**prepared.effects, **kept}), prior=prior, progress=progress)
+    more = replace(prepared, effects={**prepared.effects, **kept})
+    again = search(more, prior=prior, after=searched, progress=progress)
     return searched if prepared.apparatus.refits_are_over() else again
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -22,10 +22,14 @@ from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.search.constants import STEERING, VARIANTS_TRIED
 from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.twins import are_proportional, as_twin
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
 
 __all__ = ["Refits", "is_significant"]
+
+Extended: TypeAlias = tuple[WeighedFit, dict[Names, float]]
+"""A candidate with one more effect, and the closed-form scores of the effect by noise model."""
 
 _SAME_START = 0.1  # in prior sds: starts that are closer together are duplicates
 
@@ -37,14 +41,38 @@ class Refits:
     sensor: Null | None
     noises: Noises
     templates: TemplateMemory
+    known: dict[tuple[WeighedFit, NamedEffect[Any], float], Extended] = field(default_factory=dict, repr=False)
+    """Refits with one more effect, by the candidate, the effect, and the nats against it."""
+    scored: dict[tuple[Fit, NoiseLaw, Bank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
+    """Log Bayes factors of the templates of a bank, by label."""
+
+    def scores(self, found: Fit, law: NoiseLaw, bank: Bank) -> dict[str, FloatArray]:
+        """Return the log Bayes factors of a bank's templates about a fit, by label, (n_templates,) each."""
+        key = found, law, bank
+        if key not in self.scored:
+            self.scored[key] = score_effects(Linearised.of(found, law), bank)
+        return self.scored[key]
 
     def law_of(self, candidate: WeighedFit) -> NoiseLaw:
         """Return the most probable noise distribution about a fit."""
         return self.noises.best(candidate.evidence).law
 
-    def weighed(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int = 30) -> WeighedFit:
-        """Fit under one noise distribution, compute the evidence under all, and refit if another is more probable."""
+    def weighed(
+        self,
+        model: Model,
+        starts: FloatArray,
+        law: NoiseLaw,
+        max_steps: int = 30,
+        *,
+        beyond: WeighedFit | None = None,
+    ) -> WeighedFit:
+        """Fit under one noise distribution, compute the evidence under all, and refit if another is more probable.
+
+        A fit that gains nothing `beyond` another one is given the evidence of that: nobody asks for its own.
+        """
         found = self._fit(model, starts, law, max_steps)
+        if beyond is not None and not _gains(found, beyond.found, law):
+            return WeighedFit.of(found, law, beyond.evidence, 0.0)
         for _ in range(2):
             evidence = self.noises.weigh(found)
             best = self.noises.best(evidence).law
@@ -56,16 +84,34 @@ class Refits:
             evidence = self.noises.weigh(found)
         return WeighedFit.of(found, law, evidence, log_visible(found, law, self.templates.usable))
 
-    def extended(
-        self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0
-    ) -> tuple[WeighedFit, dict[Names, float]]:
-        """Refit with one more effect, for its likely variants.
+    def extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
+        """Refit with one more effect, for its likely variants, unless that was done before.
+
+        An effect that changes the readings exactly as another one did has its fit and its evidence.
 
         Returns
         -------
         The best, as the share that it has of all variants, less the nats `against` it; and the closed-form scores of
         the effect by the noise models that steer.
         """
+        key = parent, effect, against
+        if key not in self.known:
+            self.known[key] = self._as_twin(parent, effect, against) or self._extended(parent, effect, against)
+        return self.known[key]
+
+    def _as_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
+        """Return the refit of another effect that predicts the same, as the refit of this one."""
+        own = self.templates.of(parent.found, effect)
+        for (held, other, less), (candidate, scores) in list(self.known.items()):
+            if held is parent and less == against and are_proportional(own, self.templates.of(held.found, other)):
+                found = as_twin(candidate.found, self.templates.of(held.found, other), own, self.templates.usable)
+                if found is not None:
+                    weights = {name: w for name, w in candidate.weights.items() if name != other.name}
+                    weights[effect.name] = candidate.weights[other.name]
+                    return replace(candidate, found=found, weights=weights), scores
+        return None
+
+    def _extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
         templates = self.templates.of(parent.found, effect)
         own = Bank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
 
@@ -135,13 +181,13 @@ class Refits:
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # With several modes of the null, the best one may change with the effect.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        fitted = [self.weighed(model, np.stack(starts), seen[0][0].law)]
+        fitted = [self.weighed(model, np.stack(starts), seen[0][0].law, beyond=parent)]
         if seen[0][0].law.remembers:  # to a walk a slow effect is noise: its amplitude would stay at 0
             plain = self.noises.certain
             for about, scores in seen[1:]:
                 promised = parent.evidence[plain].log_z + log_mean(scores)
                 if fitted[0].evidence[plain].log_z < promised - STEERING:
-                    fitted.append(self.weighed(model, np.stack(starts), about.law))
+                    fitted.append(self.weighed(model, np.stack(starts), about.law, beyond=parent))
         return max(fitted, key=lambda candidate: self.noises.over_all(_log_z_by_noise(candidate)))
 
     def _plainly(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
@@ -156,13 +202,15 @@ def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:
 
 def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
     """Return whether an added effect is significant: the fit improves by more than expected per parameter."""
-    law = candidate.law
+    return _gains(candidate.found, parent.found, candidate.law)
 
-    def misfit(found: Fit) -> float:
-        whitened = law(found.residuals)[:, None]
+
+def _gains(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
+    def misfit(fitted: Fit) -> float:
+        whitened = law(fitted.residuals)[:, None]
         return float(law.misfit(whitened, law.scale(whitened))[0])
 
-    return 2 * (misfit(parent.found) - misfit(candidate.found)) > 3.0
+    return 2 * (misfit(beyond) - misfit(found)) > 3.0
 
 
 def _worth_trying(templates: EffectTemplates, weights: FloatArray) -> list[int]:

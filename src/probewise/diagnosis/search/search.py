@@ -7,16 +7,19 @@ unknown effect. Templates screen them; a beam of the best is refitted jointly an
 from __future__ import annotations
 
 import math
-from typing import cast
+from collections.abc import Sequence
+from typing import Any, cast
 
 import numpy as np
 
+from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.noise.law import steps_within_scans
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.bases import unknown_templates, unlike_named
+from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.search.backward_elimination import eliminate_backward
 from probewise.diagnosis.search.constants import (
     EXTENDED_WITHIN,
@@ -25,6 +28,7 @@ from probewise.diagnosis.search.constants import (
     MOST_REFITTED_LATE,
     NULL_TRIED_AGAIN,
     REFITTED_LATE,
+    SAME_MODE,
     WITH_UNKNOWN,
 )
 from probewise.diagnosis.search.forward_selection import select_forward
@@ -36,8 +40,8 @@ from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.searched import Evidences, Posterior, Screening, Searched, posterior_of
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.unknown import Unknown
-from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
-from probewise.effects import NoiseEffect
+from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
+from probewise.effects import NamedEffect, NoiseEffect
 from probewise.progress import Progress, silent
 
 __all__ = ["search"]
@@ -50,6 +54,7 @@ def search(
     max_order: int | None = None,
     beam: int = 8,
     depth: int = 3,
+    after: Searched | None = None,
     progress: Progress = silent,
 ) -> Searched:
     """Compute the evidence of combinations of effects.
@@ -65,6 +70,8 @@ def search(
         for few readings.
     beam, depth
         Number of combinations refitted at each size above one, and the largest size.
+    after
+        An earlier search of the same recording with a given null, with fewer effects: its fits are not made again.
     progress
         Called at every refit.
     """
@@ -73,13 +80,20 @@ def search(
         max_order = 1 if len(prepared.usable) < FEW_READINGS else MAX_ORDER
     prior = prior or prepared.apparatus.prior_odds(effects)
     on_noise = {name: cast(NoiseEffect, effects[name]) for name in effects if name in prepared.on_noise}
-    noises = Noises(recording, on_noise, prior)
-    templates = TemplateMemory(prepared.usable)
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
-    refits, own = Refits(prepared.null, noises, templates), prepared.apparatus.own_effects(on_mean)
+    refits = (
+        Refits(prepared.null, Noises(recording, on_noise, prior), TemplateMemory(prepared.usable))
+        if after is None
+        else after.refits
+    )
+    noises, templates, own = refits.noises, refits.templates, prepared.apparatus.own_effects(on_mean)
     state = SearchState(on_mean, prior, noises, templates, refits, own, progress, prepared.apparatus.refits_are_over)
-    fit_nulls(state, prepared, max_order=max_order)
-    unknown = _unknown(state, prepared)
+    if after is None:
+        fit_nulls(state, prepared, max_order=max_order)
+    else:
+        state.sensors |= after.nulls
+        state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
+    unknown = _unknown(state, prepared, after)
     screening = Screening(templates, state.null.found, unknown.bases, unknown.covariates)
 
     def evidences() -> Evidences:
@@ -116,6 +130,7 @@ def search(
         certain=noises.certain,
         nulls=state.sensors,
         screening=screening,
+        refits=refits,
         evidences=evidences(),
         posterior=posterior(),
     )
@@ -127,27 +142,36 @@ def _refit_null(state: SearchState) -> None:
     single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
     for candidate in sorted(single, key=lambda c: -c.log_z)[:NULL_TRIED_AGAIN]:
         start = candidate.found.z[: null.found.model.sensor.n_params]
-        state.keep(max(state.null, state.refits.weighed(null.found.model, start[None, :], candidate.law), key=_log_z))
+        again = state.refits.weighed(null.found.model, start[None, :], candidate.law)
+        if again.log_z > state.null.log_z + SAME_MODE:
+            state.keep(again)
 
 
-def _log_z(candidate: WeighedFit) -> float:
-    return candidate.log_z
+def _unknown(state: SearchState, prepared: Prepared, after: Searched | None) -> Unknown:
+    """Build the basis functions of unknown effects about the best null; those of an earlier search serve again."""
+    named = [effect for name, effect in state.effects.items() if not out_of_vocabulary((name,))]
+    if after is None:
+        bases, covariates = _bases(state, prepared, named)
+    else:
+        bases, covariates = after.screening.unknown_bases, after.screening.covariates
+    each = state.prior.unknown_complexity_penalty
+    return Unknown(
+        state.refits.scores,
+        bases,
+        covariates,
+        state.noises,
+        lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
+        n_choices=lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
+    )
 
 
-def _unknown(state: SearchState, prepared: Prepared) -> Unknown:
-    """Build the basis functions of unknown effects about the best null."""
+def _bases(
+    state: SearchState, prepared: Prepared, named: Sequence[NamedEffect[Any]]
+) -> tuple[Bank, tuple[Covariate, ...]]:
     null, recording = state.null, prepared.recording
     covariates, slope = prepared.apparatus.covariates(null.found, recording)
     level = null.found.predicted
     starts = np.flatnonzero(steps_within_scans(recording) == 0)
     bases = unknown_templates(covariates, level - level.min(), slope, starts)
-    named = [effect for name, effect in state.effects.items() if not out_of_vocabulary((name,))]
     problem = Linearised.of(null.found, state.refits.law_of(null))
-    each = state.prior.unknown_complexity_penalty
-    return Unknown(
-        unlike_named(bases, state.templates.bank(null.found, named), problem),
-        tuple(covariates),
-        state.noises,
-        lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
-        n_choices=lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
-    )
+    return unlike_named(bases, state.templates.bank(null.found, named), problem), tuple(covariates)

@@ -19,6 +19,7 @@ from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.search.constants import ALIASED_NATS
+from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, in_vocabulary, out_of_vocabulary
 from probewise.effects import is_out_of_vocabulary
 from probewise.sensor import Stage
@@ -185,6 +186,8 @@ class Searched:
         The null by SSF order.
     screening
         Templates for the tests.
+    refits
+        All refits, for another search of the same recording.
     evidences, posterior
         Evidences and probabilities of all hypotheses.
     """
@@ -195,6 +198,7 @@ class Searched:
     certain: Names
     nulls: Mapping[int, Null]
     screening: Screening
+    refits: Refits
     evidences: Evidences
     posterior: Posterior
 

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
+from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.refits import Refits, is_significant
@@ -94,9 +96,16 @@ class SearchState:
         """Return the sum of a candidate's log evidence and the log prior odds of its effects."""
         return candidate.log_z + self.prior.log_mean(candidate.names)
 
-    def bank(self, null: WeighedFit) -> Bank:
-        """Return the templates of all effects about a null."""
-        return self.templates.bank(null.found, list(self.effects.values()))
+    def banks(self, null: WeighedFit) -> list[Bank]:
+        """Return the templates of all effects about a null: those with a name, and those with a formula alone."""
+        named = [effect for name, effect in self.effects.items() if not out_of_vocabulary((name,))]
+        rest = [effect for name, effect in self.effects.items() if out_of_vocabulary((name,))]
+        return [self.templates.bank(null.found, effects) for effects in (named, rest) if effects]
+
+    def scores(self, about: WeighedFit, law: NoiseLaw, null: WeighedFit) -> dict[str, FloatArray]:
+        """Return the log Bayes factors of every effect's entries about a fit, by their templates about a null."""
+        of_banks = [self.refits.scores(about.found, law, bank) for bank in self.banks(null)]
+        return {name: own for scores in of_banks for name, own in scores.items()}
 
     def complexity_penalty(self, degrees_of_freedom: int, each: float | None = None) -> float:
         """Return the penalty in nats of effects with an SSF of fewer degrees of freedom than the null alone needs.

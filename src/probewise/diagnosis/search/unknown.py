@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import logsumexp
 
+from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.screening import log_mean, score_unknown
+from probewise.diagnosis.evidence.screening import log_mean
+from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.names import Names
+from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.outlying import outlying, score_together
 from probewise.diagnosis.search.constants import ALIASED_NATS
@@ -28,6 +30,8 @@ class Unknown:
 
     Parameters
     ----------
+    scores
+        Function that scores a bank about a fit, by label.
     bases
         Templates of the basis functions.
     covariates
@@ -40,6 +44,7 @@ class Unknown:
         Log of the ratio of the number of combinations of this many names to that of single names.
     """
 
+    scores: Callable[[Fit, NoiseLaw, Bank], Mapping[str, FloatArray]]
     bases: Bank
     covariates: tuple[Covariate, ...]
     noises: Noises
@@ -55,7 +60,8 @@ class Unknown:
         best = -np.inf
         for candidate in candidates:
             for noise, evidence in candidate.steering():
-                by_family = score_unknown(Linearised.of(candidate.found, evidence.law), self.bases)
+                scores = self.scores(candidate.found, evidence.law, self.bases)
+                by_family = {family: log_mean(own) for family, own in scores.items()}
                 if evidence.law.share > 0:
                     far_out = outlying(candidate.found.residuals, evidence.law)
                     by_family |= score_together(far_out, self.covariates)

@@ -138,7 +138,7 @@ class Inquiry(ShowsItself):
     def settled(self) -> bool:
         """Whether the posterior sd of every parameter in the goal is at most its goal."""
         if not self._goal:
-            raise ParameterError("goal", None, 'the sds that are asked for, by parameter: goal={"centre_hz": 0.5}')
+            raise ParameterError("goal", None, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
         return self._times_goal <= 1.0
 
     @property
@@ -259,7 +259,7 @@ class Inquiry(ShowsItself):
             given = given(self._taken[-1][0] if self._taken else None)
         cost_s = floats(given, "cost_s")
         if cost_s.shape not in ((), (len(self._settings),)):
-            raise ShapeError(f"cost_s has shape {cost_s.shape}; allowed: ({len(self._settings)},), one a setting")
+            raise ShapeError(f"cost_s has shape {cost_s.shape}; allowed: ({len(self._settings)},), one per setting")
         if not ((cost_s > 0) & np.isfinite(cost_s)).all():
             raise ParameterError("cost_s", cost_s.tolist(), "seconds greater than 0, finite")
         return cost_s
@@ -269,12 +269,12 @@ def _goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str,
     if goal is None:
         return {}
     if not isinstance(goal, Mapping) or not goal:
-        raise ParameterError("goal", goal, 'the sds that are asked for, by parameter: goal={"centre_hz": 0.5}')
+        raise ParameterError("goal", goal, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
     for name, sd in goal.items():
         if name not in names:
             raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
         if not require_finite_number(f"goal[{name!r}]", sd) > 0:
-            raise ParameterError(f"goal[{name!r}]", sd, "a sd greater than 0")
+            raise ParameterError(f"goal[{name!r}]", sd, "greater than 0")
     return dict(goal)
 
 

@@ -62,7 +62,9 @@ class ReadingNoise:
         if not require_number("dof", self.dof) > 0:
             raise ParameterError("dof", self.dof, "greater than 0; infinity is the Gaussian")
         if not 0 <= require_number("outliers", self.outliers) < 1:
-            raise ParameterError("outliers", self.outliers, "0 or more, below 1: the share of readings that are")
+            raise ParameterError(
+                "outliers", self.outliers, "0 or more, below 1: the share of readings that are outliers"
+            )
         if self.outliers and (self.between is None or not _is_range(self.between)):
             allowed = "(low, high), finite, low < high: the least and the greatest outlier"
             raise ParameterError("between", self.between, allowed)

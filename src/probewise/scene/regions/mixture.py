@@ -31,7 +31,7 @@ class MixtureOfRegions:
         for k, part in enumerate(self.parts):
             wanted = int(np.sum(which == k))
             if wanted and part.n_regions != wanted:
-                raise ShapeError(f"part {k} holds {part.n_regions} regions; allowed: {wanted}, as which == {k}")
+                raise ShapeError(f"part {k} holds {part.n_regions} regions; allowed: {wanted}, one per {k} in which")
         if which.ndim != 1 or (which.size and (which.min() < 0 or which.max() >= len(self.parts))):
             raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one per hypothesis")
 

@@ -89,7 +89,7 @@ def _directed_pieces(edges: FloatArray) -> FloatArray:
     """Split edges (n_edges, 2, 2) where they meet and keep the boundary of the even-odd inside."""
     size = float(np.ptp(edges.reshape(-1, 2), axis=0).max())
     if size == 0:
-        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon with an area")
+        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
     pieces: dict[tuple[tuple[float, float], tuple[float, float]], None] = {}
     for start, end in edges:
         cuts = {0.0, 1.0}
@@ -122,7 +122,7 @@ def _directed_pieces(edges: FloatArray) -> FloatArray:
         if sides[0] != sides[1]:
             kept.append(ends if sides[0] else ends[::-1])
     if not kept:
-        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon with an area")
+        raise ParameterError("vertices_mm", edges[:, 0].tolist(), "a polygon whose area is not 0")
     return np.stack(kept)
 
 

@@ -18,7 +18,7 @@ __all__ = [
     "BentRail",
     "Chirp",
     "CrossTalk",
-    "Floor",
+    "DeadZone",
     "Ghost",
     "PeakMemory",
     "PlaceStep",
@@ -156,7 +156,7 @@ class CrossTalk:
 
 
 @dataclass(frozen=True)
-class Floor:
+class DeadZone:
     """A dead zone: light below a share of white gives no signal."""
 
     name: ClassVar[str] = "floor"

@@ -1,0 +1,168 @@
+"""Dead points of nested sampling as weighted samples of the posterior: means, quantiles, equally weighted draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
+from probewise._display import ShowsItself
+from probewise._kinds import require_number, require_rng, require_whole
+from probewise.errors import ParameterError, ShapeError
+from probewise.nested.evidence import log_volumes
+from probewise.nested.weights import weighted_quantiles
+
+__all__ = ["COUNTS", "PER_POINT", "DeadPoints", "of_length"]
+
+PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
+COUNTS = ("parent", "n_at_death")
+
+
+def of_length(name: str, values: FloatArray | IntArray, n: int, one: str) -> FloatArray | IntArray:
+    """Return the values, (n,).
+
+    Raises
+    ------
+    ShapeError
+        If there are more or fewer; `one` says what each is of.
+    """
+    if values.shape != (n,):
+        raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n},), one per {one}")
+    return values
+
+
+@dataclass(frozen=True, eq=False)
+class DeadPoints(ShowsItself):
+    """The weighted samples of a run of nested sampling.
+
+    Attributes
+    ----------
+    names
+        Parameter names, one per column of theta.
+    theta
+        Dead points in order of death, followed by the last live points, (n_dead, n_params).
+    log_likelihood, label, log_weight
+        Of each: log likelihood, the number from 0 to 1 that orders points of equal likelihood,
+        and log posterior weight (the weights sum to one), all (n_dead,).
+    log_birth, birth_label
+        Log likelihood and label of the dead point above which each was drawn, (n_dead,);
+        minus infinity and 1 for draws from the whole prior.
+    parent
+        Row of the point at which each point's chain began; -1 for the initial draws from the prior, (n_dead,).
+    n_at_death
+        Number of points alive when each died, itself included, (n_dead,).
+    log_start
+        Natural log of the share of the prior with nonzero likelihood.
+    """
+
+    names: tuple[str, ...]
+    theta: FloatArray
+    log_likelihood: FloatArray
+    label: FloatArray
+    log_weight: FloatArray
+    log_birth: FloatArray
+    birth_label: FloatArray
+    parent: IntArray
+    n_at_death: IntArray
+    log_start: float
+
+    def __post_init__(self) -> None:
+        theta = frozen(self.theta)
+        if theta.ndim != 2 or theta.shape[1] != len(self.names):
+            raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_dead, {len(self.names)}) for {self.names}")
+        object.__setattr__(self, "theta", theta)
+        for name in PER_POINT:
+            self._freeze(name, frozen(getattr(self, name)))
+        for name in COUNTS:
+            self._freeze(name, frozen_int(getattr(self, name)))
+
+    def _freeze(self, name: str, values: FloatArray | IntArray) -> None:
+        object.__setattr__(self, name, of_length(name, values, self.n_dead, "row of theta"))
+
+    @property
+    def weight(self) -> FloatArray:
+        """Posterior weights, summing to one, (n_dead,)."""
+        return np.asarray(np.exp(self.log_weight))
+
+    @property
+    def n_dead(self) -> int:
+        """Number of weighted samples."""
+        return len(self.theta)
+
+    @property
+    def log_volume(self) -> FloatArray:
+        """Expected natural log of the prior share above each sample, ln X, (n_dead,)."""
+        return log_volumes(self.n_at_death, self.log_start)
+
+    def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
+        """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
+        require_rng(rng)
+        n = require_whole("n", n)
+        ladder = np.cumsum(self.weight)
+        rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
+        return np.asarray(rng.permutation(np.minimum(rows, len(ladder) - 1)))
+
+    def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
+
+        Systematic resampling: a point of weight w occurs n w times, rounded up or down, so points
+        repeat only where a weight exceeds 1 / n; `diversify` makes repeated samples distinct.
+        """
+        return np.asarray(self.theta[self.rows(n, rng=rng)])
+
+    def mean(self, f: Callable[[FloatArray], FloatArray] | None = None, *, block: int | None = None) -> FloatArray:
+        """Average the parameters, or any function of them, over the posterior.
+
+        Parameters
+        ----------
+        f
+            Function from rows of theta, (n, n_params), to values, (n, ...), for instance an SSF field
+            (n, n_v, n_u); by default the parameters themselves.
+        block
+            Largest number of rows passed to `f` at a time, to bound memory; by default all.
+
+        Returns
+        -------
+        The posterior mean, with the shape of one row's value; (n_params,) without `f`.
+        """
+        if block is not None and block < 1:
+            raise ParameterError("block", block, "1 or more")
+        if f is None:
+            return np.asarray(self.weight @ self.theta)
+        size = self.n_dead if block is None else block
+        total: FloatArray | None = None
+        for first in range(0, self.n_dead, size):
+            theta, weight = self.theta[first : first + size], self.weight[first : first + size]
+            values = np.asarray(f(theta))
+            if values.shape[:1] != (len(theta),):
+                raise ShapeError(f"f(theta) has shape {values.shape}; allowed: {len(theta)} rows, as many as theta has")
+            part = np.asarray(np.tensordot(weight, values, axes=(0, 0)))
+            total = part if total is None else total + part
+        return np.zeros(0) if total is None else total
+
+    def covariance(self) -> FloatArray:
+        """Posterior covariance of the parameters, (n_params, n_params)."""
+        centred = self.theta - self.mean()
+        return np.asarray((centred * self.weight[:, None]).T @ centred)
+
+    def sd(self) -> FloatArray:
+        """Posterior standard deviation of the parameters, (n_params,)."""
+        return np.asarray(np.sqrt(self.weight @ (self.theta - self.mean()) ** 2))
+
+    def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
+        """Weighted quantiles of each parameter, (n_q,) -> (n_q, n_params)."""
+        return weighted_quantiles(self.theta, self.weight, q)
+
+    def interval(self, mass: float = 0.95) -> FloatArray:
+        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
+        share = "greater than 0, less than 1"
+        columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
+        if not 0 < require_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
+            raise ParameterError("mass", mass, share)
+        return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
+
+    def best(self) -> FloatArray:
+        """Parameters of the greatest likelihood, (n_params,)."""
+        return np.asarray(self.theta[int(np.argmax(self.log_likelihood))])

@@ -1,0 +1,95 @@
+"""Two robots whose sensor model leaves an effect out: one trusts the model, the other doubts it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from probewise.experiment import left_out_of
+from probewise.report import exploration as exploration_report
+from probewise.report.html import Section, figure, paragraph, table
+from probewise.report.paper_view import window_mm
+from probewise.report.plots import PAGE_IN, belief_in_the_sensor, explain_field, grid_of_axes, png
+from probewise.report.robot_search import RobotSearch
+from probewise.report.words import count, number
+
+__all__ = ["SATURATION", "answer", "figures", "section"]
+
+SATURATION = 40.0
+"""Reading at which the concealed effect of the demo, saturation, sets in; the model expects 60 over white."""
+
+
+def answer(searches: Sequence[RobotSearch]) -> str:
+    """Say in one sentence how both robots ended, the trusting one first."""
+    trusting, doubting = (
+        f"{count(len(s.run.steps), 'reading')}, off by {number(s.largest_error_mm, 1)} mm "
+        f"(posterior sd up to {number(s.run.last.widest_mm, 1)} mm)"
+        for s in searches
+    )
+    return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
+
+
+def figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
+    """Draw what both robots believe about the circle at the end, and the doubting one about its sensor: PNG by name."""
+    ends = np.array([window_mm([s.run], len(s.run.steps)) for s in searches])
+    corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
+    (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
+    axes = grid_of_axes(1, 2, size_in=(PAGE_IN, 1.4 + 3.3 * (high - low) / (right - left)))
+    for ax, search in zip(axes[0], searches, strict=True):
+        places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in search.run.readings]
+        title = f"{search.model} robot, after {count(len(places), 'reading')}"
+        exploration_report.view(
+            search.run.last,
+            search.run.experiment,
+            places,
+            levels=search.levels,
+            truth_mm=search.truth_mm,
+            title=title,
+            ax=ax,
+        ).set(xlim=(left, right), ylim=(low, high))
+    explain_field(axes)
+    doubting = searches[-1].run
+    beliefs = [left_out_of(step, doubting.experiment.trust).probability for step in doubting.steps]
+    return {"doubt.png": png(axes), "belief.png": png(belief_in_the_sensor(beliefs))}
+
+
+def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
+    """Build the demo's section from both searches, the trusting robot's first, and from `figures`."""
+    doubting = searches[-1].run
+    missing = left_out_of(doubting.last, doubting.experiment.trust)
+    introduction = paragraph(
+        f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
+        f"{number(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. The other "
+        f"expects with probability {1 - doubting.experiment.trust:.1g} that an effect is missing; it compares the "
+        f"plain model with each effect that could act, and chooses its readings and its end under all of them."
+    )
+    rows = table(
+        ("robot", "readings", "largest error", "widest posterior sd", "stopped because"),
+        (
+            (
+                s.model,
+                str(len(s.run.steps)),
+                f"{number(s.largest_error_mm, 1)} mm",
+                f"{number(s.run.last.widest_mm, 1)} mm",
+                s.run.stop_reason,
+            )
+            for s in searches
+        ),
+        caption="Both robots look for the circle of the searches above, from the same first reading on it. One run "
+        "each; probewise study --concealed repeats it for many circles and effects.",
+    )
+    fields = figure(
+        drawn["doubt.png"],
+        "The posterior of each robot at its end: left the trusting robot, right the doubting one. Blue: 50 circles "
+        "drawn from the posterior. Dashed white: the hidden circle.",
+    )
+    belief = figure(
+        drawn["belief.png"],
+        "What the doubting robot believes about its sensor after each reading. A dashed line marks a reading that "
+        "changed the most probable effect.",
+    )
+    found = paragraph(f"At its end the doubting robot reports: {missing.sentence}")
+    return Section(
+        "A robot that doubts its sensor", (introduction, paragraph(answer(searches)), fields, rows, belief, found)
+    )

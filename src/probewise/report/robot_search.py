@@ -1,0 +1,43 @@
+"""One robot's search beside the truth that only the simulated world knows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from probewise._arrays import FloatArray
+from probewise.experiment import Exploration
+
+__all__ = ["RobotSearch"]
+
+
+@dataclass(frozen=True, eq=False)
+class RobotSearch:
+    """One robot's search: the name of its sensor model, its run, and the true shape."""
+
+    model: str
+    run: Exploration
+    truth: Mapping[str, float]
+    truth_mm: FloatArray
+    levels: tuple[float, float]
+
+    @property
+    def largest_error_mm(self) -> float:
+        """Largest absolute error of a parameter, in mm."""
+        last = self.run.last
+        return max(
+            abs(float(mean) - self.truth[name])
+            for name, mean in zip(last.names, last.mean, strict=True)
+            if name in self.truth and name.endswith("_mm")
+        )
+
+    @property
+    def first_white(self) -> int:
+        """Number of the first reading closer to white than to black: reaching it is luck, whatever the model."""
+        middle = sum(self.levels) / 2
+        seen = [r.value > middle for r in self.run.readings]
+        return seen.index(True) + 1 if any(seen) else len(seen)
+
+    def step_at(self, n: int) -> int:
+        """Return the number of the step after `n` readings, or of the last step if the run ended earlier."""
+        return min(n, len(self.run.steps))

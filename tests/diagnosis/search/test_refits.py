@@ -1,0 +1,92 @@
+"""Refits that are made once: twins, refits that gain nothing, and a second search."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.search import search as searching
+from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.nulls import fit_nulls
+from probewise.diagnosis.search.refits import Refits, is_significant
+from probewise.diagnosis.search.state import SearchState
+from probewise.diagnosis.search.twins import are_proportional
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.effects import CorrelatedNoise, Extent, RandomWalk
+from probewise.systems import RunTable, Simulator
+
+_N = 120
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    """A straight line that leaves out the room's temperature, of lambda about 11."""
+    rng = np.random.default_rng(7)
+    force, room = 10 * rng.random(_N), 20 + np.cumsum(rng.normal(size=_N))
+    y = 2.0 + 0.5 * force + 0.05 * (room - room.mean()) / room.std() + 0.05 * rng.normal(size=_N)
+    table = RunTable({"t_s": np.arange(float(_N)), "force": force, "room": room, "y": y}, time="t_s", run=None)
+    simulator = Simulator(
+        "y", "V", {"zero": (-10, 10), "slope": (0, 2)}, simulate=lambda p, u: p["zero"] + p["slope"] * u["force"],
+        time="t_s",
+    )  # fmt: skip
+    return prepare_system(simulator, table)
+
+
+@pytest.fixture(scope="module")
+def state(prepared):
+    prior = prepared.apparatus.prior_odds(prepared.effects)
+    extent = Extent.of(prepared.recording)
+    on_noise = {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)}
+    refits = Refits(prepared.null, Noises(prepared.recording, on_noise, prior), TemplateMemory(prepared.usable))
+    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.on_noise}
+    state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
+    fit_nulls(state, prepared, max_order=1)
+    return state
+
+
+def test_a_twin_has_the_evidence_of_a_refit_of_its_own(state):
+    """An offset that follows the room, by name and as a zero that depends on the room: one curve, two names."""
+    first = state.refits.extended(state.null, state.effects["sensitivity:room"])[0]
+    twin = state.refits.extended(state.null, state.effects["depends:zero:room"])[0]
+    alone = replace(state.refits, known={}).extended(state.null, state.effects["depends:zero:room"])[0]
+    assert twin.names == alone.names == ("depends:zero:room",)
+    assert twin.evidence is first.evidence
+    assert twin.log_z == pytest.approx(alone.log_z, abs=0.02)
+    assert twin.found.model.predict(twin.found.z[None])[0] == pytest.approx(alone.found.predicted, abs=5e-4)
+
+
+def test_effects_of_different_curves_are_no_twins(state):
+    def of(name):
+        return state.templates.of(state.null.found, state.effects[name])
+
+    assert are_proportional(of("sensitivity:room"), of("depends:zero:room"))
+    assert not are_proportional(of("sensitivity:room"), of("depends:slope:room"))
+    assert not are_proportional(of("sensitivity:room"), of("gain_step"))
+
+
+def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
+    weighed = state.refits.extended(state.null, state.effects["sensitivity:room"])[0]
+    assert weighed.evidence[()].log_z > state.null.evidence[()].log_z + 20
+    idle = state.refits.extended(state.null, state.effects["input_offset:force"])[0]
+    assert idle.evidence.keys() == state.null.evidence.keys()
+    assert not is_significant(idle, state.null)
+    assert idle.log_z <= state.null.log_z + 0.02
+
+
+def test_a_second_search_makes_no_refit_again(prepared, monkeypatch):
+    fitted = []
+    whole = Refits.weighed
+    monkeypatch.setattr(
+        Refits, "weighed", lambda self, model, *a, **k: fitted.append(model.names) or whole(self, model, *a, **k)
+    )
+    first = searching.search(prepared)
+    made = list(fitted)
+    fitted.clear()
+    again = searching.search(prepared, after=first)
+    assert len(made) > 4
+    # The null is fitted once more from the leading fits of one effect.
+    assert [names for names in fitted if names] == []
+    assert again.posterior.by_mean == pytest.approx(first.posterior.by_mean, abs=1e-6)

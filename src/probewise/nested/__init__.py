@@ -29,6 +29,7 @@ from probewise.nested.stop import (
     State,
     StopRule,
 )
+from probewise.nested.weighted_samples import WeightedSamples
 
 __all__ = [
     "LIVE_PER_PARAM",
@@ -57,6 +58,7 @@ __all__ = [
     "StopRule",
     "Tally",
     "Weighted",
+    "WeightedSamples",
     "agreement_of",
     "alive_at_death",
     "chain_memory",

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
-from probewise._display import ShowsItself
-from probewise._kinds import require_number, require_rng, require_whole
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evidence import log_volumes
-from probewise.nested.weights import weighted_quantiles
+from probewise.nested.weighted_samples import WeightedSamples
 
 __all__ = ["COUNTS", "PER_POINT", "DeadPoints", "of_length"]
 
@@ -34,7 +32,7 @@ def of_length(name: str, values: FloatArray | IntArray, n: int, one: str) -> Flo
 
 
 @dataclass(frozen=True, eq=False)
-class DeadPoints(ShowsItself):
+class DeadPoints(WeightedSamples):
     """The weighted samples of a run of nested sampling.
 
     Attributes
@@ -82,11 +80,6 @@ class DeadPoints(ShowsItself):
         object.__setattr__(self, name, of_length(name, values, self.n_dead, "row of theta"))
 
     @property
-    def weight(self) -> FloatArray:
-        """Posterior weights, summing to one, (n_dead,)."""
-        return np.asarray(np.exp(self.log_weight))
-
-    @property
     def n_dead(self) -> int:
         """Number of weighted samples."""
         return len(self.theta)
@@ -95,22 +88,6 @@ class DeadPoints(ShowsItself):
     def log_volume(self) -> FloatArray:
         """Expected natural log of the prior share above each sample, ln X, (n_dead,)."""
         return log_volumes(self.n_at_death, self.log_start)
-
-    def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
-        """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
-        require_rng(rng)
-        n = require_whole("n", n)
-        ladder = np.cumsum(self.weight)
-        rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")
-        return np.asarray(rng.permutation(np.minimum(rows, len(ladder) - 1)))
-
-    def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
-
-        Systematic resampling: a point of weight w occurs n w times, rounded up or down, so points
-        repeat only where a weight exceeds 1 / n; `diversify` makes repeated samples distinct.
-        """
-        return np.asarray(self.theta[self.rows(n, rng=rng)])
 
     def mean(self, f: Callable[[FloatArray], FloatArray] | None = None, *, block: int | None = None) -> FloatArray:
         """Average the parameters, or any function of them, over the posterior.
@@ -141,27 +118,6 @@ class DeadPoints(ShowsItself):
             part = np.asarray(np.tensordot(weight, values, axes=(0, 0)))
             total = part if total is None else total + part
         return np.zeros(0) if total is None else total
-
-    def covariance(self) -> FloatArray:
-        """Posterior covariance of the parameters, (n_params, n_params)."""
-        centred = self.theta - self.mean()
-        return np.asarray((centred * self.weight[:, None]).T @ centred)
-
-    def sd(self) -> FloatArray:
-        """Posterior standard deviation of the parameters, (n_params,)."""
-        return np.asarray(np.sqrt(self.weight @ (self.theta - self.mean()) ** 2))
-
-    def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
-        """Weighted quantiles of each parameter, (n_q,) -> (n_q, n_params)."""
-        return weighted_quantiles(self.theta, self.weight, q)
-
-    def interval(self, mass: float = 0.95) -> FloatArray:
-        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
-        share = "greater than 0, less than 1"
-        columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
-        if not 0 < require_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
-            raise ParameterError("mass", mass, share)
-        return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
 
     def best(self) -> FloatArray:
         """Parameters of the greatest likelihood, (n_params,)."""

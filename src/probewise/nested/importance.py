@@ -17,15 +17,15 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from probewise._arrays import FloatArray, IntArray, frozen
-from probewise._display import ShowsItself
-from probewise._kinds import require_rng, require_whole
+from probewise._arrays import FloatArray, frozen
+from probewise._kinds import require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.proposal import Proposal, find_parts, fit_proposals, joined
 from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded
-from probewise.nested.weights import n_effective, resampled, weighted_quantiles
+from probewise.nested.weighted_samples import WeightedSamples
+from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["Weighted", "pareto_k", "refine", "update"]
 
@@ -44,7 +44,7 @@ _APART = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Weighted(ShowsItself):
+class Weighted(WeightedSamples):
     """Weighted posterior samples and the evidence, from importance sampling.
 
     Attributes
@@ -113,39 +113,10 @@ class Weighted(ShowsItself):
         )
         return (*(words for so, words in reasons if so), *self.inherited)
 
-    @property
-    def weight(self) -> FloatArray:
-        """Posterior weights, summing to one, (n,)."""
-        return np.asarray(np.exp(self.log_weight))
-
-    def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
-        """Draw the rows of `n` equally weighted samples by systematic resampling, (n,), in random order."""
-        require_rng(rng)
-        n = require_whole("n", n)
-        return np.asarray(rng.permutation(resampled(self.weight, n, rng)))
-
-    def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw `n` equally weighted posterior samples, (n, n_params), in random order."""
-        return np.asarray(self.theta[self.rows(n, rng=rng)])
-
     def mean(self, f: Callable[[FloatArray], FloatArray] | None = None) -> FloatArray:
         """Posterior mean of the parameters, (n_params,), or of `f(theta)` (n, ...), of the trailing shape."""
         values = self.theta if f is None else np.asarray(f(self.theta))
         return np.asarray(np.tensordot(self.weight, values, axes=(0, 0)))
-
-    def sd(self) -> FloatArray:
-        """Posterior standard deviation of the parameters, (n_params,)."""
-        return np.asarray(np.sqrt(self.weight @ (self.theta - self.mean()) ** 2))
-
-    def quantiles(self, q: FloatArray | list[float] | tuple[float, ...]) -> FloatArray:
-        """Weighted quantiles of each parameter, (n_q,) -> (n_q, n_params)."""
-        return weighted_quantiles(self.theta, self.weight, q)
-
-    def interval(self, mass: float = 0.95) -> FloatArray:
-        """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
-        if not 0 < mass < 1:
-            raise ParameterError("mass", mass, "greater than 0, less than 1")
-        return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])
 
     def summary(self) -> str:
         """Describe evidence and posterior in plain text."""

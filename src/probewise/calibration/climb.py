@@ -27,14 +27,14 @@ __all__ = ["N_SNAPSHOTS", "Climb", "KnownDensity", "Rung", "climb"]
 
 # A change of temperature leaves at least this share of the particles effective.
 _KEPT = 0.5
-_N_STEPS = 5
+_N_STEPS = 3
 _BISECTIONS = 40
 _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: one costs as much as a move.
 _DRAWS = 4
 # Times that the posterior's samples are kept; moves of each particle once it is reached, and between two exchanges.
 N_SNAPSHOTS = 4
-_N_MORE, _EXCHANGE = 12, 2
+_N_MORE, _EXCHANGE = 24, 4
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 6
 # A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.

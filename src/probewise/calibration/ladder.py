@@ -39,8 +39,8 @@ _N_TRIES = 4
 _LEAST_SHARE = 0.05
 # The first climb from a peak starts from a density so much wider: particles gather more easily than they spread.
 _WIDENED = 1.6
-# Moves once the posterior is reached, at the first climb from a peak and at the second.
-_FEW_MOVES, _MANY_MOVES = 6, 60
+# From a peak: moves at each temperature; once the posterior is reached, at the first climb and at the second.
+_STEPS, _FEW_MOVES, _MANY_MOVES = 5, 6, 60
 # Draws of a density fitted to the samples about a peak.
 _N_FITTED = 6000
 # Two evidences this many errors apart disagree, if it is this far: few clouds tell their own scatter roughly.
@@ -159,6 +159,7 @@ def _about_peak(
             log_z_below=clouds,
             error_below=0.0,
             n_calls_below=n_calls,
+            n_steps=_STEPS,
             n_more=n_more,
             rng=rng,
             told=told,

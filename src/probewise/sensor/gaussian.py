@@ -406,7 +406,7 @@ def _seen_of_unit_disc(
     tilt = (np.abs(slope) + np.abs(y) / half) * sd_y * per_sd
     tilt += _BEND * sd_y * sd_y * per_sd / half**3
     out, left = np.empty((len(y), along.shape[1])), np.ones(len(y), dtype=np.bool_)
-    along = np.broadcast_to(along, out.shape)
+    along, reach = np.broadcast_to(along, out.shape), _reach_of(n_nodes)
     for n, most in ((n_nodes // 3, 0.8), (2 * n_nodes // 5, 1.0), (3 * n_nodes // 5, 1.35)):
         smooth = (np.abs(y) + _hermite(n)[0][-1] * sd_y < 1) & (tilt < most)
         rows = np.flatnonzero(left & smooth[:, 0])
@@ -415,17 +415,17 @@ def _seen_of_unit_disc(
         for r in _blocks(rows, out.shape[1]):
             ends = np.sqrt(1 - (y[r] + sd_y[r] * node) ** 2) * per_sd[r]
             turns = slope[r] * sd_y[r] * node * per_sd[r]
-            out[r] = _shared_chords(along[r] * per_sd[r], ends, turns, np.broadcast_to(weight, ends.shape))
+            out[r] = _shared_chords(along[r] * per_sd[r], ends, turns, np.broadcast_to(weight, ends.shape), reach)
     rows = np.flatnonzero(left)
     if rows.size:
-        found = _across_disc(y[rows, 0], sd_y[rows, 0], _reach_of(n_nodes), _legendre(n_nodes))
+        found = _across_disc(y[rows, 0], sd_y[rows, 0], reach, _legendre(n_nodes))
         node, x, weight = (part.T for part in found)
         ends, turns = x * per_sd[rows], slope[rows] * (node - y[rows]) * per_sd[rows]
         smooth = np.ptp(ends, axis=1) + np.ptp(turns, axis=1) < _MOST_SDS
         left[rows[smooth]] = False
         for r in _blocks(np.flatnonzero(smooth), out.shape[1]):
             own = rows[r]
-            out[own] = _shared_chords(along[own] * per_sd[own], ends[r], turns[r], weight[r])
+            out[own] = _shared_chords(along[own] * per_sd[own], ends[r], turns[r], weight[r], reach)
     if left.any():
         p, q = (np.broadcast_to(a, out.shape)[left] for a in (p, q))
         var_p, var_q, cov_pq = (np.broadcast_to(a, y.shape)[left] for a in (var_p, var_q, cov_pq))
@@ -449,27 +449,34 @@ def _line(p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray, float, 
     return c * p + s * q, across[:, :1], c, s
 
 
-def _shared_chords(along: FloatArray, ends: FloatArray, turns: FloatArray, weight: FloatArray) -> FloatArray:
+def _shared_chords(
+    along: FloatArray, ends: FloatArray, turns: FloatArray, weight: FloatArray, reach: float
+) -> FloatArray:
     """Integrate over chords that all readings share; lengths are in sds along them.
 
     Readings at `along`, (n, n_points); half the chords' lengths, how far the mean moves from one to the next, and their
     weights, (n, n_nodes).
     """
-    side = np.copysign(PER_SD, along)
-    distance = np.abs(along) * PER_SD
-    # Of most footprints one end of the chord is out of reach.
-    wide = np.flatnonzero(ends.min(axis=1) - np.abs(turns).max(axis=1) < _REACH)
-    near, back = CENTRE + ends * PER_SD, CENTRE - ends[wide] * PER_SD
-    found = np.zeros(along.shape)
+    distance, side = np.abs(along) * PER_SD, np.copysign(PER_SD, along)
+    found = _mass_before(ends, distance, side, turns, weight)
+    # Of most footprints the other end of the chord is out of reach.
+    both = np.flatnonzero(ends.min(axis=1) - np.abs(turns).max(axis=1) < reach)
+    if both.size:
+        found[both] -= _mass_before(-ends[both], distance[both], side[both], turns[both], weight[both])
+    return found
+
+
+def _mass_before(
+    ends: FloatArray, distance: FloatArray, side: FloatArray, turns: FloatArray, weight: FloatArray
+) -> FloatArray:
+    """Sum over chords the mass before one end of them; the arrays of `_shared_chords`."""
+    found = np.zeros(distance.shape)
+    start, cells = CENTRE + ends * PER_SD, np.empty(distance.shape)
     for k in range(ends.shape[1]):
-        shift = side * turns[:, k : k + 1]
-        shift += distance
-        cells = near[:, k : k + 1] - shift
+        np.multiply(side, -turns[:, k : k + 1], out=cells)
+        cells -= distance
+        cells += start[:, k : k + 1]
         normal_cdf_in_place(cells)
-        if wide.size:
-            cells_back = back[:, k : k + 1] - shift[wide]
-            normal_cdf_in_place(cells_back)
-            cells[wide] -= cells_back
         cells *= weight[:, k : k + 1]
         found += cells
     return found

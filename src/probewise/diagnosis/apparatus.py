@@ -69,7 +69,7 @@ class Apparatus(Protocol):
         """Return the names of the user's own effects, which are always tried."""
         ...
 
-    def refits_are_over(self) -> bool:
+    def refits_are_over(self, share: float = 1.0) -> bool:
         """Return whether the budget of costly predictions is spent, so that no further combination is refitted."""
         ...
 

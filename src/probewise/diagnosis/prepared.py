@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from probewise.diagnosis.fitting.earlier import SensorPrior, require_same_unit, 
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.thinning import rows_to_diagnose
-from probewise.effects import NamedEffect
+from probewise.effects import NamedEffect, NoiseEffect
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording, require_described
 from probewise.sensor import Stage
@@ -62,6 +62,11 @@ class Prepared:
     def on_noise(self) -> frozenset[str]:
         """Names of the effects on the noise."""
         return frozenset(name for name, effect in self.effects.items() if effect.stage is Stage.NOISE)
+
+    @cached_property
+    def faults_of_the_noise(self) -> frozenset[str]:
+        """Names of the effects that change the noise alone."""
+        return frozenset(n for n in self.on_noise if not cast(NoiseEffect, self.effects[n]).changes_the_mean)
 
     @property
     def least_readings(self) -> int:

@@ -176,6 +176,18 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
     n_nodes: ClassVar[int] = 10
     """Number of nodes of its prior, for an effect of one parameter."""
 
+    changes_the_mean: ClassVar[bool] = False
+    """Whether it is physics of the mean, seen in the readings alone."""
+
+    @property
+    def seen(self) -> FloatArray | None:
+        """Parameters (n_params,) that the readings show beyond doubt; by default None: a fit must show them."""
+        return None
+
+    def change(self, predicted: FloatArray) -> FloatArray:
+        """Return the change of readings predicted without it, any shape: none unless it `changes_the_mean`."""
+        return np.zeros_like(predicted)
+
     def bank(self) -> FloatArray:
         """Return equally weighted nodes of the prior of its one parameter, (n_nodes, 1, 1)."""
         return self.prior.from_unit_cube((np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes)[:, None, :]

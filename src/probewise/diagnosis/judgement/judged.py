@@ -114,7 +114,12 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         ("cannot_tell", ())
         if prepared.too_little
         else verdict_on(
-            hypotheses, test.p_value, noise_names=prepared.on_noise, aliases=pairs, aliased_with=aliased_with
+            hypotheses,
+            test.p_value,
+            noise_names=prepared.faults_of_the_noise,
+            aliases=pairs,
+            aliased_with=aliased_with,
+            certain=frozenset(searched.certain),
         )
     )
     if verdict == "unknown" and searched.prior.unknown_explains_most and searched.evidences.one_name_explains_more():
@@ -162,10 +167,12 @@ def verdict_on(
     noise_names: frozenset[str],
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
+    certain: frozenset[str] = frozenset(),
 ) -> tuple[Verdict, Names]:
-    """Decide by probabilities; name physics only if the global test has raised an alarm too."""
+    """Decide by probabilities; name physics only if the global test has raised an alarm too, or it is `certain`."""
     verdict, combination = decide(hypotheses, noise_names, aliases, aliased_with)
-    return ("cannot_tell", ()) if verdict == "named" and p_value > ALARM else (verdict, combination)
+    doubtful = verdict == "named" and not {*combination} <= noise_names | certain
+    return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
 
 
 def credible_set(hypotheses: tuple[Hypothesis, ...], mass: float = 0.95) -> tuple[str, ...]:

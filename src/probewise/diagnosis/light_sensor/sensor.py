@@ -65,7 +65,7 @@ class LightSensor:
         """Return the names of effects defined outside this library."""
         return frozenset(effects.keys() - EFFECTS)
 
-    def refits_are_over(self) -> bool:
+    def refits_are_over(self, share: float = 1.0) -> bool:
         """Return False: predictions are cheap here."""
         return False
 

@@ -23,6 +23,12 @@ STEERING = 3.0
 # and singles that screening did not favour were lost; no figure was kept.
 REFITTED_WITHIN = 6.0
 SINGLES = 6  # effects that are refitted alone; the width of the beam, three, before: no figure was kept
+# Effects that lead under plain noise, refitted about the null as it is fitted then, where noise with memory leads. Two
+# tanks of which one overflows: about the fit beside a walk the overflow lacked 68 nats, about the plain fit it led.
+LEADING_PLAINLY = 3
+# Shares of a limited budget of refits that may be spent once one effect, or two, were tried: what is missing twice is
+# worth as much as the last of many names for what is missing once.
+SHARES = (0.6, 0.9)
 EXTENDED_WITHIN = 20.0  # nats behind the best of its size: nothing is added to a combination further back
 # Nats behind the best: an SSF order so far back is not searched. An effect may look like another Gaussian, and be
 # explained better by its name at fewer of them.

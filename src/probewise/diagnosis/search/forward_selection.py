@@ -12,11 +12,13 @@ from probewise.diagnosis.search.constants import (
     ABSORBED,
     EXTENDED_WITHIN,
     FAINT,
+    LEADING_PLAINLY,
     MOST_OUT_OF_VOCABULARY,
     ORDERS_WITHIN,
     PAIRED,
     PAIRED_FROM,
     REFITTED_WITHIN,
+    SHARES,
     SINGLES,
     STEERING,
 )
@@ -55,11 +57,19 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
             chosen = _alone(state, null, proposals)
         else:
             chosen = promising(state, proposals, width=beam, behind=STEERING)
+        asked = [proposals[names] for names in chosen]
+        if size == 1:
+            asked = [*asked[:1], *_plainly(state, null), *asked[1:]]
+        state.share = SHARES[size - 1] if size <= len(SHARES) else 1.0
         refitted = []
-        for k, names in enumerate(chosen):
-            state.progress(f"refitting effects, {size} at a time", k, len(chosen))
-            refitted.append(state.refit(proposals[names].parent, proposals[names].added))
-        kept = [c for c in refitted if c is not None]
+        for k, proposal in enumerate(asked):
+            state.progress(f"refitting effects, {size} at a time", k, len(asked))
+            parent = state.candidates[proposal.parent.n_gaussians, ()] if proposal.parent is null else proposal.parent
+            refitted.append(state.refit(parent, proposal.added))
+            if size == 1 and refitted[-1] is not None:
+                state.improve_null(refitted[-1])
+        state.share = 1.0
+        kept = list({c.names: c for c in refitted if c is not None}.values())
         if not kept:
             break
         parents = [c for c in kept if c.log_z > max(r.log_z for r in rivals_of(c.names, kept)) - EXTENDED_WITHIN]
@@ -135,6 +145,23 @@ def _alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Propo
     always = state.tried_always | faint | twice
     chosen = promising(state, proposals, width=SINGLES, behind=REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
+
+
+def _plainly(state: SearchState, null: WeighedFit) -> list[Proposal]:
+    """Propose the effects that lead under plain noise, about the null as it is fitted then.
+
+    To a walk of the noise, or a correlation, what is missing is noise, and the null is fitted beside it: there the
+    effect that is missing may show in nothing. Only a null that then predicts otherwise says more.
+    """
+    plain = state.refits.under_plain_noise(null)
+    if plain is None:
+        return []
+    scores = state.scores(plain, plain.law, plain)
+    odds = {
+        name: log_mean(own) + state.prior.log_mean((name,)) for name, own in scores.items() if first_of(name) is None
+    }
+    ranked = sorted(odds, key=lambda name: -odds[name])[:LEADING_PLAINLY]
+    return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_mean(())]
 
 
 def _together(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:

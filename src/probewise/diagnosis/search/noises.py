@@ -45,18 +45,20 @@ class Noises:
         self._step = lattice_step(self.recording.readings[self.recording.usable])
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         seen = 0 < Quantisation.seen_above * rough_sd(self.recording) < self._step
-        self.certain = (Quantisation.name,) if Quantisation.name in self.effects and seen else ()
+        rounded = {Quantisation.name: np.array([self._step])} if Quantisation.name in self.effects and seen else {}
+        shown = {name: effect.seen for name, effect in self.effects.items() if effect.seen is not None}
+        self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
+        self.certain = tuple(sorted(self._known))
         self._hidden = hides_the_noise(self._step, self.recording)
-        others = [name for name in self.effects if name != Quantisation.name]
+        others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
         single = [tuple(sorted({*names, *self.certain})) for names in subsets(others, 1)]
         self.models = {names: self._model(names) for names in single}
 
     def _model(self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None) -> NoiseModel:
         # Certain effects are not re-estimated about each fit, whose own residual may be larger.
-        known = {name: (np.array([[self._step]]), np.zeros(1)) for name in self.certain}
         effects = tuple(self.effects[n] for n in names)
         rounding = self._step if self._hidden and names == self.certain else 0.0
-        return NoiseModel(effects, self.recording, {**known, **(likely or {})}, rounding, self.least_sd)
+        return NoiseModel(effects, self.recording, {**self._known, **(likely or {})}, rounding, self.least_sd)
 
     def log_prior(self, names: Names) -> float:
         """Log prior of a noise model."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,9 +20,9 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.search.constants import STEERING, VARIANTS_TRIED
+from probewise.diagnosis.search.constants import ALIASED_NATS, SAME_MODE, STEERING, VARIANTS_TRIED
 from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.twins import are_proportional, as_twin
+from probewise.diagnosis.search.twins import Swap, are_proportional
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
 
@@ -43,6 +43,8 @@ class Refits:
     templates: TemplateMemory
     known: dict[tuple[WeighedFit, NamedEffect[Any], float], Extended] = field(default_factory=dict, repr=False)
     """Refits with one more effect, by the candidate, the effect, and the nats against it."""
+    twins: dict[WeighedFit, tuple[WeighedFit, Swap]] = field(default_factory=dict, repr=False)
+    """Refits taken from those of twins, with the refit and the exchange of effects."""
     scored: dict[tuple[Fit, NoiseLaw, Bank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
     """Log Bayes factors of the templates of a bank, by label."""
 
@@ -84,6 +86,24 @@ class Refits:
             evidence = self.noises.weigh(found)
         return WeighedFit.of(found, law, evidence, log_visible(found, law, self.templates.usable))
 
+    def is_better_at(self, z: FloatArray, candidate: WeighedFit) -> bool:
+        """Return whether a candidate's model is better at coordinates z (n_params,) than at its fit."""
+        found, law = candidate.found, candidate.law
+        readings = found.predicted + found.residuals
+        whitened = law(readings - found.model.predict(z[None, :])[0, self.templates.usable])[:, None]
+        there = float(law.misfit(whitened, law.scale(whitened))[0]) + 0.5 * float(z @ z)
+        return there < found.objective - SAME_MODE
+
+    def under_plain_noise(self, null: WeighedFit) -> WeighedFit | None:
+        """Fit a given null under the plainest noise too; None if it predicts the same, or its noise has no memory."""
+        if self.sensor is None or not self.law_of(null).remembers:
+            return None
+        law = null.evidence[self.noises.certain].law
+        found = self._fit(null.found.model, np.stack([null.found.z, *self.sensor.starts]), law, 30)
+        if np.sum(law(found.residuals - null.found.residuals) ** 2) < 2 * ALIASED_NATS * found.sd**2:
+            return None
+        return WeighedFit.of(found, law, self.noises.weigh(found), 0.0)
+
     def extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
         """Refit with one more effect, for its likely variants, unless that was done before.
 
@@ -96,7 +116,8 @@ class Refits:
         """
         key = parent, effect, against
         if key not in self.known:
-            self.known[key] = self._as_twin(parent, effect, against) or self._extended(parent, effect, against)
+            twin = self._as_twin(parent, effect, against) or self._beside_twin(parent, effect, against)
+            self.known[key] = twin or self._extended(parent, effect, against)
         return self.known[key]
 
     def _as_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
@@ -104,12 +125,21 @@ class Refits:
         own = self.templates.of(parent.found, effect)
         for (held, other, less), (candidate, scores) in list(self.known.items()):
             if held is parent and less == against and are_proportional(own, self.templates.of(held.found, other)):
-                found = as_twin(candidate.found, self.templates.of(held.found, other), own, self.templates.usable)
-                if found is not None:
-                    weights = {name: w for name, w in candidate.weights.items() if name != other.name}
-                    weights[effect.name] = candidate.weights[other.name]
-                    return replace(candidate, found=found, weights=weights), scores
+                swap = Swap(other.name, self.templates.of(held.found, other), effect.name, own)
+                twin = swap.of(candidate, self.templates.usable)
+                if twin is not None:
+                    self.twins[twin] = candidate, swap
+                    return twin, scores
         return None
+
+    def _beside_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
+        """Return the refit with this effect beside the twin of one that a candidate holds, as beside that."""
+        first, swap = self.twins.get(parent, (None, None))
+        known = None if first is None else self.known.get((first, effect, against))
+        if known is None or swap is None:
+            return None
+        twin = swap.of(known[0], self.templates.usable)
+        return None if twin is None else (twin, known[1])
 
     def _extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
         templates = self.templates.of(parent.found, effect)

@@ -17,6 +17,7 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.prior_odds import PriorOdds
+from probewise.diagnosis.search.constants import SAME_MODE
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.refits import Refits, is_significant
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
@@ -48,7 +49,9 @@ class SearchState:
     progress
         Progress function.
     is_over
-        Function that returns whether the budget of refits is spent.
+        Function that returns whether a share of the budget of refits is spent.
+    share
+        Share of it that may be spent by now.
     """
 
     effects: Mapping[str, NamedEffect[Any]]
@@ -58,7 +61,8 @@ class SearchState:
     refits: Refits
     tried_always: frozenset[str] = frozenset()
     progress: Progress = silent
-    is_over: Callable[[], bool] = lambda: False
+    is_over: Callable[[float], bool] = lambda share: False
+    share: float = 1.0
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
     sensors: dict[int, Null] = field(default_factory=dict)
     """By SSF order."""
@@ -132,7 +136,7 @@ class SearchState:
         The best candidate of that kind, possibly an earlier one; None if there is none.
         """
         against = 0.0 if parent.names else self.complexity_penalty(parent.degrees_of_freedom)
-        if self.is_over():
+        if self.is_over(self.share):
             return max(self.of(tuple(sorted((*parent.names, added)))), key=lambda c: c.log_z, default=None)
         self.extended.add((parent, added))
         try:
@@ -154,6 +158,16 @@ class SearchState:
             self.about_parts[names, noise] = parent.evidence[noise].log_z + min(value, 0.0) - against
         self.undetected.add(names)
         return None
+
+    def improve_null(self, candidate: WeighedFit) -> None:
+        """Fit a given null again from where a fit with one more effect left it, if it is better there."""
+        null = self.candidates[candidate.n_gaussians, ()]
+        start = candidate.found.z[: null.found.model.n_params]
+        if self.refits.sensor is None or not self.refits.is_better_at(start, null):
+            return
+        again = self.refits.weighed(null.found.model, start[None, :], candidate.law)
+        if again.log_z > null.log_z + SAME_MODE:
+            self.keep(again)
 
     def reach(self, names: Names) -> None:
         """Refit a combination, starting from its largest refitted subset."""

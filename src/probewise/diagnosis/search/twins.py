@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence.templates import EffectTemplates
 from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.search.weighed_fit import WeighedFit
 
-__all__ = ["are_proportional", "as_twin"]
+__all__ = ["Swap", "are_proportional"]
 
 _PROPORTIONAL = 1e-9  # one minus the cosine of two templates
 _SAME_READINGS = 1e-3  # noise sds, the largest difference of two predictions
@@ -28,33 +29,44 @@ def are_proportional(first: EffectTemplates, second: EffectTemplates) -> bool:
     return bool(np.all(np.abs(np.einsum("ij,ij->j", a, b)) >= (1 - _PROPORTIONAL) * norms) and np.all(norms > 0))
 
 
-def as_twin(found: Fit, of: EffectTemplates, twin: EffectTemplates, usable: IntArray) -> Fit | None:
-    """Return the fit with a twin in place of its last effect; None if it predicts or differentiates otherwise.
+@dataclass(frozen=True, eq=False)
+class Swap:
+    """The exchange of one effect for its twin, by their names and templates."""
 
-    Parameters
-    ----------
-    found
-        The fit; its last effect is a variant of the first effect.
-    of, twin
-        Templates of the first effect, and of its twin.
-    usable
-        Rows with usable readings, (n_usable,).
-    """
-    held = found.model.effects[-1]
-    variant = next((k for k, each in enumerate(of.variants) if each is held), None)
-    if variant is None:
+    name: str
+    of_first: EffectTemplates
+    twin: str
+    of_twin: EffectTemplates
+
+    def of(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
+        """Return a candidate with the twin in place of the effect; None if it predicts or differentiates otherwise.
+
+        `usable` are the rows with usable readings, (n_usable,).
+        """
+        found = self._fitted(candidate.found, usable)
+        if found is None:
+            return None
+        weights = {self.twin if name == self.name else name: own for name, own in candidate.weights.items()}
+        return replace(candidate, found=found, weights=weights)
+
+    def _fitted(self, found: Fit, usable: IntArray) -> Fit | None:
+        effects, of = list(found.model.effects), self.of_first.variants
+        pair = next(((i, k) for i, held in enumerate(effects) for k, each in enumerate(of) if each is held), None)
+        if pair is None:
+            return None
+        at, variant = pair
+        held, effects[at] = effects[at], self.of_twin.variants[variant]
+        model = replace(found.model, effects=tuple(effects))
+        amplitudes = np.array(held.amplitudes, dtype=np.int64) + found.model.columns_of(held.name).start
+        for sign in (1.0, -1.0):
+            z, slopes = found.z.copy(), found.slopes.copy()
+            z[amplitudes] *= sign
+            slopes[:, amplitudes] *= sign
+            predicted, own = (values[usable] for values in model.jacobian(z))
+            if _are_same(predicted, own, replace(found, slopes=slopes)):
+                residuals = found.residuals + found.predicted - predicted
+                return replace(found, model=model, z=z, predicted=predicted, residuals=residuals, slopes=own)
         return None
-    parent, _ = found.model.without(held.name)
-    model = parent.with_effect(twin.variants[variant])
-    amplitudes = np.array(held.amplitudes, dtype=np.int64) + parent.n_params
-    for sign in (1.0, -1.0):
-        z, slopes = found.z.copy(), found.slopes.copy()
-        z[amplitudes] *= sign
-        slopes[:, amplitudes] *= sign
-        predicted, own = (values[usable] for values in model.jacobian(z))
-        if _are_same(predicted, own, replace(found, slopes=slopes)):
-            return replace(found, model=model, z=z, predicted=predicted, residuals=found.residuals, slopes=own)
-    return None
 
 
 def _are_same(predicted: FloatArray, slopes: FloatArray, found: Fit) -> bool:

@@ -32,6 +32,7 @@ from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, System
 from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.proposals import proposals
+from probewise.systems.forms.stop import MeterStop
 
 __all__ = ["ON_NOISE", "SimulatorApparatus"]
 
@@ -63,9 +64,12 @@ class SimulatorApparatus:
     ----------
     about
         The fit, and the sd of a reading.
+    stop
+        The end of the meter's range, where readings stand at one that was not declared.
     """
 
     about: About
+    stop: MeterStop | None = None
 
     @property
     def system(self) -> System:
@@ -97,7 +101,8 @@ class SimulatorApparatus:
         extent = Extent.of(recording)
         on_noise = [effect for kind in ON_NOISE if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
-        return forms | {effect.name: effect for effect in on_noise}
+        stops = {} if self.stop is None else {self.stop.name: self.stop}
+        return forms | {effect.name: effect for effect in on_noise} | stops
 
     def proposals(self) -> dict[str, NamedEffect[Any]]:
         """Return short formulas of columns and states."""
@@ -107,16 +112,16 @@ class SimulatorApparatus:
         """Return the names of the extra effects of the user's file."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
-    def refits_are_over(self) -> bool:
-        """Return whether the budget of calls of `simulate`, or of integration steps, is spent."""
+    def refits_are_over(self, share: float = 1.0) -> bool:
+        """Return whether this share of the budget of calls of `simulate`, or of integration steps, is spent."""
         caller, tally = self.system.caller, self.system.tally
         if caller is None:
-            tally.cut_short = tally.cut_short or tally.n_steps >= STEPS_OF_A_SEARCH
-            return tally.cut_short
-        if caller.broadcasts or caller.n_calls < CALLS_OF_A_SEARCH:
-            return False
-        caller.cut_short = True
-        return True
+            over = tally.n_steps >= share * STEPS_OF_A_SEARCH
+            tally.cut_short |= over
+            return over
+        over = not caller.broadcasts and caller.n_calls >= share * CALLS_OF_A_SEARCH
+        caller.cut_short |= over
+        return over
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Divide the prior odds among these effects."""

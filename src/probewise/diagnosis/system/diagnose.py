@@ -24,6 +24,7 @@ from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, S
 from probewise.systems.calls import Tally
 from probewise.systems.forms import About
 from probewise.systems.forms.readings import since_start_of_run
+from probewise.systems.forms.stop import MeterStop, stop_of
 
 __all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
 
@@ -89,10 +90,11 @@ def prepare_system(
     recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
     recording = without_lost_rows(system, recording)
+    recording, stop = without_stop(simulator, table, recording)
     told = _counting(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
-    apparatus = SimulatorApparatus(About(system, table, found.z, sd))
+    apparatus = SimulatorApparatus(About(system, table, found.z, sd), stop)
     begun = replace(system, first=found.z)
     told("building the effects")
     effects = apparatus.effects(recording, begun) if bound else {}
@@ -133,6 +135,20 @@ def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
     return replace(recording, readings=np.where(lost, np.nan, recording.readings), notes=(*recording.notes, note))
 
 
+def without_stop(
+    simulator: Simulator, table: RunTable, recording: RunRecording
+) -> tuple[RunRecording, MeterStop | None]:
+    """Leave out, with a note, readings at which the meter stands at the end of its range; and return where it ends."""
+    found = stop_of(as_recording(simulator, table), simulator.reading)
+    if found is None:
+        return recording, None
+    stop, rows = found
+    level = f"{stop.level:.6g} {simulator.unit}".rstrip()
+    note = f"{int(rows.sum())} readings left out: they stand at {level}, where the meter stops"
+    recording = replace(recording, readings=np.where(rows, np.nan, recording.readings), notes=(*recording.notes, note))
+    return recording, stop
+
+
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     """Return notes: calls of `simulate` that failed, and parameters that it does not accept as arrays."""
     apparatus = diagnosis.apparatus
@@ -144,8 +160,8 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     out = []
     if caller.cut_short:
         out.append(
-            f"simulate takes one sample at a time: after {CALLS_OF_A_SEARCH:,} calls no further combination of effects "
-            "was fitted; if simulate takes arrays, the search is complete"
+            f"simulate takes one sample at a time: in {CALLS_OF_A_SEARCH:,} calls not every combination of effects "
+            "that promised something was fitted; if simulate takes arrays, the search is complete"
         )
     if caller.n_failed:
         out.append(f"simulate raised an error for {caller.n_failed:,} parameter vectors, which count as impossible")
@@ -158,8 +174,8 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _notes_on_law(tally: Tally) -> Iterator[str]:
     if tally.cut_short:
         yield (
-            f"integrating the law takes long: after {STEPS_OF_A_SEARCH:,} steps no further combination of effects "
-            "was fitted; with a larger max_step_s, shorter runs or fewer rows the search is complete"
+            f"integrating the law takes long: in {STEPS_OF_A_SEARCH:,} steps not every combination of effects that "
+            "promised something was fitted; with a larger max_step_s, shorter runs or fewer rows the search is complete"
         )
     if tally.n_failed:
         yield f"rates raised an error for {tally.n_failed:,} parameter vectors, which count as impossible"

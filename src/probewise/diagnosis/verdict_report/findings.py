@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_m
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, in_vocabulary, out_of_vocabulary
 from probewise.diagnosis.verdict_report.words import unit_in_words
-from probewise.effects import NamedEffect
+from probewise.effects import NamedEffect, NoiseEffect
 from probewise.recordings.plan import Plan
 
 __all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
@@ -162,11 +162,14 @@ def _too_small(
 def _size(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
     """Return lambda: the residual norm on noise-free readings after a full refit without the effect."""
     law = holder.evidence[noise].law
-    found = holder.found
+    found, prepared = holder.found, searched.prepared
+    effect = prepared.effects[name]
+    if name in prepared.on_noise and cast(NoiseEffect, effect).changes_the_mean:
+        everywhere = found.model.predict(found.z[None, :])[0]
+        return float(np.linalg.norm(cast(NoiseEffect, effect).change(everywhere))) / found.sd
     if name in searched.certain:
         step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of(name)]
         return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
-    prepared = searched.prepared
     if name in prepared.on_noise:
         # For noise effects: the size of an effect on the mean with equal evidence.
         without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]

@@ -1,0 +1,67 @@
+"""A meter that stands at the end of its range: seen in the readings, named, and carried to predictions."""
+
+import numpy as np
+import pytest
+
+from probewise.diagnosis import diagnose_system
+from probewise.diagnosis.system.fitted import repaired_of
+from probewise.systems import Noise, RunTable, Simulator, as_recording, predict_system
+from probewise.systems.forms.stop import stop_of
+
+_N, _SD = 240, 0.05
+
+
+def _simulator(**more):
+    return Simulator(
+        "y", "V", {"zero": (-10, 10), "slope": (0, 2)}, simulate=lambda p, u: p["zero"] + p["slope"] * u["x"], **more
+    )
+
+
+def _table(readings):
+    x = 3 + 2 * np.sin(np.arange(_N) / 12)
+    return {"x": x, "y": readings(1.0 + x + _SD * np.random.default_rng(3).standard_normal(_N))}
+
+
+def _stop(table, **more):
+    simulator = _simulator(**more)
+    return stop_of(as_recording(simulator, RunTable(table, time=None, run=None)))
+
+
+def test_a_meter_that_stops_after_its_noise_is_seen():
+    found, rows = _stop(_table(lambda y: np.minimum(y, 5.5)))
+    assert (found.level, found.is_ceiling, rows.sum()) == (5.5, True, np.sum(_table(lambda y: y)["y"] >= 5.5))
+    found, _ = _stop(_table(lambda y: np.maximum(y, 2.5)))
+    assert (found.level, found.is_ceiling) == (2.5, False)
+
+
+_NOT_STOPPED = {
+    "no stop": lambda y: y,
+    "noise after the stop": lambda y: np.minimum(y, 5.5) + 0.01 * np.random.default_rng(1).standard_normal(_N),
+    "coarse digits": lambda y: np.round(y, 1),
+    "single lost readings": lambda y: np.where(np.arange(_N) % 30 == 0, 9.9, y),
+    "constant": lambda y: np.full(_N, 3.0),
+}
+
+
+@pytest.mark.parametrize("case", _NOT_STOPPED)
+def test_nothing_is_seen_where_no_meter_stops(case):
+    assert _stop(_table(_NOT_STOPPED[case])) is None
+
+
+def test_a_declared_end_is_no_news():
+    table = _table(lambda y: np.minimum(y, 5.5))
+    assert _stop(table, noise=Noise(range=(0.0, 5.5))) is None
+
+
+@pytest.mark.slow
+def test_a_stop_is_named_and_predicted():
+    table = _table(lambda y: np.minimum(y, 5.5))
+    found = diagnose_system(_simulator(), table, rng=np.random.default_rng(0))
+    assert (found.verdict, found.combination) == ("named", ("saturation",))
+    effect = found.effects[0]
+    assert effect.parameters[0].interval95 == pytest.approx((5.5, 5.5))
+    # Some 60 readings are up to half a volt, ten sds, beyond.
+    beyond = np.maximum(1.0 + table["x"] - 5.5, 0) / _SD
+    assert effect.size_lambda == pytest.approx(np.linalg.norm(beyond), rel=0.1)
+    predicted = predict_system(repaired_of(found), table, rng=np.random.default_rng(1))
+    assert predicted.mean.max() == pytest.approx(5.5)

@@ -14,13 +14,13 @@ from probewise.arm import Pose, Reading
 from probewise.calibration import FittedSensor, mean_field
 from probewise.errors import ParameterError
 from probewise.experiment import CLEAN, Exploration, begin, experiment_for, left_out_of, repaired, result_json, step
-from probewise.experiment.asking import Field
+from probewise.experiment.asking import Field, inquire
+from probewise.experiment.checking import ENOUGH_BITS, NAMES, bits_of_names, far_side
 from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
 from probewise.experiment.posterior import prior_posterior, updated
 from probewise.experiment.refitted import refitted
 from probewise.experiment.rivals import rivals_of
-from probewise.experiment.settling import ENOUGH_BITS, _bits_of_names
 from probewise.inquiry import prior_entropy
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
@@ -200,7 +200,7 @@ def test_a_reading_tells_names_by_what_they_predict():
     alike = np.tile(20.0 + 3.0 * even, 2)
     apart = np.concatenate([20.0 + 3.0 * even, 90.0 + 3.0 * even])
     near = np.concatenate([20.0 + 0.5 * even, 23.0 + 2.0 * even])
-    bits = _bits_of_names(weight, np.stack([alike, apart, near], axis=1), names, 1.0)
+    bits = bits_of_names(weight, np.stack([alike, apart, near], axis=1), names, 1.0)
     at = np.linspace(-20.0, 60.0, 20_001)
     given = [norm.pdf(at, mean, math.hypot(sd, 1.0)) for mean, sd in ((20.0, 0.5), (23.0, 2.0))]
     both = 0.5 * (given[0] + given[1])
@@ -208,6 +208,36 @@ def test_a_reading_tells_names_by_what_they_predict():
     assert bits[0] == pytest.approx(0.0, abs=1e-9)
     assert bits[1] == pytest.approx(1.0, abs=1e-6)
     assert bits[2] == pytest.approx(exact, abs=0.01)
+
+
+@pytest.mark.parametrize(("angles_deg", "asked_deg"), [((0, 20, 40), 200), ((0, 120, 240), None), ((0, 180), None)])
+def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_deg):
+    """A circle's edge read from one side leaves its other side, from three sides or two opposite ones none."""
+    x, y, radius = 500.0, 260.0, 90.0
+    on_edge = [
+        Reading(35.0, Pose(x + radius * math.cos(a), y + radius * math.sin(a)), 8.0) for a in np.radians(angles_deg)
+    ]
+    inside = Reading(60.0, Pose(x - 0.6 * radius, y), 0.0)
+    joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
+    with arm_of(Trial(REFERENCE, 0)) as arm:
+        field = Field.under(arm, doubting.grid)
+    prospect, _ = inquire(doubting, joined, joined.theta[:20], field, at=inside)
+    far = far_side(prospect, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
+    if asked_deg is None:
+        assert far is None
+        return
+    place = doubting.grid.places_mm[prospect.rows[far] % doubting.grid.n_places]
+    asked = x + radius * math.cos(math.radians(asked_deg)), y + radius * math.sin(math.radians(asked_deg))
+    assert np.hypot(*(place - asked)) < 12.0
+
+
+def test_a_patch_may_lie_anywhere_on_the_field():
+    found = {rival.name: rival.effect.prior for rival in rivals() if rival.name in ("glint", "albedo_patch")}
+    drawn = {name: prior.from_unit_cube(np.random.default_rng(0).random((4000, 4))) for name, prior in found.items()}
+    assert {prior.names for prior in found.values()} == {("amp", "x", "y", "r"), ("albedo", "x", "y", "r")}
+    for theta in drawn.values():
+        np.testing.assert_allclose(theta[:, 1:3].mean(axis=0), (524.0, 260.0), atol=25.0)
+        np.testing.assert_allclose(theta[:, 1:3].max(axis=0), (1048.0, 520.0), rtol=0.01)
 
 
 def test_a_repaired_sensor_holds_the_effect_that_leads(sensor, stepped):
@@ -240,6 +270,7 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     steps = [s for s, _ in timed_steps(_arm(trial), experiment, seed=8101, circle=0, max_readings=40)]
     known = [step.number for step in steps if step.widest_mm < 4.0 and step.chance_off < 0.01]
     assert known[0] < steps[-1].number
+    assert steps[-1].map.label == NAMES
     assert steps[-1].map.highest < ENOUGH_BITS
     assert left_out_of(steps[-1], 0.9).credible_set == ("ambient_step",)
     assert np.abs(steps[-1].mean - trial.truth).max() < 2.0

@@ -96,6 +96,11 @@ class PatchPrior:
         """The height's name, then x, y, r."""
         return (self.size, "x", "y", "r")
 
+    @property
+    def radius(self) -> LogUniform:
+        """Prior of the radius."""
+        return LogUniform(_RADII[0] / 2 * self.line.length_mm, _RADII[-1] * 2 * self.line.length_mm)
+
     @cached_property
     def _by_line(self) -> Product:
         """Prior over what the scan shows: height on the line, place along it, distance in radii, radius."""
@@ -105,7 +110,7 @@ class PatchPrior:
                 "on_line": HeavyTailed(self.typical),
                 "along": Uniform(line.low_mm - _MARGIN * length, line.high_mm + _MARGIN * length),
                 "beside": self.BESIDE,
-                "r": LogUniform(_RADII[0] / 2 * length, _RADII[-1] * 2 * length),
+                "r": self.radius,
             }
         )
 

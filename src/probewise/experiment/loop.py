@@ -34,7 +34,7 @@ from probewise.experiment.judging import OFF_SDS, chance_off, doubt, fit, inform
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import prior_posterior, reconsidered
 from probewise.experiment.setting import Experiment, widest_mm
-from probewise.experiment.settling import ENOUGH_BITS, settling
+from probewise.experiment.settling import settling
 from probewise.experiment.values import ArmError, Exploration, State, Step
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
@@ -145,8 +145,8 @@ def step(
     asks = False
     if experiment.trust < 1:
         known, _ = _is_known(experiment, posterior, arm, likely, rng)
-        outlook = settling(experiment, wary, prospect, outlook, readings, rng=rng, known=known)
-        asks = known and outlook.highest >= ENOUGH_BITS and (max_readings is None or len(readings) < max_readings)
+        outlook, asks = settling(experiment, wary, prospect, outlook, readings, rng=rng, known=known)
+        asks = asks and (max_readings is None or len(readings) < max_readings)
     if arm is None and (outlook.flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = arms()
     known, off = _is_known(experiment, posterior, arm, likely, rng)

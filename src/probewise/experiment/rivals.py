@@ -56,6 +56,10 @@ ON_FIELD = {
     "edge_blur": False,
     "edge_shadow": False,
     "halo": False,
+    "periodic_position_error": False,
+    "height_gradient": True,
+    "albedo_patch": True,
+    "glint": True,
 }
 """Effects on the mean that are detectable over a shape on a field, and whether their scale is the field's."""
 
@@ -108,7 +112,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
         reach_mm = math.hypot(*field_mm) if wide else _SCAN_MM
         effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _scan(reach_mm)))
         if effect is not None and name not in carried:
-            found += [Rival(name, effect=way) for way in _ways(effect)]
+            found += [Rival(name, effect=way) for way in _ways(effect, field_mm)]
     noise = declared_noise(likelihood)
     if noise is not None:
         laws = noise_laws(*noise, (model.levels.i_min, model.levels.i_max))
@@ -116,14 +120,14 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     return tuple(found)
 
 
-def _ways(effect: NamedEffect[FloatArray]) -> list[Told]:
+def _ways(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[Told]:
     """List the ways in which an effect may act in a run: one that changes with time does so at the run's own pace."""
     if effect.name in OF_MOTION:
-        return [Shown(effect), FromRest(Shown(effect))]
+        return [Shown(effect, field_mm), FromRest(Shown(effect, field_mm))]
     if effect.name not in _IN_TIME:
-        return [Shown(effect)]
+        return [Shown(effect, field_mm)]
     ways = [effect, GainLoss.like(effect)] if isinstance(effect, GainDrift) else [effect]
-    return [Paced(Shown(way)) for way in ways]
+    return [Paced(Shown(way, field_mm)) for way in ways]
 
 
 @dataclass(frozen=True)

@@ -3,20 +3,18 @@
 Several kinds of hypotheses may explain all readings and differ in the shape. The utility is the expected information
 about all of them together. If some reading may be the last, it is the probability of that: every length known under the
 mixture, with little chance that one is wrong. Kinds that are aliased but agree on the shape then need not be
-distinguished. Once the lengths are known, the utility is the information about the name of what the sensor leaves out,
-and the run goes on while a reading promises enough of it.
+distinguished. Once the lengths are known, readings check what is left open (`checking`).
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
+from probewise.experiment.checking import ENOUGH_BITS, FAR_SIDE, NAMES, bits_of_names, far_side
 from probewise.experiment.judging import OFF_SDS
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
@@ -27,10 +25,7 @@ from probewise.recordings.plan import Plan
 from probewise.scene import outlines
 from probewise.scene.regions import EllipseRegion, PolygonRegion
 
-__all__ = ["ENOUGH_BITS", "settling"]
-
-ENOUGH_BITS = 0.08
-"""Expected information about the name of what is left out for which a reading is taken after the shape is known."""
+__all__ = ["settling"]
 
 _NEAR = 15.0  # times the target sd: beyond it, the ordinary information is used
 _HYPOTHESES = 800
@@ -42,10 +37,8 @@ _BEST = 60  # places with the largest information about all parameters
 _AT_EDGES = 40
 _ANYWHERE = 20
 _LEAST_CHANCE = 0.25  # probability of ending the run from which only that counts
-_NODES = 12  # of the reading expected under a name
 _ENDING = 60  # most informative places, tested for ending the run
 _LABEL = "expected information about the shape and what the sensor leaves out (bits)"
-_NAMES = "expected information about what the sensor leaves out (bits)"
 _ENDS = "probability that a reading there ends the run, whatever the sensor leaves out"
 
 
@@ -58,41 +51,56 @@ def settling(
     *,
     rng: np.random.Generator,
     known: bool = False,
-) -> UtilityMap:
-    """Return the map of the utility over designs for all kinds; far from the end, the given map.
+) -> tuple[UtilityMap, bool]:
+    """Return the map of the utility over designs for all kinds, or the given one far from the end.
 
-    `known` says whether the posterior knows the shape, so that only the name of what is left out is open.
+    `known` says whether the posterior knows the shape. The second value returned says whether a reading is to be taken
+    even so.
 
     Candidates are the designs with the largest information, those at edges and centres of probable shapes, earlier
     places, and some random ones.
     """
     if prospect.goal is None:
-        return outlook
+        return outlook, False
     theta, lengths, weight = _drawn(experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng)
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
-        return outlook
+        return outlook, False
     rows = _candidates(experiment, prospect, outlook, theta, readings, rng)
     plan = Pace.of(readings).on(_plan(prospect, rows, readings[-1]))
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
     if known:
-        names = [kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own]
-        values = np.zeros(len(prospect.designs))
-        values[prospect.rows[rows]] = _bits_of_names(weight, answers, np.array(names), prospect.readout.noise_sd)
-        values.flags.writeable = False
-        return UtilityMap(prospect.designs, values, outlook.reachable, _NAMES)
+        names = np.array([kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own])
+        worth = bits_of_names(weight, answers, names, prospect.readout.noise_sd)
+        if worth.max() >= ENOUGH_BITS:
+            return _map(prospect, outlook, rows, worth, NAMES), True
+        far = far_side(prospect, experiment.shape.region(_middle(experiment, prospect)), readings)
+        if far is not None:
+            return _map(prospect, outlook, np.array([far]), np.ones(1), FAR_SIDE), True
+        return _map(prospect, outlook, rows, worth, NAMES), False
     worth, label = _bits(weight, answers, prospect), _LABEL
     best = np.argsort(-worth, kind="stable")[:_ENDING]
     chance = _ends(lengths, weight, answers[:, best], prospect, prospect.goal.sd, OFF_SDS * experiment.stop_sd_mm)
     if chance.max() >= _LEAST_CHANCE:
         worth, label = np.zeros(len(worth)), _ENDS
         worth[best] = chance
+    return _map(prospect, outlook, rows, worth, label), False
+
+
+def _map(prospect: Prospect, outlook: UtilityMap, rows: IntArray, worth: FloatArray, label: str) -> UtilityMap:
+    """Return the map of the utility of some available designs, (n,)."""
     values = np.zeros(len(prospect.designs))
     values[prospect.rows[rows]] = worth
     values.flags.writeable = False
     return UtilityMap(prospect.designs, values, outlook.reachable, label)
+
+
+def _middle(experiment: Experiment, prospect: Prospect) -> FloatArray:
+    """Return the posterior mean of the shape's parameters, (1, n_params)."""
+    theta = prospect.theta[:, experiment.shape_columns]
+    return np.asarray((prospect.weight @ theta)[None] / prospect.weight.sum())
 
 
 def _drawn(
@@ -182,30 +190,3 @@ def _ends(
         ends &= np.where(off, joint, 0.0).sum(axis=0) < MOST_OFF * mass
         out[design] = mass[ends].sum() / mass.sum()
     return out
-
-
-def _bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], noise_sd: float) -> FloatArray:
-    """Return the expected information about the name alone, in bits, (n_designs,), by a Gaussian for each name.
-
-    Histograms of the few hypotheses that a name has would tell names apart that agree.
-    """
-    share, mean, sd = [], [], []
-    for name in np.unique(names):
-        own = names == name
-        part = float(weight[own].sum())
-        average = weight[own] @ answers[own] / part
-        share.append(part)
-        mean.append(average)
-        sd.append(np.sqrt(weight[own] @ (answers[own] - average) ** 2 / part + noise_sd**2))
-    p, middle, width = np.array(share)[:, None], np.array(mean), np.array(sd)
-    # The entropy of the mixture, by Gauss-Hermite nodes about each name's Gaussian.
-    nodes, node_weight = np.polynomial.hermite_e.hermegauss(_NODES)
-    node_weight = node_weight / node_weight.sum()
-    told = np.zeros(answers.shape[1])
-    for k, part in enumerate(share):
-        at = middle[k] + width[k] * nodes[:, None]
-        log_density = -0.5 * ((at[:, None] - middle) / width) ** 2 - np.log(width)
-        most = log_density.max(axis=1)
-        of_all = most + np.log((p * np.exp(log_density - most[:, None])).sum(axis=1))
-        told += part * (node_weight @ (log_density[:, k] - of_all))
-    return np.asarray(np.maximum(told / math.log(2.0), 0.0))

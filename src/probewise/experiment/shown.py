@@ -2,7 +2,8 @@
 
 A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small for the dozen readings
 of a run. Such an effect changes neither the readings nor the shape: it counts as nothing left out. A change point
-may come at any of up to a hundred readings, sooner as likely as later in proportion.
+may come at any of up to a hundred readings, sooner as likely as later in proportion. A patch may lie anywhere on the
+field, not only along scanned lines.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from typing import Any, ClassVar
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailed, LogHeavyTailed, NamedEffect
+from probewise.effects.patches import PatchPrior
 from probewise.effects.wrapped import Wrapped
 from probewise.experiment.pace import EACH_S
-from probewise.priors import LogUniform, Prior, Product
+from probewise.priors import LogUniform, Prior, Product, Uniform
 
 __all__ = ["Shown"]
 
@@ -26,9 +28,10 @@ _SMALLEST = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Shown(Wrapped[Any]):
-    """An effect whose prior leaves out the sizes that a run cannot show."""
+    """An effect whose prior leaves out the sizes that a run on a field of this width and height cannot show."""
 
     effect: NamedEffect[Any]
+    field_mm: tuple[float, float]
 
     within_run: ClassVar[Mapping[str, LogUniform]] = {"at_s": LogUniform(0.5 * EACH_S, 100.0 * EACH_S)}
 
@@ -36,6 +39,10 @@ class Shown(Wrapped[Any]):
     def prior(self) -> Prior:
         """The effect's prior, of sizes that show."""
         own = self.effect.prior
+        if isinstance(own, PatchPrior):
+            size = HeavyTailed(own.typical, smallest=_SMALLEST)
+            x, y = (Uniform(0.0, length) for length in self.field_mm)
+            return Product({own.size: size, "x": x, "y": y, "r": own.radius})
         if not isinstance(own, Product):
             return own
         return Product({name: self._marginal(name, marginal) for name, marginal in own.marginals.items()})

@@ -30,17 +30,21 @@ from probewise.study.trial import BRIGHT, DARK, SEED, experiment_of, judged, rea
 from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
 from probewise.world.concealed import (
     AlbedoGradient,
+    AlbedoPatch,
     AmbientStep,
     CorrelatedNoise,
     Dropouts,
     EdgeBlur,
     EdgeShadow,
     Flicker,
+    Glint,
     Halo,
+    HeightGradient,
     Hysteresis,
     Lag,
     OffsetDrift,
     Outliers,
+    PeriodicPositionError,
     PositionScale,
     Quantisation,
     SensorTilt,
@@ -60,6 +64,7 @@ __all__ = [
 ]
 
 _EACH_S = 8.0  # seconds between readings, about
+_MIDDLE_MM = (FIELD.width_mm / 2, FIELD.height_mm / 2)
 _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
 
 
@@ -98,6 +103,10 @@ CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, 
     "correlated_noise": (CorrelatedNoise, (0.3, 0.6, 0.9)),
     "signal_dependent_noise": (SignalDependentNoise, (1.0, 8.0, 30.0)),
     "quantisation": (Quantisation, (2.0, 5.0, 10.0)),
+    "periodic_position_error": (lambda mm: PeriodicPositionError(mm, 60.0, 0.0), (1.0, 4.0, 10.0)),
+    "height_gradient": (lambda mm: HeightGradient(mm / FIELD.width_mm), (0.5, 2.0, 5.0)),
+    "albedo_patch": (lambda share: AlbedoPatch(share, *_MIDDLE_MM, 150.0), (0.1, 0.3, 0.6)),
+    "glint": (lambda units: Glint(units, *_MIDDLE_MM, 100.0), (3.0, 12.0, 30.0)),
     "sensor_tilt": (lambda mm: SensorTilt(mm, 0.0), (2.0, 6.0, 12.0)),
     "position_scale": (lambda share: PositionScale(share, share), (0.005, 0.02, 0.05)),
 }

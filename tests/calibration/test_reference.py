@@ -13,6 +13,7 @@ from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
+from probewise.nested.weights import n_effective
 from probewise.priors import LogUniform, Uniform
 from probewise.recordings import Recording
 
@@ -30,7 +31,7 @@ def _sorted_draws(prior: SSFPrior, n: int, rng: np.random.Generator) -> FloatArr
     return space.leave(space.enter(prior.from_unit_cube(rng.random((n, len(prior.names))))))[0]
 
 
-def _compensation(recording: Recording, n: int, rng: np.random.Generator) -> Compensation:
+def _compensation(recording: Recording, n: int, rng: np.random.Generator, n_pool: int = 4000) -> Compensation:
     """Learn the answers of N - 1 Gaussians that are known to a tenth of a mm, narrower than what they are used for."""
     below = default_prior(recording, n - 1)
     shapes = np.tile([0.3, 0.5, 1.5, 0.03, 0.08, -0.005, 0.2, -4.0, 2.0, 0.05, 0.02, 0.0][: 6 * (n - 1)], (300, 1))
@@ -38,7 +39,7 @@ def _compensation(recording: Recording, n: int, rng: np.random.Generator) -> Com
     theta *= 1.0 + 0.02 * rng.standard_normal(theta.shape)
     rest = below.coordinates.leave(below.coordinates.enter(theta))[0]
     posing = Posing(recording, default_prior)
-    return Compensation.of(posing.problem(n - 1), below.coordinates, posing.problem(1), rest, rng=rng, n_pool=4000)
+    return Compensation.of(posing.problem(n - 1), below.coordinates, posing.problem(1), rest, rng=rng, n_pool=n_pool)
 
 
 @pytest.fixture
@@ -119,6 +120,16 @@ def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth:
     sds = np.sqrt(np.diag(covariance))
     apart = np.linalg.norm((shift[told] - refit) / sds)
     assert apart < 0.15 * np.linalg.norm(refit / sds)
+
+
+def test_the_pool_grows_until_enough_of_its_shapes_are_effective(recording: Recording) -> None:
+    compensation = _compensation(recording, 2, np.random.default_rng(33), n_pool=60_000)
+    log_asked = 0.8 * compensation.answers.log_evidence(compensation.most)
+    n = len(log_asked)
+    assert len(compensation.pool) == n
+    assert n == 60_000 or n_effective(log_asked) >= 4000
+    assert n == 12_000 or n_effective(log_asked[:-12_000]) < 4000
+    assert len(_compensation(recording, 2, np.random.default_rng(33), n_pool=5000).pool) == 5000
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -9,6 +9,7 @@ tells which places and widths of the new Gaussian the readings ask for, before a
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,12 +18,13 @@ from scipy.special import log_ndtr, logsumexp, ndtri_exp
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
 from probewise.inference import SensorProblem, sd_floor
-from probewise.nested.weights import resampled
+from probewise.nested.weights import n_effective, resampled
 
 __all__ = ["Answer", "Compensation"]
 
-# All particles take their shapes from one pool: with 6,000 its scatter was the greatest part of the error of ln Z.
-_N_POOL = 24_000
+# All particles take their shapes from one pool, whose scatter no cloud tells: with 6,000 it was the greatest part of
+# the error of ln Z of two Gaussians. So many are drawn at a time, until enough are effective or there are many.
+_N_DRAWN, _EFFECTIVE, _MOST_DRAWN = 12_000, 4_000, 60_000
 _AT_ONCE = 500
 # First-order evidences are tempered, and a share of the shapes does without: far from the mean they mislead.
 _TEMPERED, _PLAIN = 0.8, 0.1
@@ -40,6 +42,11 @@ class Answer:
     shift: FloatArray
     mean: FloatArray
     sd: FloatArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[Answer]) -> Answer:
+        """Join answers, one after the other."""
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
 
     def take(self, rows: IntArray) -> Answer:
         """Select rows."""
@@ -143,7 +150,7 @@ class _Linear:
         """Tell the answer to Gaussians, (n, 6), of any amplitude."""
         blocks = np.array_split(gaussian, max(1, -(-len(gaussian) // _AT_ONCE)))
         parts = [self._answer(block) for block in blocks]
-        return Answer(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
+        return Answer.joined(parts)
 
     def _answer(self, gaussian: FloatArray) -> Answer:
         if not len(gaussian):
@@ -201,18 +208,24 @@ class Compensation:
         theta: FloatArray,
         *,
         rng: np.random.Generator,
-        n_pool: int = _N_POOL,
+        n_pool: int = _MOST_DRAWN,
     ) -> Compensation:
-        """Learn from the problem of N - 1 Gaussians and samples of its posterior, (n, 6 N - 4)."""
+        """Learn from the problem of N - 1 Gaussians and its samples, (n, 6 N - 4); from `n_pool` shapes at most."""
         linear = _Linear.of(below, coordinates, alone, theta)
         prior = coordinates.prior
-        pool = prior.from_unit_cube(rng.random((n_pool, len(prior.names))))[:, :6]
-        answers = linear.answer(pool)
         mass = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
         mass = mass[..., 0] / np.sqrt(mass[..., 3] * mass[..., 4] - mass[..., 5] ** 2)
         most = float(np.mean(mass.min(axis=1) / (mass.sum(axis=1) + mass.min(axis=1))))
-        log_norm = float(logsumexp(_TEMPERED * answers.log_evidence(most))) - math.log(n_pool)
-        return cls(coordinates, linear, pool, answers, most, log_norm)
+        pools: list[FloatArray] = []
+        answers: list[Answer] = []
+        log_asked = np.empty(0)
+        while log_asked.size < n_pool and (not pools or n_effective(log_asked) < _EFFECTIVE):
+            n_more = min(_N_DRAWN, n_pool - log_asked.size)
+            pools.append(prior.from_unit_cube(rng.random((n_more, len(prior.names))))[:, :6])
+            answers.append(linear.answer(pools[-1]))
+            log_asked = np.concatenate([log_asked, _TEMPERED * answers[-1].log_evidence(most)])
+        log_norm = float(logsumexp(log_asked)) - math.log(log_asked.size)
+        return cls(coordinates, linear, np.concatenate(pools), Answer.joined(answers), most, log_norm)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, Answer]:
         """Draw shapes, (n, 6) with amplitudes to be replaced, and the answers to them."""

@@ -31,7 +31,7 @@ from probewise.scene.regions import (
     StripesRegion,
     UniformRegion,
 )
-from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_in_place
+from probewise.sensor._normal import normal_cdf
 
 __all__ = [
     "ACCURATE_NODES",
@@ -390,102 +390,8 @@ def _seen_of_unit_disc(
 ) -> FloatArray:
     """Mass of Gaussians, arrays broadcasting to (n_samples, n_points), inside the unit circle.
 
-    Readings of a scan along a line share the chords along it, where these are smooth.
+    Only the (sample, reading) pairs whose edge is within reach are integrated.
     """
-    line = None if max(var_p.shape[1], var_q.shape[1], cov_pq.shape[1]) > 1 else _line(p, q)
-    if line is None:
-        return _seen_of_each(p, q, var_p, var_q, cov_pq, n_nodes)
-    along, across, c, s = line
-    cross = 2 * c * s * cov_pq
-    var_y = s * s * var_p + c * c * var_q - cross
-    cov = c * s * (var_q - var_p) + (c * c - s * s) * cov_pq
-    sd_y = np.sqrt(var_y)
-    per_sd = sd_y / np.sqrt(var_p * var_q - cov_pq**2)
-    y, sd_y, slope, per_sd = np.broadcast_arrays(across, sd_y, cov / var_y, per_sd)
-    half = np.sqrt(np.maximum(1 - y * y, 1e-12))
-    tilt = (np.abs(slope) + np.abs(y) / half) * sd_y * per_sd
-    tilt += _BEND * sd_y * sd_y * per_sd / half**3
-    out, left = np.empty((len(y), along.shape[1])), np.ones(len(y), dtype=np.bool_)
-    along, reach = np.broadcast_to(along, out.shape), _reach_of(n_nodes)
-    for n, most in ((n_nodes // 3, 0.8), (2 * n_nodes // 5, 1.0), (3 * n_nodes // 5, 1.35)):
-        smooth = (np.abs(y) + _hermite(n)[0][-1] * sd_y < 1) & (tilt < most)
-        rows = np.flatnonzero(left & smooth[:, 0])
-        left[rows] = False
-        node, weight = _hermite(n)
-        for r in _blocks(rows, out.shape[1]):
-            ends = np.sqrt(1 - (y[r] + sd_y[r] * node) ** 2) * per_sd[r]
-            turns = slope[r] * sd_y[r] * node * per_sd[r]
-            out[r] = _shared_chords(along[r] * per_sd[r], ends, turns, np.broadcast_to(weight, ends.shape), reach)
-    rows = np.flatnonzero(left)
-    if rows.size:
-        found = _across_disc(y[rows, 0], sd_y[rows, 0], reach, _legendre(n_nodes))
-        node, x, weight = (part.T for part in found)
-        ends, turns = x * per_sd[rows], slope[rows] * (node - y[rows]) * per_sd[rows]
-        smooth = np.ptp(ends, axis=1) + np.ptp(turns, axis=1) < _MOST_SDS
-        left[rows[smooth]] = False
-        for r in _blocks(np.flatnonzero(smooth), out.shape[1]):
-            own = rows[r]
-            out[own] = _shared_chords(along[own] * per_sd[own], ends[r], turns[r], weight[r], reach)
-    if left.any():
-        p, q = (np.broadcast_to(a, out.shape)[left] for a in (p, q))
-        var_p, var_q, cov_pq = (np.broadcast_to(a, y.shape)[left] for a in (var_p, var_q, cov_pq))
-        out[left] = _seen_of_each(p, q, var_p, var_q, cov_pq, n_nodes)
-    return np.clip(out, 0.0, 1.0)
-
-
-def _line(p: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray, float, float] | None:
-    """Coordinates along the line on which all readings lie, (n, n_points), and across, (n, 1); cosine and sine."""
-    p, q = np.broadcast_arrays(p, q)
-    if p.shape[1] < _FEW_READINGS:
-        return None
-    dp, dq = float(p[0, -1] - p[0, 0]), float(q[0, -1] - q[0, 0])
-    length = float(np.hypot(dp, dq))
-    if length == 0.0:
-        return None
-    c, s = dp / length, dq / length
-    across = c * q - s * p
-    if np.abs(across - across[:, :1]).max() > _SAME:
-        return None
-    return c * p + s * q, across[:, :1], c, s
-
-
-def _shared_chords(
-    along: FloatArray, ends: FloatArray, turns: FloatArray, weight: FloatArray, reach: float
-) -> FloatArray:
-    """Integrate over chords that all readings share; lengths are in sds along them.
-
-    Readings at `along`, (n, n_points); half the chords' lengths, how far the mean moves from one to the next, and their
-    weights, (n, n_nodes).
-    """
-    distance, side = np.abs(along) * PER_SD, np.copysign(PER_SD, along)
-    found = _mass_before(ends, distance, side, turns, weight)
-    # Of most footprints the other end of the chord is out of reach.
-    both = np.flatnonzero(ends.min(axis=1) - np.abs(turns).max(axis=1) < reach)
-    if both.size:
-        found[both] -= _mass_before(-ends[both], distance[both], side[both], turns[both], weight[both])
-    return found
-
-
-def _mass_before(
-    ends: FloatArray, distance: FloatArray, side: FloatArray, turns: FloatArray, weight: FloatArray
-) -> FloatArray:
-    """Sum over chords the mass before one end of them; the arrays of `_shared_chords`."""
-    found = np.zeros(distance.shape)
-    start, cells = CENTRE + ends * PER_SD, np.empty(distance.shape)
-    for k in range(ends.shape[1]):
-        np.multiply(side, -turns[:, k : k + 1], out=cells)
-        cells -= distance
-        cells += start[:, k : k + 1]
-        normal_cdf_in_place(cells)
-        cells *= weight[:, k : k + 1]
-        found += cells
-    return found
-
-
-def _seen_of_each(
-    p: FloatArray, q: FloatArray, var_p: FloatArray, var_q: FloatArray, cov_pq: FloatArray, n_nodes: int
-) -> FloatArray:
-    """Integrate each (sample, reading) pair whose edge is within reach by itself; arrays as above."""
     reach = _reach_of(n_nodes)
     largest = np.sqrt(0.5 * (var_p + var_q) + np.hypot(0.5 * (var_p - var_q), cov_pq))
     distance = np.sqrt(p * p + q * q)
@@ -509,9 +415,6 @@ def _seen_of_each(
 
 
 _BLOCK = 2**13  # nodes at a time: they fit the cache
-_FEW_READINGS, _SAME = 8, 1e-9  # a scan along a line: so many readings, so straight
-_MOST_SDS = 10.0  # that the ends of chords may move, for as many nodes as there are
-_BEND = 2.5  # curvature of an edge asks for nodes as so much slope does
 _FLAT, _BENT = 0.01, 0.4  # curvature of an edge, in footprints of sd 1, up to which few and some nodes suffice
 
 
@@ -589,52 +492,29 @@ def _long_chords(
     reach: float,
     rule: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Integrate along the long axis, then across it."""
+    """Integrate along the long axis; the short one, y = sin(4 arctan u), removes the root at the end of the chords."""
     half, spread = 0.5 * (var_r + var_t), 0.5 * (var_r - var_t)
     twist = np.hypot(spread, cov)
     long = np.sqrt(half + twist)
     short = np.sqrt(var_r * var_t - cov * cov) / long
     cosine = np.sqrt(0.5 + 0.5 * spread / np.where(twist > 0, twist, 1.0))
     mean_x, mean_y = d * cosine, d * np.sqrt(1 - cosine * cosine)
-    _, x, weight = _across_disc(mean_y, short, reach, rule)
+    low, high = (_quarter_tangent((mean_y + side * reach * short).clip(-1.0, 1.0)) for side in (-1, 1))
+    node, weight = rule
+    u = np.concatenate([-node[::-1], node])[:, None] * (0.5 * (high - low)) + 0.5 * (high + low)
+    widen = 1 / (1 + u * u)
+    sine = 2 * u * widen
+    x = 1 - 2 * sine * sine
+    y = 2 * sine * (1 - u * u) * widen
     per_long = 1 / long
     inner = normal_cdf((x - mean_x) * per_long)
-    back = np.flatnonzero(mean_x * per_long < reach)
-    if back.size:
-        inner[:, back] -= normal_cdf((-x[:, back] - mean_x[back]) * per_long[back])
-    inner *= weight
-    return np.asarray(inner.sum(axis=0))
-
-
-def _across_disc(
-    mean: FloatArray, sd: FloatArray, reach: float, rule: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Chords of the unit disc within reach of a normal density, (n,): places y, half lengths, weights, (n_nodes, n).
-
-    In y = sin(4 arctan u) half the length, cos(4 arctan u), has no root at the ends.
-    """
-    low, high = (_quarter_tangent((mean + side * reach * sd).clip(-1.0, 1.0)) for side in (-1, 1))
-    node, weight = (np.concatenate([sign * a[::-1], a])[:, None] for sign, a in zip((-1, 1), rule, strict=True))
-    u = node * (0.5 * (high - low))
-    u += 0.5 * (high + low)
-    square = u * u
-    widen = 1 / (1 + square)
-    sine = 2 * u * widen
-    y = sine * (1 - square) * widen
-    y *= 2
-    x = sine * sine
-    x *= -2
-    x += 1
-    density = y - mean
-    density *= 1 / sd
-    density *= density
-    density *= -0.5
-    np.exp(density, out=density)
-    density *= x
-    density *= widen
-    density *= weight
-    density *= (high - low) * 2 / (np.sqrt(2 * np.pi) * sd)
-    return y, x, density
+    inner -= normal_cdf((-x - mean_x) * per_long)
+    y -= mean_y
+    y /= short
+    inner *= np.exp(-0.5 * y * y) * x * widen
+    return np.asarray(
+        np.concatenate([weight[::-1], weight]) @ inner * ((high - low) * 2 / (np.sqrt(2 * np.pi) * short))
+    )
 
 
 def _quarter_tangent(y: FloatArray) -> FloatArray:

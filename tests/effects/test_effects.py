@@ -295,8 +295,7 @@ def test_gates_open_what_each_variant_acts_on(kind):
     for k in (0, 7, len(gates.opened) - 1):
         variant = effect.variants()[k]
         own = base().with_effects(variant).predict(variant.bank()[0], PLAN) - plain
-        # Of a round footprint rounding decides which chords cross a disc; their errors differ by less than this.
-        np.testing.assert_allclose(everywhere * gates.opened[k], own, atol=1e-8)
+        np.testing.assert_allclose(everywhere * gates.opened[k], own, atol=1e-12)
 
 
 def test_a_reflection_is_the_same_scene_seen_from_beside():

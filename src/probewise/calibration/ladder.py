@@ -207,16 +207,20 @@ def _from_below(
 
 def _bridged(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> Climb:
     """Take the evidence from a bridge, where enough samples lie on it; doubt where it disagrees with the climb's."""
-    if bridged(added, taken)[1] < _LEAST_SHARE:
+    ratio, share = bridged(added, taken)
+    if share < _LEAST_SHARE:
         return made
-    each = zip(np.split(added, _N_CLOUDS), np.split(taken, _N_CLOUDS), strict=True)
+    # What each cloud adds to the bridge of all (jackknife): by itself a cloud that is stuck would outweigh the others.
+    own = np.repeat(np.arange(_N_CLOUDS), len(taken) // _N_CLOUDS)
+    of_added = np.repeat(np.arange(_N_CLOUDS), len(added) // _N_CLOUDS)
+    without = np.array([bridged(added[of_added != k], taken[own != k])[0] for k in range(_N_CLOUDS)])
     # Samples of the posterior that still drift tell another evidence late than early.
     by_time = taken.reshape(_N_CLOUDS, N_SNAPSHOTS, -1, taken.shape[1])
     early, late = (half.reshape(-1, taken.shape[1]) for half in np.split(by_time, 2, axis=1))
     drift = bridged(added, late)[0] - bridged(added, early)[0]
     found = replace(
         made,
-        log_z_of_clouds=log_z + np.array([bridged(*both)[0] for both in each]),
+        log_z_of_clouds=log_z + _N_CLOUDS * ratio - (_N_CLOUDS - 1) * without,
         start_error=math.hypot(made.start_error, drift),
     )
     apart = abs(found.log_z - made.log_z)

@@ -31,7 +31,7 @@ from probewise.scene.regions import (
     StripesRegion,
     UniformRegion,
 )
-from probewise.sensor._normal import normal_cdf
+from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_in_place
 
 __all__ = [
     "ACCURATE_NODES",
@@ -466,6 +466,14 @@ def _blocks(rows: IntArray, n_nodes: int) -> Iterator[IntArray]:
     return (rows[start : start + step] for start in range(0, len(rows), step))
 
 
+def _cumulative(z: FloatArray) -> FloatArray:
+    """Look up the normal cumulative, in place; by the table however few there are: no pair depends on others."""
+    z *= PER_SD
+    z += CENTRE
+    normal_cdf_in_place(z)
+    return z
+
+
 def _skewed_chords(
     mean_x: FloatArray, mean_y: FloatArray, sd_y: FloatArray, per_sd: FloatArray, tilt: FloatArray, n_nodes: int
 ) -> FloatArray:
@@ -477,10 +485,10 @@ def _skewed_chords(
     np.subtract(1.0, along, out=along)
     np.sqrt(along, out=along)
     across = node[:, None] * tilt
-    found = weight @ normal_cdf((along - mean_x) * per_sd - across)
+    found = weight @ _cumulative((along - mean_x) * per_sd - across)
     back = np.flatnonzero(node[-1] * np.abs(tilt) - mean_x * per_sd > -_REACH)
     if back.size:
-        found[back] -= weight @ normal_cdf((-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back])
+        found[back] -= weight @ _cumulative((-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back])
     return np.asarray(found)
 
 
@@ -507,8 +515,8 @@ def _long_chords(
     x = 1 - 2 * sine * sine
     y = 2 * sine * (1 - u * u) * widen
     per_long = 1 / long
-    inner = normal_cdf((x - mean_x) * per_long)
-    inner -= normal_cdf((-x - mean_x) * per_long)
+    inner = _cumulative((x - mean_x) * per_long)
+    inner -= _cumulative((-x - mean_x) * per_long)
     y -= mean_y
     y /= short
     inner *= np.exp(-0.5 * y * y) * x * widen

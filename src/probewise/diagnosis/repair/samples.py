@@ -20,6 +20,7 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
 from probewise.diagnosis.repair.annealing import Density, anneal, by_weight
+from probewise.diagnosis.repair.profiled import Profiled
 from probewise.diagnosis.repair.quadratic import Quadratic
 from probewise.diagnosis.repair.surrogate import Surrogate
 from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
@@ -34,6 +35,7 @@ __all__ = ["ModelSamples", "sample_model"]
 N_SAMPLES = 500
 N_WALKERS = 250
 _MOVES = 6  # moves of posterior samples after a step
+_N_PROFILED = 1000  # draws of which posterior samples are chosen by weight
 # The surrogate costs next to nothing.
 _N_NEAR = 2000
 _MOVES_NEAR = 20
@@ -112,7 +114,9 @@ def sample_model(
     """Draw from the posterior about a fit, under its noise model.
 
     Samples of the Laplace approximation are annealed through a second-order surrogate: with several Gaussians the
-    posterior is curved, and samples of the Laplace approximation predict new angles worse by tens of nats.
+    posterior is curved, and samples of the Laplace approximation predict new angles worse by tens of nats. Where many
+    samples cost little more than one, and an effect has a nonlinear coordinate, they are drawn about slices of it
+    instead.
 
     Parameters
     ----------
@@ -193,6 +197,16 @@ def _posterior_draws(
     if not annealed:
         return np.asarray(center + draws @ steps)
     problem, usable = JointProblem(model, recording, noise.at_best), recording.usable
+
+    def posterior(z: FloatArray) -> FloatArray:
+        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
+        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
+
+    profiled = Profiled.of(found, law, recording) if model.sensor.in_bulk else None
+    if profiled is not None:
+        weighed = profiled.weighed(posterior, n_first=_N_PROFILED, n_wanted=N_SAMPLES, rng=rng)
+        if weighed is not None:
+            return weighed
     quadratic = Quadratic.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
     near = Surrogate.of(quadratic, center, steps, recording.readings[usable], law)
 
@@ -200,9 +214,7 @@ def _posterior_draws(
         return np.asarray(-0.5 * np.sum(e**2, axis=1))
 
     def of_posterior(e: FloatArray) -> FloatArray:
-        z = center + e @ steps
-        height = problem.prior.log_prob(z) + problem.log_likelihood(z)
-        return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
+        return posterior(center + e @ steps)
 
     def carried(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
         weighed = by_weight(first, log_q, log_p, n_wanted=n, rng=rng)

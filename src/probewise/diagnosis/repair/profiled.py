@@ -1,0 +1,223 @@
+"""A proposal along the one coordinate in which a posterior is least like its Laplace approximation.
+
+Laplace's approximation about slices (Rue, Martino and Chopin 2009): the other coordinates are fitted anew at fixed
+values of that one, such as a time constant, and are normal about each fit. Samples drawn by weight from a normal
+approximation never reach a tail that it lacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Self
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.diagnosis.fitting.coordinates import FARTHEST
+from probewise.diagnosis.fitting.fit import Fit
+from probewise.diagnosis.noise.law import NoiseLaw
+from probewise.nested.weights import n_effective, resampled
+from probewise.recordings.plan import Recording
+
+__all__ = ["Profiled"]
+
+_NODES = np.arange(-8.0, 8.5)  # of a slice, in sds of the Laplace approximation
+_STEPS = 3  # of the fit in each slice, in each of these rounds
+_ROUNDS = 2
+_FAR = 30.0  # nats below the best slice: no further ones
+_STEP = 1e-5  # of a coordinate, for differences
+_FREEDOM = 6  # of a Student-t within each slice: no weight is large in its tails
+_N_CELLS = 400
+_INDEPENDENT = 0.25  # least effective sample size, as a share of the samples wanted
+
+
+@dataclass(frozen=True, eq=False)
+class Profiled:
+    """A density of coordinates: that of coordinate `at` by the evidence of its slices, the others Student-t in each.
+
+    Parameters
+    ----------
+    at
+        The coordinate.
+    nodes
+        Its values in the slices, rising, (n_nodes,).
+    modes
+        The other coordinates' best values in each slice, (n_nodes, n_params - 1).
+    roots
+        Cholesky factors of their covariances there, (n_nodes, n_params - 1, n_params - 1).
+    log_evidence
+        Log evidence of each slice, up to a constant, (n_nodes,).
+    """
+
+    at: int
+    nodes: FloatArray
+    modes: FloatArray
+    roots: FloatArray
+    log_evidence: FloatArray
+
+    @classmethod
+    def of(cls, found: Fit, law: NoiseLaw, recording: Recording) -> Self | None:
+        """Profile the least normal of the coordinates in which the effects of a fit are nonlinear.
+
+        None if there is none, or its slices cannot be fitted.
+        """
+        slopes = law(found.slopes)
+        sd = max(float(law.scale(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.information)
+        covariance = np.linalg.inv(slopes.T @ slopes / sd**2 + np.eye(len(found.z)))
+        tried = [cls._along(found, law, recording, at, covariance, float(sd)) for at in _nonlinear(found)]
+        return max((profile for profile in tried if profile is not None), key=lambda p: p._curvature, default=None)
+
+    @classmethod
+    def _along(
+        cls, found: Fit, law: NoiseLaw, recording: Recording, at: int, covariance: FloatArray, sd: float
+    ) -> Self | None:
+        nodes = found.z[at] + _NODES * np.sqrt(covariance[at, at])
+        nodes = nodes[np.abs(nodes) < FARTHEST]
+        if len(nodes) < len(_NODES) // 2:
+            return None
+        z = found.z + np.outer(nodes - found.z[at], covariance[at] / covariance[at, at])
+        z = np.clip(z, -FARTHEST, FARTHEST)
+        rest, usable = np.delete(np.arange(len(found.z)), at), recording.usable
+        readings, n, eye = recording.readings[usable], len(nodes), np.eye(len(found.z))
+
+        def sliced(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+            """Return the log posterior of each slice, (n_nodes,), and slopes, (n_nodes, n_points + 1, n_params)."""
+            near = z[:, None, :] + _STEP * np.concatenate([np.zeros((1, len(rest))) @ eye[rest], eye[rest]])
+            predicted = found.model.predict(near.reshape(-1, z.shape[1]))[:, usable]
+            whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
+            sigma = law.scale(whitened[:, 0].T)
+            height = -law.misfit(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
+            normal = law.as_normal(whitened[:, 0].T, sigma).T
+            joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
+            return np.where(np.isfinite(height), height, -np.inf), joined
+
+        state = z, *sliced(z)
+        for _ in range(_ROUNDS):
+            for _ in range(_STEPS):
+                curvature, downhill = _normal_equations(state[2], state[0][:, rest], sd)
+                tried = state[0].copy()
+                tried[:, rest] += np.clip(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0], -1.0, 1.0)
+                tried = np.clip(tried, -FARTHEST, FARTHEST)
+                state = _better(state, (tried, *sliced(tried)))
+            # A slice that went astray begins again from its neighbour's fit, towards the middle.
+            towards = np.arange(n) - np.sign(np.arange(n) - int(np.argmax(state[1])))
+            tried = state[0][towards]
+            tried[:, at] = nodes
+            state = _better(state, (tried, *sliced(tried)))
+        z, height, joined = state
+        there = _about_the_best(height)
+        if there.sum() < len(_NODES) // 2:
+            return None
+        curvature, _ = _normal_equations(joined[there], z[there][:, rest], sd)
+        roots = np.linalg.cholesky(np.linalg.inv(curvature))
+        volume = np.log(np.diagonal(roots, axis1=1, axis2=2)).sum(axis=1)
+        return cls(at, nodes[there], z[there][:, rest], roots, height[there] + volume)
+
+    @property
+    def _curvature(self) -> float:
+        """Largest difference in nats from a normal density, three sds from its middle."""
+        spacing = float(np.median(np.diff(self.nodes)))
+        best = int(np.argmax(self.log_evidence))
+        apart = (self.nodes - self.nodes[best]) / spacing
+        within = np.abs(apart) < 3.5
+        fall = self.log_evidence[best] - self.log_evidence
+        return float(np.max(np.abs(fall - 0.5 * apart**2)[within]))
+
+    @cached_property
+    def _edges(self) -> FloatArray:
+        return np.linspace(self.nodes[0], self.nodes[-1], _N_CELLS + 1)
+
+    @cached_property
+    def _shares(self) -> FloatArray:
+        """Probability of each cell of the coordinate, (n_cells,)."""
+        middle = 0.5 * (self._edges[1:] + self._edges[:-1])
+        log_density = np.interp(middle, self.nodes, self.log_evidence)
+        shares = np.exp(log_density - log_density.max())
+        return np.asarray(shares / shares.sum())
+
+    def _normal_at(self, value: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Return the others' middle (n_samples, n_params - 1), and the number of the nearest slice, (n_samples,)."""
+        middle = np.stack([np.interp(value, self.nodes, column) for column in self.modes.T], axis=1)
+        return middle, np.argmin(np.abs(value[:, None] - self.nodes), axis=1)
+
+    def draws(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw coordinates, (n_samples, n_params)."""
+        cell = rng.choice(_N_CELLS, n_samples, p=self._shares)
+        value = self._edges[cell] + np.diff(self._edges)[cell] * rng.random(n_samples)
+        middle, slice_of = self._normal_at(value)
+        eps = rng.standard_normal(middle.shape) / np.sqrt(rng.chisquare(_FREEDOM, (n_samples, 1)) / _FREEDOM)
+        rest = middle + np.einsum("nij,nj->ni", self.roots[slice_of], eps)
+        return np.insert(rest, self.at, value, axis=1)
+
+    def weighed(
+        self, log_p: Callable[[FloatArray], FloatArray], *, n_first: int, n_wanted: int, rng: np.random.Generator
+    ) -> FloatArray | None:
+        """Draw coordinates of a posterior by weight, (n_wanted, n_params); None if too few are independent.
+
+        No weight exceeds the mean by more than the root of the number of draws: one draw in a tail that is heavier
+        than this density's must not stand for many (Ionides 2008).
+        """
+        first = self.draws(n_first, rng=rng)
+        gain = log_p(first) - self.log_density(first)
+        if not np.isfinite(gain).any():
+            return None
+        gain = np.minimum(gain, logsumexp(gain) - 0.5 * np.log(n_first))
+        if n_effective(gain) < _INDEPENDENT * n_wanted:
+            return None
+        return np.asarray(first[rng.permutation(resampled(np.exp(gain - gain.max()), n_wanted, rng))])
+
+    def log_density(self, z: FloatArray) -> FloatArray:
+        """Return the log density of coordinates, up to a constant, (n_samples, n_params) -> (n_samples,)."""
+        value, rest = z[:, self.at], np.delete(z, self.at, axis=1)
+        middle, slice_of = self._normal_at(value)
+        eps = np.linalg.solve(self.roots[slice_of], (rest - middle)[:, :, None])[:, :, 0]
+        volume = np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
+        cell = np.clip(np.searchsorted(self._edges, value) - 1, 0, _N_CELLS - 1)
+        with np.errstate(divide="ignore"):
+            log_share = np.log(self._shares[cell])
+        tail = 0.5 * (_FREEDOM + rest.shape[1]) * np.log1p(np.sum(eps**2, axis=1) / _FREEDOM)
+        return np.asarray(log_share - tail - volume[slice_of])
+
+
+Slices = tuple[FloatArray, FloatArray, FloatArray]
+"""Coordinates (n_nodes, n_params), log posteriors (n_nodes,), whitened derivatives with residuals."""
+
+
+def _better(old: Slices, new: Slices) -> Slices:
+    """Take each slice from the fit that is higher."""
+    higher = new[1] > old[1]
+    return (
+        np.where(higher[:, None], new[0], old[0]),
+        np.where(higher, new[1], old[1]),
+        np.where(higher[:, None, None], new[2], old[2]),
+    )
+
+
+def _about_the_best(height: FloatArray) -> BoolArray:
+    """Return the slices about the best, as far as none is far below it, (n_nodes,)."""
+    best = int(np.argmax(height))
+    low = np.flatnonzero(~(height > height[best] - _FAR))
+    out = np.zeros(len(height), dtype=np.bool_)
+    out[max(low[low < best], default=-1) + 1 : min(low[low > best], default=len(height))] = True
+    return out
+
+
+def _nonlinear(found: Fit) -> list[int]:
+    """List the coordinates of effects that are no amplitudes."""
+    out = []
+    for effect in found.model.effects:
+        first = found.model.columns_of(effect.name).start
+        out += [first + k for k in range(len(effect.prior.names)) if k not in effect.amplitudes]
+    return out
+
+
+def _normal_equations(joined: FloatArray, rest: FloatArray, sd: float) -> tuple[FloatArray, FloatArray]:
+    """Return curvature and gradient of each slice's log posterior by its coordinates `rest` (n_nodes, n_rest).
+
+    `joined` (n_nodes, n_rest + 1, n_points): derivatives of whitened residuals, and the residuals.
+    """
+    gram = joined @ joined.transpose(0, 2, 1) / sd**2
+    return gram[:, :-1, :-1] + np.eye(rest.shape[1]), -gram[:, :-1, -1] - rest

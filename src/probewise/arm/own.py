@@ -23,15 +23,14 @@ from probewise.arm.basics import Clock
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
-from probewise.errors import FileError, LinkError, ParameterError, ShapeError, shortened
-from probewise.recordings.python_file import run_python_file
+from probewise.errors import FileError, LinkError, ParameterError, ShapeError
+from probewise.recordings.python_file import briefly, run_python_file
 
 __all__ = ["Measures", "OwnInstrument", "instrument_of", "require_measures"]
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
 _TAKEN = ("reading", "scan", "pattern", "orientation_deg")  # names of a recording's columns, not allowed for covariates
-_LONGEST = 200
 
 
 class Measures(Protocol):
@@ -116,7 +115,7 @@ class OwnInstrument:
         except Exception as failure:
             if error is None:
                 raise
-            warnings.warn(f"the instrument may not be at rest: {_briefly(failure)}", RuntimeWarning, stacklevel=2)
+            warnings.warn(f"the instrument may not be at rest: {briefly(failure)}", RuntimeWarning, stacklevel=2)
 
     @property
     def turns(self) -> bool:
@@ -215,7 +214,7 @@ class OwnInstrument:
         where = f"{self.source}, line {frames[-1]}" if frames else self.source
         if isinstance(error, ParameterError | ShapeError) and not frames:  # a wrong value was returned
             return f"{where}: {error}"
-        return f"{where}: {what} raises {type(error).__name__}: {_briefly(error)}".rstrip(": ")
+        return f"{where}: {what} raises {type(error).__name__}: {briefly(error)}".rstrip(": ")
 
 
 def instrument_of(
@@ -298,7 +297,3 @@ def _finite(name: str, found: object, n_places: int, allowed: str) -> FloatArray
     if not np.isfinite(array).all():
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
     return array
-
-
-def _briefly(error: BaseException) -> str:
-    return shortened(" ".join(str(error).split()), _LONGEST)

@@ -6,6 +6,7 @@ import os
 import sys
 import traceback
 from collections.abc import Mapping
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -13,7 +14,7 @@ from probewise._kinds import require_path
 from probewise.errors import FileError, shortened
 from probewise.recordings.text import read_text
 
-__all__ = ["run_python_file"]
+__all__ = ["briefly", "run_python_file", "run_python_text"]
 
 _LONGEST = 200
 
@@ -36,11 +37,15 @@ def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any
         If it cannot be read or run; the error names the line if there is one.
     """
     path = require_path("path", path, what)
-    text = read_text(path, what)
+    return run_python_text(read_text(path, what), path)
+
+
+def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
+    """Run the text of a user's file, as `run_python_file` does."""
     try:
         code = compile(text, str(path), "exec")
     except (SyntaxError, ValueError) as error:
-        found = f"is no Python: {_briefly(error)}"
+        found = f"is no Python: {briefly(error)}"
         raise FileError(path, found, "a file that Python can run", row=getattr(error, "lineno", None)) from error
     module = ModuleType(f"probewise_file_{path.stem}")  # a prefix, so that serial.py cannot hide the package serial
     module.__file__ = str(path)
@@ -52,10 +57,11 @@ def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any
         exec(code, module.__dict__)
     except (Exception, SystemExit) as error:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        found = f"stops with {type(error).__name__}: {_briefly(error)}"
+        found = f"stops with {type(error).__name__}: {briefly(error)}"
         raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
     return module.__dict__
 
 
-def _briefly(error: BaseException) -> str:
+def briefly(error: BaseException) -> str:
+    """Write an error on one short line."""
     return shortened(" ".join(str(error).split()), _LONGEST)

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import os
-import traceback
 from collections.abc import Mapping
 from difflib import get_close_matches
 from pathlib import Path
-from types import CodeType
 from typing import Any
 
 from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError
+from probewise.recordings.python_file import briefly, run_python_text
 from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_of
 
@@ -49,13 +48,7 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     """
     path = require_path("path", path, "the name of a Python file that describes a simulator")
     text = read_text(path, "a Python file that describes a simulator")
-    try:
-        code = compile(text, str(path), "exec")
-    except (SyntaxError, ValueError) as error:
-        raise FileError(
-            path, f"is no Python: {_briefly(error)}", "a file that Python can run", row=getattr(error, "lineno", None)
-        ) from error
-    said = _run(code, path)
+    said = run_python_text(text, path)
     try:
         return _simulator(said, path, text)
     except ParameterError as error:
@@ -65,21 +58,8 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
         raise FileError(path, found, error.allowed + hint) from error
     except (TypeError, ValueError, AttributeError, LookupError) as error:
         raise FileError(
-            path, f"what it says does not fit together ({_briefly(error)})", f"these names: {', '.join(_NAMES)}"
+            path, f"what it says does not fit together ({briefly(error)})", f"these names: {', '.join(_NAMES)}"
         ) from error
-
-
-def _run(code: CodeType, path: Path) -> dict[str, Any]:
-    names: dict[str, Any] = {"__name__": path.stem, "__file__": str(path)}
-    try:
-        exec(code, names)
-    except (KeyboardInterrupt, GeneratorExit):
-        raise
-    except BaseException as error:
-        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        found = f"stops with {type(error).__name__}: {_briefly(error)}"
-        raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
-    return names
 
 
 def _simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
@@ -149,8 +129,3 @@ def _extra(name: str, given: object) -> Extra:
     if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
         raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
     return Extra(marginal_of(name, given["prior"]), float(given["null"]), str(given["says"]))
-
-
-def _briefly(error: BaseException) -> str:
-    text = " ".join(str(error).split())
-    return text if len(text) <= 200 else f"{text[:197]}..."

@@ -10,10 +10,24 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from probewise import scene
-from probewise.arm import Pose, Reading
+from probewise.arm import Pose, Reading, read_geometry, shipped_geometry
+from probewise.arm.geometry import Accuracy
+from probewise.arm.uncertainty import FITTED
 from probewise.calibration import FittedSensor, mean_field
 from probewise.errors import ParameterError
-from probewise.experiment import CLEAN, Exploration, begin, experiment_for, left_out_of, repaired, result_json, step
+from probewise.experiment import (
+    CLEAN,
+    Exploration,
+    FittedArm,
+    begin,
+    experiment_for,
+    left_out_of,
+    repaired,
+    result_json,
+    step,
+    with_arm_error,
+)
+from probewise.experiment.arm_error import arm_error
 from probewise.experiment.asking import Field, inquire
 from probewise.experiment.checking import ENOUGH_BITS, NAMES, bits_of_names, far_side
 from probewise.experiment.method import from_scratch
@@ -208,6 +222,33 @@ def test_a_reading_tells_names_by_what_they_predict():
     assert bits[0] == pytest.approx(0.0, abs=1e-9)
     assert bits[1] == pytest.approx(1.0, abs=1e-6)
     assert bits[2] == pytest.approx(exact, abs=0.01)
+
+
+def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting):
+    """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
+    rng = np.random.default_rng(3)
+    with arm_of(Trial(REFERENCE, 0)) as simulated:
+        field = Field.under(simulated, doubting.grid)
+    state, found = begin(doubting, field, rng=rng), []
+    for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
+        reading = Reading(value, Pose(x, y), 8.0 * k)
+        state, last = step(state, reading, doubting, field, prior_bits=20.0, rng=rng, max_readings=3)
+        found.append(last)
+    covariance = np.diag([0.2**2 if name == "base x" else 0.0 for name in FITTED])
+    accuracy = Accuracy(8, 1.0, 1.0, 0.001, tuple(map(tuple, covariance.tolist())))
+    geometry = replace(
+        read_geometry(shipped_geometry()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0), accuracy=accuracy
+    )
+
+    def slopes(kinds):
+        of = (doubting, FittedArm(geometry, (10.0, 60.0)), state.readings, last.posterior, kinds)
+        named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
+        return arm_error(*of, **named, rng=np.random.default_rng(1)).slopes
+
+    run = Exploration(doubting, tuple(found))
+    claimed = with_arm_error(run, geometry, levels=(10.0, 60.0), rng=np.random.default_rng(1)).arm.slopes
+    np.testing.assert_allclose(claimed, slopes(last.kinds.wary))
+    assert not np.allclose(claimed, slopes(last.kinds))
 
 
 @pytest.mark.parametrize(("angles_deg", "asked_deg"), [((0, 20, 40), 200), ((0, 120, 240), None), ((0, 180), None)])

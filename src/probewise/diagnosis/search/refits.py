@@ -45,6 +45,8 @@ class Refits:
     """Refits with one more effect, by the candidate, the effect, and the nats against it."""
     twins: dict[WeighedFit, tuple[WeighedFit, Swap]] = field(default_factory=dict, repr=False)
     """Refits taken from those of twins, with the refit and the exchange of effects."""
+    plain: dict[WeighedFit, WeighedFit | None] = field(default_factory=dict, repr=False)
+    """Nulls as fitted under the plainest noise, where they predict otherwise."""
     scored: dict[tuple[Fit, NoiseLaw, Bank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
     """Log Bayes factors of the templates of a bank, by label."""
 
@@ -98,11 +100,13 @@ class Refits:
         """Fit a given null under the plainest noise too; None if it predicts the same, or its noise has no memory."""
         if self.sensor is None or not self.law_of(null).remembers:
             return None
-        law = null.evidence[self.noises.certain].law
-        found = self._fit(null.found.model, np.stack([null.found.z, *self.sensor.starts]), law, 30)
-        if np.sum(law(found.residuals - null.found.residuals) ** 2) < 2 * ALIASED_NATS * found.sd**2:
-            return None
-        return WeighedFit.of(found, law, self.noises.weigh(found), 0.0)
+        if null not in self.plain:
+            law = null.evidence[self.noises.certain].law
+            found = self._fit(null.found.model, np.stack([null.found.z, *self.sensor.starts]), law, 30)
+            apart = float(np.sum(law(found.residuals - null.found.residuals) ** 2))
+            alike = apart < 2 * ALIASED_NATS * found.sd**2
+            self.plain[null] = None if alike else WeighedFit.of(found, law, self.noises.weigh(found), 0.0)
+        return self.plain[null]
 
     def extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
         """Refit with one more effect, for its likely variants, unless that was done before.

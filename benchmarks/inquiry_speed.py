@@ -29,8 +29,8 @@ from pathlib import Path
 import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
-from probewise.experiment import Experiment, Field, Step, explore
-from probewise.experiment.asking import inquire
+from probewise.experiment import ArmOverGrid, Experiment, Step, explore
+from probewise.experiment.acquisition import inquire
 from probewise.experiment.loop import from_scratch
 from probewise.experiment.particles import Particles, update
 from probewise.inquiry import Grid
@@ -62,7 +62,7 @@ def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str
     """Run once, and time every step again by itself."""
     rows = []
     with arm:
-        field = Field.under(arm, experiment.grid)
+        field = ArmOverGrid.under(arm, experiment.grid)
         steps = list(explore(arm, experiment, rng=np.random.default_rng(run)))
     for number, (before, after) in enumerate(pairwise(steps)):
         problem = experiment.problem([step.reading for step in steps[: number + 2]])

@@ -47,13 +47,13 @@ hidden = {"distance_mm": 1300.0, "normal_rad": 2.1}
 views, took_s = [], 0.0
 while not inquiry.settled:
     if len(inquiry.readings) in (2, 4):
-        views.append((inquiry.readings, inquiry.posterior, inquiry.worth, inquiry.next()))
+        views.append((inquiry.readings, inquiry.posterior, inquiry.utility, inquiry.next()))
     bearing_rad = inquiry.next()
     last_rad = inquiry.readings[-1][0] if inquiry.readings else None
     took_s += seconds(last_rad)[np.argmin(np.abs(bearings_rad - bearing_rad))]
     reading_mm = noise.draw(np.array([[echo(hidden, bearing_rad)]]), np.array([[30.0]]), rng=rng).item()
     inquiry.tell(reading_mm)
-views.append((inquiry.readings, inquiry.posterior, inquiry.worth, None))
+views.append((inquiry.readings, inquiry.posterior, inquiry.utility, None))
 print(inquiry.summary())
 print(f"{took_s:.0f} s of turning and reading")
 

@@ -40,9 +40,9 @@ hidden = {"centre_ghz": 3.37, "width_ghz": 0.06, "height": 1.2, "background": 0.
 views = []
 while not inquiry.settled:
     if len(inquiry.readings) in (4, 9):
-        views.append((inquiry.readings, inquiry.posterior, inquiry.worth, inquiry.worth_label, inquiry.next()))
+        views.append((inquiry.readings, inquiry.posterior, inquiry.utility, inquiry.utility_label, inquiry.next()))
     inquiry.tell(peak(hidden, inquiry.next()) + 0.1 * rng.standard_normal())
-views.append((inquiry.readings, inquiry.posterior, inquiry.worth, inquiry.worth_label, None))
+views.append((inquiry.readings, inquiry.posterior, inquiry.utility, inquiry.utility_label, None))
 print(inquiry.summary())
 
 # %%

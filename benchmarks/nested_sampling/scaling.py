@@ -31,7 +31,7 @@ from nested_sampling.one import cpu_seconds, peak_megabytes
 from nested_sampling.ours import ours_result
 from nested_sampling.problems import Known, box, gaussian
 from nested_sampling.sampler import Counted
-from probewise.nested import NestedResult, State, run
+from probewise.nested import NestedResult, RoundSummary, run
 
 _FOLDER = Path(__file__).resolve().parent.parent
 
@@ -90,7 +90,7 @@ def measure(study: str, size: int, n_live: int) -> dict[str, Any]:
 def _memory(problem: Counted, n_dead: int, n_live: int) -> dict[str, Any]:
     """Trace the peak of memory up to `n_dead` iterations, beside what the result itself holds."""
 
-    def stop(state: State) -> str | None:
+    def stop(state: RoundSummary) -> str | None:
         return f"{n_dead} iterations" if state.n_dead >= n_dead else None
 
     tracemalloc.start()

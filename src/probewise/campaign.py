@@ -84,7 +84,7 @@ def run_campaign(
             raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
         done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
         left = {key: task for key, task in tasks.items() if key not in done}
-        with _ResultLog(path, wanted, fresh=before is None) as lines, _ended(work, left, executor) as ended:
+        with _ResultLog(path, wanted, fresh=before is None) as lines, _as_completed(work, left, executor) as ended:
             progress(noun, len(done), len(tasks))
             for key, result in ended:
                 line = json.loads(lines.add(key, result))  # as a later reader will see it
@@ -103,7 +103,7 @@ def read_campaign(path: str | os.PathLike[str]) -> Finished:
     """
     # After the last line end there is nothing, or an incomplete line.
     *lines, _ = read_bytes(Path(path), "a campaign's file").split(b"\n")
-    rows = [_parsed(path, number, line) for number, line in enumerate(lines, start=1)]
+    rows = [_parsed_line(path, number, line) for number, line in enumerate(lines, start=1)]
     if not rows or rows[0].get("format") != FORMAT or not isinstance(rows[0].get("settings"), dict):
         raise FileError(path, "this is not a campaign file", f'a first line with "format": "{FORMAT}" and its settings')
     results: dict[str, Result] = {}
@@ -117,7 +117,7 @@ def read_campaign(path: str | os.PathLike[str]) -> Finished:
     return Finished(rows[0]["settings"], results)
 
 
-def _parsed(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str, Any]:
+def _parsed_line(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str, Any]:
     row = json_of(path, line, "one JSON object per line", row=number)
     if not isinstance(row, dict):
         raise FileError(path, "not an object", "one JSON object per line", row=number)
@@ -164,7 +164,7 @@ class _ResultLog:
 
 
 @contextlib.contextmanager
-def _ended(
+def _as_completed(
     work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
 ) -> Iterator[Iterator[tuple[str, Result]]]:
     """Yield (key, result) as tasks end; on leaving, cancel the tasks that have not begun."""

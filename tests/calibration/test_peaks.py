@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.calibration import calibrate, default_prior
-from probewise.calibration.peaks import _split, find_peaks
+from probewise.calibration.peaks import _split_gaussian, find_peaks
 from probewise.calibration.posing import Posing
 from probewise.recordings import Recording, paper_plan
 from probewise.world import Blob, World, gaussian_spot
@@ -35,7 +35,7 @@ def test_a_split_keeps_light_centre_and_covariance(recording: Recording) -> None
     rng = np.random.default_rng(10)
     prior = default_prior(recording, 1)
     theta = prior.from_unit_cube(rng.uniform(0.05, 0.95, (30, 8)))
-    apart = _split(theta, rng)
+    apart = _split_gaussian(theta, rng)
 
     def moments(rows: np.ndarray) -> np.ndarray:
         g = rows[:, :-2].reshape(len(rows), -1, 6)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.challenge.covering import parameters_within, place_overlap, sensor_within
+from probewise.challenge.covering import place_overlap, sensor_truths_and_intervals, truths_and_intervals
 from probewise.diagnosis import EffectFound, ModelSamples, ParameterFound, Place
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
@@ -50,14 +50,14 @@ def found(*parameters):
 
 def test_an_angle_counts_by_its_nearest_turn():
     stated = found(("phase", "rad", -0.1, 0.1), ("amp", "LEGO", 1.0, 2.0))
-    within = parameters_within(Hidden(Flicker(1.5, 0.02, 2 * math.pi - 0.05), 8.0).parameters, stated)
+    within = truths_and_intervals(Hidden(Flicker(1.5, 0.02, 2 * math.pi - 0.05), 8.0).parameters, stated)
     assert within["amp"] == [1.5, 1.0, 2.0]
     assert within["phase"] == pytest.approx([-0.05, -0.1, 0.1])
 
 
 def test_what_the_vocabulary_leaves_open_is_not_asked():
     stated = found(("level", "LEGO", 50.0, 52.0), ("softness", "LEGO", 0.0, 1.0), ("scans", "scan", 0.0, 1.0))
-    assert list(parameters_within(Hidden(Saturation(51.0, 0.0), 8.0).parameters, stated)) == ["level"]
+    assert list(truths_and_intervals(Hidden(Saturation(51.0, 0.0), 8.0).parameters, stated)) == ["level"]
 
 
 def test_samples_at_the_truth_have_its_moments():
@@ -67,6 +67,6 @@ def test_samples_at_the_truth_have_its_moments():
     (a, c), (_, b) = np.linalg.inv(covariance) / 2
     theta = np.tile([1.0, 0.5, 1.5, a, b, c, 10.0, 60.0], (5, 1))
     chain = Chain(FreeMixture(1), FreeLevels(), KnownScene({}), ())
-    within = sensor_within(World(gaussian_spot([blob])), ModelSamples(chain, theta, np.ones(5), (), 1))
+    within = sensor_truths_and_intervals(World(gaussian_spot([blob])), ModelSamples(chain, theta, np.ones(5), (), 1))
     for truth, low, high in within.values():
         assert (low, high) == pytest.approx((truth, truth), rel=1e-3)

@@ -1,4 +1,4 @@
-"""How well names can be told by likeness, by a second route: readings drawn with noise, and the nearer of two fits."""
+"""The oracle baseline by a second route: readings drawn with noise, and the nearer of two fits."""
 
 import math
 

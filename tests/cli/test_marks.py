@@ -13,7 +13,7 @@ from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._arm import warn_of_goal
 from probewise.cli._hands import Hands
-from probewise.cli._marks import _moved, bring
+from probewise.cli._marks import _place_after, bring
 from probewise.cli._sheet_watch import SheetWatch, shades
 from probewise.emulator import parse_scene
 from probewise.emulator.scenes import scene_text
@@ -122,7 +122,7 @@ def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     ],
 )
 def test_an_answer_is_a_move_or_nothing(answer, moved):
-    assert _moved((1, 2, 60), answer) == moved
+    assert _place_after((1, 2, 60), answer) == moved
 
 
 def test_shades_are_those_that_fill_the_sensors_view():

@@ -23,7 +23,7 @@ from probewise.diagnosis.evidence.laplace import (
 from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.fitting.coordinates import (
     default_sensor,
-    effect_scores,
+    effect_coordinates,
     effect_values,
     theta_to_natural,
 )
@@ -184,7 +184,7 @@ def test_templates_of_a_variant_are_what_its_scans_change():
 def test_effect_scores_invert_effect_values(name):
     effect = VOCABULARY[name].for_extent(EXTENT)
     z = np.random.default_rng(2).uniform(-4, 4, size=(20, len(effect.prior.names)))
-    np.testing.assert_allclose(effect_scores(effect, effect_values(effect, z)), z, atol=1e-6)
+    np.testing.assert_allclose(effect_coordinates(effect, effect_values(effect, z)), z, atol=1e-6)
 
 
 def test_whitening_is_the_inverse_root_of_the_covariance():

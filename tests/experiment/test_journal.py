@@ -10,9 +10,9 @@ import pytest
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, ParameterError
 from probewise.experiment import (
-    Belief,
     Hidden,
     JournalWriter,
+    PosteriorSummary,
     read_journal,
     recording_of,
     require_same_settings,
@@ -30,15 +30,15 @@ def reading(k):
     return Reading(10.0 + k, Pose(1.5 * k, 2.0 * k, 0.25), 3.0 * k, {"battery_mv": 7900.0 + k})
 
 
-def belief(k):
-    return Belief({"x_mm": 1.0 / 3.0 + k}, {"x_mm": 2.0 / k}, 1.25 * k, Pose(0.1 * k, 7.0))
+def summary(k):
+    return PosteriorSummary({"x_mm": 1.0 / 3.0 + k}, {"x_mm": 2.0 / k}, 1.25 * k, Pose(0.1 * k, 7.0))
 
 
 def write(path, n):
     with JournalWriter.begin(path, SETTINGS) as writer:
         for k in range(1, n + 1):
             writer.reading(k, reading(k))
-            writer.belief(belief(k))
+            writer.summary(summary(k))
 
 
 def test_a_journal_reads_back_every_bit_of_what_was_written(tmp_path):
@@ -47,7 +47,7 @@ def test_a_journal_reads_back_every_bit_of_what_was_written(tmp_path):
     journal = read_journal(path)
     assert journal.settings["format"] == "journal/1"
     assert journal.readings == (reading(1), reading(2), reading(3))
-    assert [entry.belief for entry in journal.entries] == [belief(1), belief(2), belief(3)]
+    assert [entry.summary for entry in journal.entries] == [summary(1), summary(2), summary(3)]
     assert journal.notes == ()
 
 
@@ -72,7 +72,7 @@ def test_whatever_byte_the_writer_is_killed_at_no_whole_reading_is_lost(tmp_path
         kept = 3 if n_bytes >= reading_done else 2
         assert journal.readings == tuple(reading(k) for k in range(1, kept + 1)), n_bytes
         assert len(journal.notes) == (n_bytes > last)
-        assert kept == 2 or journal.entries[2].belief is None
+        assert kept == 2 or journal.entries[2].summary is None
 
 
 def test_resuming_goes_on_behind_the_last_reading_which_stays_in_the_file(tmp_path):
@@ -88,14 +88,14 @@ def test_resuming_goes_on_behind_the_last_reading_which_stays_in_the_file(tmp_pa
             assert path.read_bytes() == whole[: reading_done if n_bytes >= reading_done else last]
             if n_bytes < reading_done:
                 writer.reading(3, reading(3))
-            writer.belief(belief(3))
+            writer.summary(summary(3))
         assert path.read_bytes() == whole
 
 
 def test_a_missing_reading_is_null_and_comes_back_as_nan(tmp_path):
     with JournalWriter.begin(tmp_path / "j", SETTINGS) as writer:
         writer.reading(1, Reading(math.nan, Pose(1.0, 2.0), 0.0))
-        writer.belief(belief(1))
+        writer.summary(summary(1))
     assert "NaN" not in (tmp_path / "j").read_text()
     assert math.isnan(read_journal(tmp_path / "j").readings[0].value)
 

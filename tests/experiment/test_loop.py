@@ -14,8 +14,8 @@ import pytest
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
+from probewise.experiment import ArmOverGrid as FieldOf
 from probewise.experiment import Exploration, OneScan, arm_over, begin, explore, read_journal, run, step
-from probewise.experiment import Field as FieldOf
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, gaussian_entropy, prior_entropy
 from probewise.recordings import Disc

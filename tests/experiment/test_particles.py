@@ -11,9 +11,9 @@ from scipy.stats import multivariate_normal
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
 from probewise.experiment.evidence import bridged, redrawn
-from probewise.experiment.judging import information
 from probewise.experiment.kernels import LocalKernels
-from probewise.experiment.particles import Particles, _Bridge, _move, _parted, prior_particles, resized, update
+from probewise.experiment.particles import Particles, _Bridge, _move, _partitioned, prior_particles, resized, update
+from probewise.experiment.stopping_rule import information
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 
@@ -235,9 +235,9 @@ def test_kernels_follow_a_bent_shell():
 
 def test_samples_that_all_descend_from_one_are_moved_as_one_part():
     """Copies of one sample are in one part; a part with hardly any would have no kernels."""
-    alike = _parted(np.zeros(40, dtype=np.int64))
+    alike = _partitioned(np.zeros(40, dtype=np.int64))
     assert [len(part) for part in alike] == [40]
-    halves = _parted(np.arange(40))
+    halves = _partitioned(np.arange(40))
     assert [len(part) for part in halves] == [20, 20]
 
 

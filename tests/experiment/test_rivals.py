@@ -27,8 +27,8 @@ from probewise.experiment import (
     step,
     with_arm_error,
 )
+from probewise.experiment.acquisition import ArmOverGrid, inquire
 from probewise.experiment.arm_error import arm_error
-from probewise.experiment.asking import Field, inquire
 from probewise.experiment.checking import ENOUGH_BITS, NAMES, bits_of_names, far_side
 from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
@@ -54,7 +54,7 @@ def stepped(doubting):
     """Two steps of a run that doubts, both of the prior's first places."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = Field.under(arm, doubting.grid)
+        field = ArmOverGrid.under(arm, doubting.grid)
         state = begin(doubting, field, rng=rng)
         prior_bits = prior_entropy(doubting.prior, rng=rng)
         found = []
@@ -228,7 +228,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
     """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as simulated:
-        field = Field.under(simulated, doubting.grid)
+        field = ArmOverGrid.under(simulated, doubting.grid)
     state, found = begin(doubting, field, rng=rng), []
     for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
         reading = Reading(value, Pose(x, y), 8.0 * k)
@@ -261,7 +261,7 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     inside = Reading(60.0, Pose(x - 0.6 * radius, y), 0.0)
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = Field.under(arm, doubting.grid)
+        field = ArmOverGrid.under(arm, doubting.grid)
     prospect, _ = inquire(doubting, joined, joined.theta[:20], field, at=inside)
     far = far_side(prospect, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
     if asked_deg is None:

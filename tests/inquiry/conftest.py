@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.inquiry import AskedForecast, Designs, Grid, Prospect, Readout, forecast_of
+from probewise.inquiry import Designs, DirectForecast, Grid, Prospect, Readout, forecast_of
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NaiveSensor
 
@@ -45,7 +45,7 @@ def listed(table, *, noise_sd=1.0, step=1.0, weight=None, repeats=(1,), cost_s=N
     theta = np.arange(float(n))[:, None]
     rows = np.flatnonzero(np.arange(len(designs)) % (2 * n_x) < n_x)
     return Prospect(
-        AskedForecast(Listed(tuple(map(tuple, table)))),
+        DirectForecast(Listed(tuple(map(tuple, table)))),
         Readout(noise_sd, step),
         theta,
         np.full(n, 1.0 / n) if weight is None else np.asarray(weight, dtype=float),

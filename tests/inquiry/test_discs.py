@@ -8,15 +8,15 @@ import pytest
 
 from probewise.effects import VOCABULARY, AlbedoGradient, Backlash, EdgeBlur, Hysteresis, Known, Saturation
 from probewise.inquiry import (
-    AskedForecast,
     Designs,
+    DirectForecast,
     DiscForecast,
     DiscTable,
     Grid,
     InformationGain,
     Prospect,
     Readout,
-    TabledChain,
+    TabulatedChain,
     forecast_of,
     utility_map,
 )
@@ -105,7 +105,7 @@ def test_the_information_of_the_table_is_that_of_asking(made):
     """The same 400 hypotheses by both routes, all places of a coarse grid."""
     theta, grid = made.circles(400), Grid(n_x=27, n_y=14)
     quick = made.over_discs(made.chain(20), theta, grid=grid, orientations_rad=(0.0, 1.0))
-    slow = type(quick)(**{**vars(quick), "forecast": AskedForecast(made.chain(20))})
+    slow = type(quick)(**{**vars(quick), "forecast": DirectForecast(made.chain(20))})
     bits = InformationGain()(quick)
     np.testing.assert_allclose(bits, InformationGain()(slow), atol=0.01)
     assert bits.max() > 0.3
@@ -134,7 +134,7 @@ def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():
             forecast_of(model), Readout(noise_sd), theta, np.full(200, 1 / 200), theta, Designs(grid),
             Designs(grid).plan("field"), np.arange(grid.n_places), np.ones(grid.n_places),
         )  # fmt: skip
-        assert len(prospect.outlook.levels) == MOST_LEVELS
+        assert len(prospect.predictive.levels) == MOST_LEVELS
         bits.append(prospect.information(prospect.weight))
     # A hundred times less noise tells no less anywhere, and what 200 circles can tell bounds both.
     assert (bits[1] > bits[0] - 0.05).all()
@@ -151,13 +151,13 @@ def test_a_sensor_with_known_effects_is_looked_up_too(made, places, names):
     }
     model = replace(made.chain(), effects=tuple(Known(*values[name]) for name in names))
     forecast, theta = forecast_of(model), made.circles(40)
-    assert isinstance(forecast.model, DiscTable | TabledChain)
+    assert isinstance(forecast.model, DiscTable | TabulatedChain)
     run = replace(places, scan=np.zeros(len(places), dtype=np.int64), scan_names=("run",))
     away = np.abs(forecast.predict(theta, run) - model.predict(theta, run))
     assert away.max() < 0.05
     assert np.sqrt((away**2).mean()) < 0.002
     # A rival beside what is known looks the same table up.
-    acting = TabledChain.of(model.with_effects(Hysteresis()), forecast.model)
+    acting = TabulatedChain.of(model.with_effects(Hysteresis()), forecast.model)
     both = np.concatenate([theta, np.full((40, 1), 4.0)], axis=1)
     expected = model.with_effects(Hysteresis()).predict(both, run)
     assert np.abs(acting.predict(both, run) - expected).max() < 0.05

@@ -6,7 +6,7 @@ from scipy.integrate import quad
 from scipy.special import ndtr
 from scipy.stats import multivariate_normal, norm
 
-from probewise.inquiry.spans import single, whole
+from probewise.inquiry.scanlines import single, whole
 from probewise.inquiry.unit_gaussian import N_OPENINGS, REACH, seen_of_bend, seen_of_corner
 
 HALF_STEP = 1 / 64  # sd, and the steepest slope of a distribution function is 0.4 per sd

@@ -8,7 +8,7 @@ import pytest
 from probewise.errors import ParameterError
 from probewise.experiment import with_cards
 from probewise.experiment.rivals import rivals_of
-from probewise.inquiry import CardedForecast, TabledChain, forecast_of
+from probewise.inquiry import CardedForecast, TabulatedChain, forecast_of
 from probewise.recordings import Disc, Plan
 from probewise.scene import Card, CardedScene
 from probewise.study import experiment_of
@@ -54,7 +54,7 @@ def test_tables_with_cards_laid_over_them_are_the_chain(chain, plan):
         if rival.effect is None:
             continue
         acting = chain.with_effects(rival.effect)
-        quick = TabledChain.of(acting, forecast.model)
+        quick = TabulatedChain.of(acting, forecast.model)
         if quick is not None:
             n_own = len(rival.effect.prior.names)
             own = rival.effect.prior.from_unit_cube(rng.uniform(0.3, 0.7, (len(theta), n_own)))
@@ -76,12 +76,12 @@ def test_an_outlook_knows_that_a_card_tells_nothing_of_the_shape(chain):
     theta = experiment.prior.from_unit_cube(np.random.default_rng(2).random((500, 3)))
     even = np.full(len(theta), 1 / len(theta))
     plan = experiment.designs.plan("field")
-    outlook = experiment.forecast.outlook(theta, even, experiment.designs, plan, np.arange(len(plan)), 1.0)
-    ((_, mass),) = list(outlook.maps(even))
+    predictive = experiment.forecast.predictive(theta, even, experiment.designs, plan, np.arange(len(plan)), 1.0)
+    ((_, mass),) = list(predictive.maps(even))
     on_card = int(np.argmin((plan.x_mm - 300.0) ** 2 + (plan.y_mm - 200.0) ** 2))
     beside = int(np.argmin((plan.x_mm - 500.0) ** 2 + (plan.y_mm - 260.0) ** 2))
     assert mass[on_card].max() > 0.999
-    assert outlook.levels[mass[on_card].argmax()] == pytest.approx((DARK + BRIGHT) / 2, abs=0.5)
+    assert predictive.levels[mass[on_card].argmax()] == pytest.approx((DARK + BRIGHT) / 2, abs=0.5)
     assert mass[beside].max() < 0.99
 
 

@@ -108,7 +108,7 @@ def fit_geometry(
     if len(marks) < LEAST_MARKS:
         raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
     before = values_of(geometry)
-    values, total, jacobian = _solve(geometry, before, turned, marks, touch_mm)
+    values, total, jacobian = _most_probable(geometry, before, turned, marks, touch_mm)
     n = int(np.isfinite(marks).sum())
     p_value = float(chdtrc(n, total))
     residuals = marks - places_of(geometry, values, turned)
@@ -130,7 +130,7 @@ def fit_geometry(
     )
 
 
-def _solve(
+def _most_probable(
     geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
 ) -> tuple[FloatArray, float, FloatArray]:
     """Return the most probable parameters, the sum of squares there, and the Jacobian, (n_residuals, 9)."""
@@ -157,7 +157,7 @@ def _disagreement(
     off = f"the marks disagree: {rms:.1f} mm root mean square, where each is good to {touch_mm:g} mm"
     for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
         others = np.arange(len(marks)) != k
-        values, total, _ = _solve(geometry, before, turned[others], marks[others], touch_mm)
+        values, total, _ = _most_probable(geometry, before, turned[others], marks[others], touch_mm)
         if chdtrc(int(np.isfinite(marks[others]).sum()), total) >= LEAST_P:
             away = float(np.sqrt(np.nansum((marks[k] - places_of(geometry, values, turned[[k]])[0]) ** 2)))
             return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"

@@ -173,7 +173,7 @@ class LegoArm:
         self.rise()
         self._arrive(BASE, goals[BASE])
         for joint in self._order(goals):
-            self._near(joint, goals[joint].counts)
+            self._move_near(joint, goals[joint].counts)
 
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
         """Move the sensor over a place and lower it, by default to reading height.
@@ -189,11 +189,11 @@ class LegoArm:
         if self.first_down is not None and height_mm is None:
             ask, self.first_down = self.first_down, None
             for step_mm in np.linspace(travel_mm, read_mm, N_STEPS_DOWN + 1)[:-1].tolist():
-                self._down(x_mm, y_mm, step_mm)
+                self._lower_to(x_mm, y_mm, step_mm)
                 ask(step_mm)
-        self._down(x_mm, y_mm, read_mm if height_mm is None else height_mm)
+        self._lower_to(x_mm, y_mm, read_mm if height_mm is None else height_mm)
 
-    def _down(self, x_mm: float, y_mm: float, height_mm: float) -> None:
+    def _lower_to(self, x_mm: float, y_mm: float, height_mm: float) -> None:
         goals = self._goals(x_mm, y_mm, height_mm)
         self.rise()
         self._arrive(BASE, goals[BASE])
@@ -217,7 +217,7 @@ class LegoArm:
                 stand = np.degrees(self.angles_rad).round(1).tolist()
                 raise ReachError("joints", stand, "angles from which the sensor can rise; bring the arm home by hand")
             _, joint, goal = min(ways)
-            self._near(joint, goal)
+            self._move_near(joint, goal)
         self._is_down = False
 
     def home(self) -> None:
@@ -315,7 +315,7 @@ class LegoArm:
         end_mm = self._heights_mm(ways[0])[-1]
         if max(lowest_mm) > end_mm - CLEAR_MM:
             return orders[int(np.argmax(lowest_mm))]
-        self._near(SHOULDER, self.geometry.shoulder.counts_at(math.pi / 2))
+        self._move_near(SHOULDER, self.geometry.shoulder.counts_at(math.pi / 2))
         return ELBOW, SHOULDER
 
     def _heights_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
@@ -349,6 +349,6 @@ class LegoArm:
         self._machine.move_to(joint, goal.counts, side)
         self._arrived[joint] = goal.side
 
-    def _near(self, joint: int, counts: int) -> None:
+    def _move_near(self, joint: int, counts: int) -> None:
         self._machine.move_near(joint, counts)
         self._arrived[joint] = 0

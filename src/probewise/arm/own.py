@@ -84,14 +84,14 @@ class OwnInstrument:
 
     def __enter__(self) -> Self:
         """Connect; an object without `measure` is closed and refused."""
-        with self._telling("connect"):
+        with self._errors_located("connect"):
             own = self._connect() if self._own is None else self._own
             if hasattr(own, "__enter__") and hasattr(own, "__exit__"):
                 entered = own.__enter__()
                 own = entered if hasattr(entered, "measure") else own
         self._own = own
         try:
-            with self._telling(""):
+            with self._errors_located(""):
                 require_measures("what connect() returned", own)
         except BaseException as error:
             self.__exit__(type(error), error, error.__traceback__)
@@ -107,7 +107,7 @@ class OwnInstrument:
         leave = getattr(own, "__exit__", None)
         close = getattr(own, "close", None)
         try:
-            with deferred(), self._telling("close"):
+            with deferred(), self._errors_located("close"):
                 if hasattr(own, "__enter__") and callable(leave):
                     leave(kind, error, trace)
                 elif callable(close):
@@ -136,7 +136,7 @@ class OwnInstrument:
         own = getattr(self._own, "reachable", None)
         if own is None:
             return np.ones(len(places_mm), dtype=np.bool_)
-        with self._telling("reachable"):
+        with self._errors_located("reachable"):
             held = np.asarray(_per_place("reachable", own(places_mm), len(places_mm), "True or False"))
             if held.dtype.kind not in "biu":
                 raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
@@ -149,9 +149,9 @@ class OwnInstrument:
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2), by default 0: shape (n_places,)."""
         own = getattr(self._own, "orientation_rad", 0.0)
-        with self._telling("orientation_rad"):
+        with self._errors_located("orientation_rad"):
             angles = own(places_mm) if callable(own) else own
-            return _finite("orientation_rad", angles, len(places_mm), "a finite number of radians")
+            return _finite_per_place("orientation_rad", angles, len(places_mm), "a finite number of radians")
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Return the seconds to move from `start` to each place and read; default: from distance: shape (n_places,)."""
@@ -159,7 +159,7 @@ class OwnInstrument:
         if own is None:
             away = np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm)
             return np.asarray(away / self._speed.move_mm_s + self._speed.read_s)
-        with self._telling("travel_s"):
+        with self._errors_located("travel_s"):
             allowed = "seconds, finite, 0 or more; nan out of reach"
             seconds = _numbers("travel_s", own(start, places_mm), len(places_mm), allowed)
             wrong = ~((seconds >= 0) & (seconds < math.inf))
@@ -175,7 +175,7 @@ class OwnInstrument:
         ParameterError, LinkError
             If the result is not a valid reading; LinkError for an instrument from a file.
         """
-        with self._telling("measure"):
+        with self._errors_located("measure"):
             return self._reading(self._own.measure(pose), pose)
 
     def _reading(self, found: object, pose: Pose) -> Reading:
@@ -186,7 +186,7 @@ class OwnInstrument:
             return Reading(_value("what measure returned", found), pose, now_s)
         if "value" not in found:
             raise ParameterError("what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
-        known = {name: _known(name, number) for name, number in found.items() if name != "value"}
+        known = {name: _covariate(name, number) for name, number in found.items() if name != "value"}
         time_s = known.pop("time_s", now_s)
         place = {name: known.pop(name, getattr(pose, name)) for name in _OF_THE_POSE}
         for name, number in (("time_s", time_s), *place.items()):
@@ -195,7 +195,7 @@ class OwnInstrument:
         return Reading(value, Pose(**place, height_mm=pose.height_mm), time_s, known)
 
     @contextlib.contextmanager
-    def _telling(self, what: str) -> Iterator[None]:
+    def _errors_located(self, what: str) -> Iterator[None]:
         """Convert errors inside `what` to a one-line error with the line number of the user's file.
 
         Output that the file prints goes to standard error, separate from results.
@@ -207,9 +207,9 @@ class OwnInstrument:
         except (Exception, SystemExit) as error:
             if not self.source:
                 raise
-            raise LinkError(self._told(what, error)) from error
+            raise LinkError(self._error_message(what, error)) from error
 
-    def _told(self, what: str, error: BaseException) -> str:
+    def _error_message(self, what: str, error: BaseException) -> str:
         frames = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename == self.source]
         where = f"{self.source}, line {frames[-1]}" if frames else self.source
         if isinstance(error, ParameterError | ShapeError) and not frames:  # a wrong value was returned
@@ -264,7 +264,7 @@ def _value(name: str, found: object) -> float:
     return float(number)
 
 
-def _known(name: object, number: object) -> float:
+def _covariate(name: object, number: object) -> float:
     """Return a further number of a reading as a float; NaN if missing."""
     if not isinstance(name, str) or not name.isprintable() or name != name.strip() or name in ("", *_TAKEN):
         taken = "no name that a recording has a column for" if name in _TAKEN else "a printable text"
@@ -292,7 +292,7 @@ def _numbers(name: str, found: object, n_places: int, allowed: str) -> FloatArra
     return np.asarray(array, dtype=np.float64)
 
 
-def _finite(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+def _finite_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
     array = _numbers(name, found, n_places, allowed)
     if not np.isfinite(array).all():
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")

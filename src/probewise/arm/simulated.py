@@ -106,7 +106,7 @@ class SimulatedArm:
         ShapeError
             If the places are not pairs.
         """
-        return self.reach.holds(_pairs(places_mm))
+        return self.reach.holds(_checked_places(places_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,).
@@ -116,7 +116,7 @@ class SimulatedArm:
         ShapeError
             If the places are not pairs.
         """
-        return self.reach.orientation_rad(_pairs(places_mm))
+        return self.reach.orientation_rad(_checked_places(places_mm))
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Return the seconds to move from `start` to each place (n_places, 2) and read there, shape (n_places,).
@@ -126,7 +126,7 @@ class SimulatedArm:
         ShapeError
             If the places are not pairs.
         """
-        places = _pairs(places_mm)
+        places = _checked_places(places_mm)
         away = np.hypot(places[:, 0] - start.x_mm, places[:, 1] - start.y_mm)
         return np.asarray(away / self.speed.move_mm_s + self.speed.read_s, dtype=np.float64)
 
@@ -153,7 +153,7 @@ class SimulatedArm:
         return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": height_mm})
 
 
-def _pairs(places_mm: FloatArray) -> FloatArray:
+def _checked_places(places_mm: FloatArray) -> FloatArray:
     places = floats(places_mm, "places_mm")
     if places.ndim != 2 or places.shape[1] != 2:
         raise ShapeError(f"places_mm has shape {places.shape}; allowed: (n_places, 2)")

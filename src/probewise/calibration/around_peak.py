@@ -138,7 +138,7 @@ def around_peak(
             density = StudentTDensity(density.mean, 0.5 * density.root)
             continue
         log_weight = problem.log_likelihood(theta) - log_density
-        density = _fitted(y, _tempered(log_weight, _LEAST_PER_COORDINATE * y.shape[1]), density)
+        density = _fitted_density(y, _tempered(log_weight, _LEAST_PER_COORDINATE * y.shape[1]), density)
     return PeakDensity(space, density), n_calls
 
 
@@ -178,7 +178,7 @@ def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
     return low * log_weight
 
 
-def _fitted(y: FloatArray, log_weight: FloatArray, before: StudentTDensity) -> StudentTDensity:
+def _fitted_density(y: FloatArray, log_weight: FloatArray, before: StudentTDensity) -> StudentTDensity:
     """Fit a density to weighted draws; with few of them it keeps some of the one before."""
     weight = np.exp(log_weight - logsumexp(log_weight))
     mean = weight @ y

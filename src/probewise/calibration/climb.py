@@ -268,12 +268,12 @@ def climb(
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):
-            now, share = _moved(now, partial(known, beta=beta), reference, beta, rng)
+            now, share = _metropolis_step(now, partial(known, beta=beta), reference, beta, rng)
             shares.append(share)
         accepted = float(np.mean(shares))
         if beta == 1.0:
             now = known(now.x)
-        log_ratio, share = _log_ratio(log_weight, (width * now.rise).reshape(n_clouds, n))
+        log_ratio, share = _log_evidence_ratio(log_weight, (width * now.rise).reshape(n_clouds, n))
         log_z += log_ratio
         overlap = min(overlap, share)
         if told is not None:
@@ -282,7 +282,7 @@ def climb(
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     if temperatures[-1] == 1.0:
         for k in range(1, n_more + 1):
-            now, _ = _moved(now, partial(known, beta=1.0), reference, 1.0, rng, fresh=exchange is None)
+            now, _ = _metropolis_step(now, partial(known, beta=1.0), reference, 1.0, rng, fresh=exchange is None)
             if exchange is not None and k % _EXCHANGE == 0:
                 now = known(space.enter(exchange(space.leave(now.x)[0])), 1.0)
             if k in keep:
@@ -307,7 +307,7 @@ def climb(
     )
 
 
-def _log_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
+def _log_evidence_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
     """Bridge two temperatures in each cloud (Bennett 1976): log of the ratio of their evidences, (n_clouds,).
 
     `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each. Also the
@@ -337,7 +337,7 @@ def _next(rise: FloatArray, beta: float, least: float) -> float:
     return high
 
 
-def _moved(
+def _metropolis_step(
     now: _Cloud,
     known: Callable[[FloatArray], _Cloud],
     reference: KnownDensity,

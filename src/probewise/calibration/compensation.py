@@ -234,6 +234,6 @@ class Compensation:
         return self.pool[rows], self.answers.take(rows)
 
     def log_tilt(self, answer: Answer) -> FloatArray:
-        """Log of the density of the shapes over the prior's, (n,)."""
+        """Log of the density with which `draw` draws over the prior's, (n,)."""
         asked = _TEMPERED * answer.log_evidence(self.most) - self.log_norm
         return np.asarray(np.logaddexp(math.log(_PLAIN), math.log(1.0 - _PLAIN) + asked))

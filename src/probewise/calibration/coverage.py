@@ -128,14 +128,16 @@ def coverage(
         raise ParameterError("n_recordings", n_recordings, "1 or more")
     held: dict[str, int] = {}
     each = map if executor is None else executor.map
-    for k, one in enumerate(each(_held, rng.spawn(n_recordings), [n_live] * n_recordings, [quick] * n_recordings)):
+    for k, one in enumerate(
+        each(_intervals_hold, rng.spawn(n_recordings), [n_live] * n_recordings, [quick] * n_recordings)
+    ):
         held = {name: held.get(name, 0) + int(inside) for name, inside in one.items()}
         if progress is not None:
             progress(Coverage(k + 1, held, n_live))
     return Coverage(n_recordings, held, n_live)
 
 
-def _held(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:
+def _intervals_hold(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:
     """Simulate and calibrate one recording; return for each quantity whether its interval holds the truth."""
     truth = draw_truth(rng=rng)
     recording = simulate_truth(truth, rng=rng)

@@ -155,10 +155,10 @@ def _centers(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray:
 
 def _reach(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
     """Bounds five sds beyond all centres except the outermost thousandth of the mass on either side."""
-    return -_upper(_SIGMAS * sd - center, mass), _upper(center + _SIGMAS * sd, mass)
+    return -_highest_level(_SIGMAS * sd - center, mass), _highest_level(center + _SIGMAS * sd, mass)
 
 
-def _upper(values: FloatArray, mass: FloatArray) -> float:
+def _highest_level(values: FloatArray, mass: FloatArray) -> float:
     flat, weight = values.ravel(), mass.ravel()
     order = np.argsort(flat)
     ladder = np.cumsum(weight[order])

@@ -249,7 +249,7 @@ def _fit_order(
     if found is None:
         found = search(n_gaussians, rng)
         notes = (*notes, *why)
-    sensor = _fitted(
+    sensor = _fitted_sensor(
         recording,
         posing.problem(n_gaussians),
         found.result,
@@ -259,10 +259,10 @@ def _fit_order(
         notes=(*notes, *found.notes),
         rng=rng,
     )
-    return OrderFit(n_gaussians, posing.belief(n_gaussians), found, sensor)
+    return OrderFit(n_gaussians, posing.prior_of(n_gaussians), found, sensor)
 
 
-def _fitted(
+def _fitted_sensor(
     recording: Recording,
     problem: SensorProblem,
     result: NestedResult | Climb,
@@ -286,7 +286,7 @@ def _fitted(
     # Samples of a climb weigh alike, so that those that are kept serve for the field.
     theta, weight = (samples, None) if isinstance(result, Climb) else (result.theta, result.weight)
     blind = blind_axis_rad(recording)
-    silent = _uninformed(samples, prior, rng)
+    silent = _unconstrained_moments(samples, prior, rng)
     if blind is not None:
         notes = (
             *notes,
@@ -315,7 +315,7 @@ def _fitted(
     )
 
 
-def _uninformed(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:
+def _unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:
     """Names of the moments (centre, widths, correlation) that the recording did not constrain."""
     before = mixture_moments(prior.from_unit_cube(rng.random((2000, len(prior.names)))), prior.n_gaussians)
     after = mixture_moments(samples, prior.n_gaussians)

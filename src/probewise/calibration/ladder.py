@@ -68,7 +68,7 @@ def climb_orders(
     n_usable = int(posing.recording.usable.sum())
     if n_usable < _LEAST_READINGS:
         return {}, (f"searched in full: {n_usable} usable readings, fewer than {_LEAST_READINGS}",)
-    unlike = _unlike(posing, highest)
+    unlike = _why_not_climbable(posing, highest)
     if unlike:
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
@@ -82,12 +82,12 @@ def climb_orders(
     return {n: found[n] for n in orders}, ()
 
 
-def _unlike(posing: Posing, highest: int) -> str:
+def _why_not_climbable(posing: Posing, highest: int) -> str:
     """Say why no order can be climbed to, if so."""
-    beliefs = [posing.belief(n) for n in range(1, highest + 1)]
-    if not all(has_reference(belief) for belief in beliefs):
+    priors = [posing.prior_of(n) for n in range(1, highest + 1)]
+    if not all(has_reference(prior) for prior in priors):
         return "searched in full: the prior of a Gaussian's light is not uniform from 0"
-    if any(replace(belief, n_gaussians=1) != beliefs[0] for belief in beliefs):
+    if any(replace(prior, n_gaussians=1) != priors[0] for prior in priors):
         return "searched in full: the prior of a Gaussian differs from order to order"
     return ""
 
@@ -132,7 +132,7 @@ def next_order(
     for way in ways:
         if way is None:
             continue
-        made = _vouched(posing, n, way(), peak, rng)
+        made = _searched_for_missed_peaks(posing, n, way(), peak, rng)
         if not made.warnings:
             return Found(made, None)
         notes.extend(made.warnings)
@@ -172,7 +172,9 @@ def _about_peak(
     log_weight = np.full(_N_FITTED, -np.inf)
     inside = np.flatnonzero(np.isfinite(drawn).all(axis=1))
     log_weight[inside] = problem.log_likelihood(drawn[inside]) - fitted.log_likelihood(drawn[inside])
-    return _bridged(made, clouds, log_weight, (made.log_likelihood - fitted.log_likelihood(made.theta))[:, None])
+    return _with_bridged_evidence(
+        made, clouds, log_weight, (made.log_likelihood - fitted.log_likelihood(made.theta))[:, None]
+    )
 
 
 def _from_below(
@@ -180,7 +182,7 @@ def _from_below(
 ) -> Climb:
     """Carry particles from the posterior of n - 1 to that of n, and bridge the two."""
     problem_below, alone = posing.problem(n - 1), posing.problem(1)
-    coordinates = posing.belief(n - 1).coordinates
+    coordinates = posing.prior_of(n - 1).coordinates
     start = below.evidence
     if isinstance(start, Climb):
         rest, log_z, error = start.theta, start.log_z_of_clouds, start.start_error
@@ -189,8 +191,8 @@ def _from_below(
         log_z, error = np.full(_N_CLOUDS, start.log_z), start.log_z_error
     few = rest[:: len(rest) // _N_PARTICLES]
     compensation = Compensation.of(problem_below, coordinates, alone, few, rng=rng)
-    reference = Reference(posing.belief(n), problem_below, compensation)
-    removal = Removal(posing.belief(n), alone)
+    reference = Reference(posing.prior_of(n), problem_below, compensation)
+    removal = Removal(posing.prior_of(n), alone)
     made = climb(
         posing.problem(n),
         reference,
@@ -201,11 +203,11 @@ def _from_below(
         rng=rng,
         told=told,
     )
-    gaussian = posing.belief(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
-    return _bridged(made, log_z, removal.added(rest, gaussian), removal.taken(made.theta))
+    gaussian = posing.prior_of(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
+    return _with_bridged_evidence(made, log_z, removal.added(rest, gaussian), removal.taken(made.theta))
 
 
-def _bridged(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> Climb:
+def _with_bridged_evidence(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> Climb:
     """Take the evidence from a bridge, where enough samples lie on it; doubt where it disagrees with the climb's."""
     ratio, share = bridged(added, taken)
     if share < _LEAST_SHARE:
@@ -230,7 +232,7 @@ def _bridged(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArra
     return replace(found, doubts=(*found.doubts, f"two estimates of ln Z disagree: {words} by a bridge"))
 
 
-def _vouched(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Generator) -> Climb:
+def _searched_for_missed_peaks(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Generator) -> Climb:
     """Doubt a climb that missed a peak which holds a part of the evidence."""
     if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:
         return made

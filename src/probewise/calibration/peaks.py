@@ -63,12 +63,12 @@ def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np
         if n > 1:
             below = np.repeat(found[n - 1].theta[None], n_split + n_added, axis=0)
             lone = drawn[:n_added, :6]
-            starts += [_split(below[:n_split], rng), _joined(prior, below[n_split:], lone, rng)]
-        found[n] = _ascended(problem(n), np.concatenate(starts))
+            starts += [_split_gaussian(below[:n_split], rng), _with_lone_gaussian(prior, below[n_split:], lone, rng)]
+        found[n] = _local_maxima(problem(n), np.concatenate(starts))
     for n in range(highest - 1, 0, -1):
         above = found[n + 1].theta
         lacking = [np.delete(above, slice(6 * k, 6 * k + 6)) for k in range(n + 1)]
-        again = _ascended(problem(n), np.array(lacking))
+        again = _local_maxima(problem(n), np.array(lacking))
         found[n] = max(found[n], again, key=lambda peak: peak.log_likelihood)
     return found
 
@@ -79,7 +79,7 @@ def _prior(problem: SensorProblem) -> SSFPrior:
     return problem.prior
 
 
-def _split(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _split_gaussian(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Split one Gaussian of each into two that keep its light, centre and covariance, (n, 6 N) -> (n, 6 N + 6)."""
     m = len(theta)
     g = theta[:, :-2].reshape(m, -1, 6)
@@ -105,7 +105,7 @@ def _split(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.concatenate([out[:, :-2], parts[1], out[:, -2:]], axis=1)
 
 
-def _joined(prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _with_lone_gaussian(prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Add a Gaussian that holds a fifth of the light of the first, or less, (n, 6 N), (n, 6) -> (n, 6 N + 6)."""
     one, first = lone.copy(), theta[:, :6]
     light = first[:, 0] / prior.amplitude_scale(first[:, 3] * first[:, 4] - first[:, 5] ** 2)
@@ -113,7 +113,7 @@ def _joined(prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random
     return np.concatenate([theta[:, :-2], one, theta[:, -2:]], axis=1)
 
 
-def _ascended(problem: SensorProblem, starts: FloatArray) -> Peak:
+def _local_maxima(problem: SensorProblem, starts: FloatArray) -> Peak:
     """Ascend from each start, (n_starts, n_params); the worse half gives up after some steps."""
     prior, likelihood, recording = _prior(problem), problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):

@@ -27,7 +27,7 @@ class Posing:
     prior: Callable[[Recording, int], SSFPrior]
     data_sets: IntArray | None = None
 
-    def belief(self, n_gaussians: int) -> SSFPrior:
+    def prior_of(self, n_gaussians: int) -> SSFPrior:
         """Return the prior of an order."""
         found = self.prior(self.recording, n_gaussians)
         if not isinstance(found, SSFPrior):
@@ -36,7 +36,7 @@ class Posing:
 
     def problem(self, n_gaussians: int) -> SensorProblem:
         """Return the inference problem of an order."""
-        return problem_for(self.recording, self.belief(n_gaussians), data_sets=self.data_sets)
+        return problem_for(self.recording, self.prior_of(n_gaussians), data_sets=self.data_sets)
 
 
 def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:

@@ -22,7 +22,7 @@ from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.priors import Uniform
 
-__all__ = ["Reference", "Way", "has_reference"]
+__all__ = ["JumpProposal", "Reference", "has_reference"]
 
 # Share of the new Gaussians that lie near one of the others, and how near: of the cube's side, in precision and
 # correlation; in place, by the other's own width.
@@ -51,8 +51,8 @@ class _Draw(Protocol):
 
 
 @dataclass(frozen=True)
-class Way:
-    """One way to get from N - 1 sorted Gaussians to N.
+class JumpProposal:
+    """A proposal that jumps from N - 1 sorted Gaussians to N.
 
     Attributes
     ----------
@@ -107,33 +107,33 @@ class Reference:
             raise ParameterError("prior", self.prior, "a prior of 2 Gaussians or more, with masses uniform from 0 to 1")
 
     @cached_property
-    def ways(self) -> tuple[Way, ...]:
+    def proposals(self) -> tuple[JumpProposal, ...]:
         """The ways that are mixed."""
         added, split, compensated = _WITHOUT if self.compensation is None else _WITH
         plain = (
-            Way(added, self.with_last, lambda theta: (self.without_last(theta), self.log_added(theta))),
-            Way(split, self.split, lambda theta: (self.merged(theta), self.log_split(theta))),
+            JumpProposal(added, self.with_last, lambda theta: (self.without_last(theta), self.log_added(theta))),
+            JumpProposal(split, self.split, lambda theta: (self.merged(theta), self.log_split(theta))),
         )
         if self.compensation is None:
             return plain
-        return (*plain, Way(compensated, self.with_compensated, self.uncompensated))
+        return (*plain, JumpProposal(compensated, self.with_compensated, self.uncompensated))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
-        parts = np.empty((len(self.ways), len(theta)))
-        for part, way in zip(parts, self.ways, strict=True):
-            rest, part[:] = way.back(theta)
+        parts = np.empty((len(self.proposals), len(theta)))
+        for part, proposal in zip(parts, self.proposals, strict=True):
+            rest, part[:] = proposal.back(theta)
             possible = np.flatnonzero(part > -np.inf)
             if possible.size:
-                part[possible] += self.below.log_likelihood(rest[possible]) + math.log(way.share)
+                part[possible] += self.below.log_likelihood(rest[possible]) + math.log(proposal.share)
         return np.asarray(logsumexp(parts, axis=0) - math.log(self.prior.n_gaussians))
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw one Gaussian more for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
-        which = rng.choice(len(self.ways), size=len(rest), p=[way.share for way in self.ways])
+        which = rng.choice(len(self.proposals), size=len(rest), p=[proposal.share for proposal in self.proposals])
         out = np.empty((len(rest), rest.shape[1] + 6))
-        for k, way in enumerate(self.ways):
-            out[which == k] = way.draw(rest[which == k], rng=rng)
+        for k, proposal in enumerate(self.proposals):
+            out[which == k] = proposal.draw(rest[which == k], rng=rng)
         return out
 
     def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -143,18 +143,18 @@ class Reference:
         the prior's, (n,); -inf where the move is impossible.
         """
         there, log_drawn = np.full(here.shape, np.nan), np.full(len(here), -np.inf)
-        which = rng.choice(len(self.ways), size=len(here), p=[way.share for way in self.ways])
-        for k, way in enumerate(self.ways):
+        which = rng.choice(len(self.proposals), size=len(here), p=[proposal.share for proposal in self.proposals])
+        for k, proposal in enumerate(self.proposals):
             rows = np.flatnonzero(which == k)
-            rest, log_here = way.back(here[rows])
+            rest, log_here = proposal.back(here[rows])
             possible = np.isfinite(log_here)
             rows, log_here = rows[possible], log_here[possible]
             if not rows.size:
                 continue
-            there[rows] = way.draw(rest[possible], rng=rng)
+            there[rows] = proposal.draw(rest[possible], rng=rng)
             possible = np.isfinite(there[rows]).all(axis=1)
             rows, log_here = rows[possible], log_here[possible]
-            log_there = way.back(there[rows])[1]
+            log_there = proposal.back(there[rows])[1]
             log_drawn[rows] = np.where(np.isfinite(log_there), log_here - log_there, -np.inf)
         return there, log_drawn
 
@@ -170,7 +170,7 @@ class Reference:
         last[near] = self._drawn_near_one(rest[near], rng)
         ratio = np.where(near, 1.0 - rng.random(len(rest)), _drawn_ratio(len(rest), rng))
         last[:, 0] = ratio * self._masses(rest).min(axis=1) * self._scale(last)
-        return _with(rest, last)
+        return _insert_gaussian(rest, last)
 
     def log_added(self, theta: FloatArray) -> FloatArray:
         """Log of r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
@@ -194,10 +194,10 @@ class Reference:
         last[:, 0] = ratio * least * self._scale(last)
         share = ratio * least / (whole + ratio * least)
         coordinates = self._compensation.coordinates
-        return _with(coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)[0], last)
+        return _insert_gaussian(coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)[0], last)
 
     def uncompensated(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Undo `with_compensated`; also the log density as `Way.back` has it."""
+        """Undo `with_compensated`; also the log density as `JumpProposal.back` has it."""
         last, rest = theta[:, -8:-2], self.without_last(theta)
         answer = self._compensation.linear.answer(last)
         masses = self._masses(theta)
@@ -234,7 +234,7 @@ class Reference:
     def _log_near_one(self, last: FloatArray, rest: FloatArray) -> FloatArray:
         """Log density of shapes, (n, 6), near one of the others, over the prior's, (n,)."""
         centre, width = self._places(rest)
-        at = self._places(_with(rest[:, -2:], last))[0]
+        at = self._places(_insert_gaussian(rest[:, -2:], last))[0]
         return np.asarray(logsumexp(_log_near(at, centre, width), axis=1) - math.log(self.prior.n_gaussians - 1))
 
     def split(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
@@ -326,7 +326,7 @@ class Reference:
         return centre, width
 
 
-def _with(rest: FloatArray, last: FloatArray) -> FloatArray:
+def _insert_gaussian(rest: FloatArray, last: FloatArray) -> FloatArray:
     """Put a Gaussian, (n, 6), before the levels, (n, 6 N - 4) -> (n, 6 N + 2)."""
     return np.concatenate([rest[:, :-2], last, rest[:, -2:]], axis=1)
 

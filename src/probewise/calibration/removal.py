@@ -66,9 +66,9 @@ class Removal:
         found = []
         for at in range(0, len(rest), at_once):
             part = rest[at : at + at_once]
-            seen, light = self._seen(part)
+            seen, light = self._responses(part)
             one = self._lone(gaussian[at : at + at_once])
-            found.append(self._log_gain(_mixed(seen, light), one, light, part[:, -2:]))
+            found.append(self._log_gain(_mixture_response(seen, light), one, light, part[:, -2:]))
         return np.concatenate(found)
 
     def exchanged(self, theta: FloatArray, *, n_tries: int, rng: np.random.Generator) -> FloatArray:
@@ -85,11 +85,11 @@ class Removal:
     def _exchanged(self, theta: FloatArray, n_tries: int, rng: np.random.Generator) -> FloatArray:
         n, m = self.prior.n_gaussians, len(theta)
         rows = np.arange(m)
-        seen, light = self._seen(theta)
+        seen, light = self._responses(theta)
         label = rng.integers(n, size=m)
         beside = np.arange(n) != label[:, None]
         others = light[beside].reshape(m, n - 1)
-        rest = _mixed(seen[beside].reshape(m, n - 1, -1), others)
+        rest = _mixture_response(seen[beside].reshape(m, n - 1, -1), others)
         own = theta[:, :-2].reshape(m, n, 6)[rows, label]
         drawn = self.prior.from_unit_cube(rng.random((m * n_tries, 6 * n + 2)))[:, :6].reshape(m, n_tries, 6)
         gaussian = np.concatenate([own[:, None], drawn], axis=1)
@@ -122,14 +122,16 @@ class Removal:
         return np.asarray(whole * drawn / (1.0 - drawn))
 
     def _taken(self, theta: FloatArray) -> FloatArray:
-        seen, light = self._seen(theta)
+        seen, light = self._responses(theta)
         out = np.empty(light.shape)
         for k in range(light.shape[1]):
             others = np.delete(light, k, axis=1)
-            out[:, k] = self._log_gain(_mixed(np.delete(seen, k, axis=1), others), seen[:, k], others, theta[:, -2:])
+            out[:, k] = self._log_gain(
+                _mixture_response(np.delete(seen, k, axis=1), others), seen[:, k], others, theta[:, -2:]
+            )
         return out
 
-    def _seen(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _responses(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Responses to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
         g = theta[:, :-2].reshape(len(theta), -1, 6)
         light = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
@@ -251,7 +253,7 @@ class Removal:
         return self.alone.likelihood
 
 
-def _mixed(seen: FloatArray, light: FloatArray) -> FloatArray:
+def _mixture_response(seen: FloatArray, light: FloatArray) -> FloatArray:
     """Response to a mixture, (n, n_used), from its Gaussians', (n, N, n_used), and their light, (n, N)."""
     return np.asarray(((light / light.sum(axis=1, keepdims=True))[:, None, :] @ seen)[:, 0])
 

@@ -61,8 +61,8 @@ def cosines(
         best = int(np.argmax(taken))
         rho = float(np.sqrt(min(taken[best] / float(problem.residual @ problem.residual), 1.0)))
         if rho > _WORTH_A_REFIT:
-            exact = refit.exact(clean, changed)
-            rho = _taken_up(found, _with_effect(problem, found, effect, templates, best, exact))
+            adjusted = refit.without_null_residuals(clean, changed)
+            rho = _taken_up(found, _with_effect(problem, found, effect, templates, best, adjusted))
         out[name] = rho
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
         out["ssf_order"] = _taken_up(found, refit.with_one_more(found, clean, changed))
@@ -88,7 +88,7 @@ def residual_with_one_named(
     Norm of the residuals by name; divided by the noise sd, it is the size of the other effect given this one. It may be
     much smaller than that effect's size alone: readings cut off by a ceiling do not show a paler patch.
     """
-    found, exact = refit.refit(clean, both), refit.exact(clean, both)
+    found, adjusted = refit.refit(clean, both), refit.without_null_residuals(clean, both)
     usable = np.flatnonzero(clean.usable)
     problem = Linearised.of(found, white(len(usable)))
     out = {}
@@ -99,7 +99,7 @@ def residual_with_one_named(
             templates, taken = _taken_by_each(problem, found, effect, usable)
             best = {int(templates.choice[k]): int(k) for k in np.argsort(taken)}  # fits of each variant, the best last
             starts = [*best.values()][-_STARTS:]
-            fits += [_with_effect(problem, found, effect, templates, at, exact) for at in starts]
+            fits += [_with_effect(problem, found, effect, templates, at, adjusted) for at in starts]
         out[name] = min(float(np.linalg.norm(by.residuals)) for by in fits)
     return out
 
@@ -114,7 +114,7 @@ def _taken_by_each(
 
 
 def _with_effect(
-    problem: Linearised, found: Fit, effect: NamedEffect[Any], templates: EffectTemplates, at: int, exact: Recording
+    problem: Linearised, found: Fit, effect: NamedEffect[Any], templates: EffectTemplates, at: int, adjusted: Recording
 ) -> Fit:
     """Refit the null and an effect from an entry of its bank."""
     columns, setting = templates.columns[at], templates.settings[at]
@@ -122,11 +122,11 @@ def _with_effect(
     start = effect.start(setting, np.asarray(amount, dtype=np.float64))
     z = found.z + problem.absorbed(found, columns @ amount)
     model = found.model.with_effect(templates.variant(at))
-    start_z = np.concatenate([z, model.scores_of(start[None, :])[0]])
+    start_z = np.concatenate([z, model.coordinates_of_last_effect(start[None, :])[0]])
     rss = float(found.residuals @ found.residuals)
     # The floor of the sd is a tenth of the residual: small enough for accuracy, large enough not to force an exact fit.
     floor = 0.1 * np.sqrt(rss / len(found.residuals))
-    return fit(model, exact, start_z, white(len(found.residuals), least=floor), tolerance=0.02)
+    return fit(model, adjusted, start_z, white(len(found.residuals), least=floor), tolerance=0.02)
 
 
 def _taken_up(found: Fit, by: Fit) -> float:

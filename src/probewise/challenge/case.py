@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from probewise.challenge.aliasing import cosines, residual_with_one_named
-from probewise.challenge.covering import parameters_within, place_overlap, sensor_within
+from probewise.challenge.covering import place_overlap, sensor_truths_and_intervals, truths_and_intervals
 from probewise.challenge.held_out import log_densities
 from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
@@ -97,13 +97,13 @@ def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
         "noise_model": truth.noise_model,
         "readings": len(case.recording),
         "truth": list(truth.combination),
-        "hidden": _hidden(truth.hidden, sizer, refit),
+        "hidden": _concealed_effects(truth.hidden, sizer, refit),
         "alias": None if truth.alias is None else truth.alias.effect.name,
         "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
     }
 
 
-def _hidden(hidden: Sequence[Hidden], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
+def _concealed_effects(hidden: Sequence[Hidden], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
     """Describe the effects; for a pair also "size_beside", the size of each when the other is in the model."""
     each = [_effect(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
@@ -144,10 +144,10 @@ def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
         **said(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
-        "parameters": {h.name: parameters_within(h.parameters, found[h.name]) for h in named},
-        "sensor": sensor_within(case.world, diagnosis.repaired),
+        "parameters": {h.name: truths_and_intervals(h.parameters, found[h.name]) for h in named},
+        "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
         "held_out": log_densities(case, diagnosis, rng=files),
-        "settled": _settled(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
+        "settled": _diagnosed_after_advice(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
         "cpu_s": cpu_s,
     }
 
@@ -182,7 +182,7 @@ def said(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _settled(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
+def _diagnosed_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
     """Take the readings that the diagnosis advises and diagnose all readings together."""
     asked = diagnosis.next_measurement
     if asked is None:

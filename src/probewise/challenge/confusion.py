@@ -33,7 +33,7 @@ def confusion(
     for result in results:
         if result["kind"] in ("clean", "single", "outside"):
             truth = {"clean": "clean", "outside": OUTSIDE}.get(result["kind"]) or result["hidden"][0]["name"]
-            counts[label(truth), label(_said(result, truth))] += 1
+            counts[label(truth), label(_stated_name(result, truth))] += 1
     order = ["clean", *SINGLES, OUTSIDE]
     said_order = ["clean", *SINGLES, "unknown", SEVERAL]
     said = {s for _, s in counts}
@@ -43,7 +43,7 @@ def confusion(
     return truths, columns, np.array([[counts[t, s] for s in columns] for t in truths]).reshape(len(truths), -1)
 
 
-def _said(result: Mapping[str, Any], truth: str) -> str:
+def _stated_name(result: Mapping[str, Any], truth: str) -> str:
     names = leading(result, clean=True)[0]
     if on_mean(result):
         names = tuple(name for name in names if name not in NOISE)

@@ -14,12 +14,12 @@ from probewise.sensor import footprint_of
 from probewise.world.challenge import Region
 from probewise.world.world import World
 
-__all__ = ["parameters_within", "place_overlap", "sensor_within"]
+__all__ = ["place_overlap", "sensor_truths_and_intervals", "truths_and_intervals"]
 
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 
-def parameters_within(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
+def truths_and_intervals(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
     """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
 
     Angles are compared modulo a turn. Parameters with one value per run, which share a prior, are left out.
@@ -36,7 +36,7 @@ def parameters_within(parameters: Mapping[str, Any], found: EffectFound) -> dict
     return out
 
 
-def sensor_within(world: World, samples: ModelSamples) -> dict[str, list[float]]:
+def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str, list[float]]:
     """Pair the true second moments of the footprint and the levels with their 95 % intervals.
 
     Moments do not depend on the number of Gaussians: mean (mm), variances and covariance (mm^2).

@@ -46,7 +46,7 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
         scores[name] = {scan: _scored(sensor, recording) for scan, recording in scans.items()}
     scores["true"] = {
-        scan: _truly(case.world.expected(recording.plan), case.world.noise_sd, recording)
+        scan: _true_log_density(case.world.expected(recording.plan), case.world.noise_sd, recording)
         for scan, recording in scans.items()
     }
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
@@ -56,6 +56,6 @@ def _scored(sensor: FittedSensor, recording: Recording) -> float:
     return float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
 
 
-def _truly(expected: FloatArray, sd: float, recording: Recording) -> float:
+def _true_log_density(expected: FloatArray, sd: float, recording: Recording) -> float:
     z = (recording.readings - expected)[recording.usable] / sd
     return float(-0.5 * z @ z - len(z) * (np.log(sd) + 0.5 * np.log(2 * np.pi)))

@@ -39,14 +39,14 @@ class NullRefit:
     def refit(self, clean: Recording, changed: Recording) -> Fit:
         """Refit the null to an effect's readings, as if the null fitted the clean sensor exactly."""
         null = self.null(clean)
-        return _fit(null.model, self.exact(clean, changed), null.z)
+        return _fit(null.model, self.without_null_residuals(clean, changed), null.z)
 
     def with_one_more(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
         """Refit the same readings with one Gaussian more than `refit`, which is not a physical effect."""
-        fits = _with_one_more(found, self.exact(clean, changed), Extent.of(clean))
+        fits = _with_one_more(found, self.without_null_residuals(clean, changed), Extent.of(clean))
         return min(fits, key=lambda f: float(np.linalg.norm(f.residuals)))
 
-    def exact(self, clean: Recording, changed: Recording) -> Recording:
+    def without_null_residuals(self, clean: Recording, changed: Recording) -> Recording:
         """Subtract the null's residuals on `clean` from `changed`."""
         readings = changed.readings.copy()
         readings[clean.usable] -= self.null(clean).residuals

@@ -45,7 +45,7 @@ def oracle_set_size(hidden: Hidden) -> float:
 
     The log Bayes factors against the rivals are taken as independent; the random draws are fixed.
     """
-    apart = _apart(hidden)
+    apart = _distances_of_rivals(hidden)
     d: FloatArray = np.array(list(apart.values()))
     right = np.array([True, *(name in accepted(hidden) for name in apart)])
     rng = np.random.default_rng(len(d))
@@ -67,10 +67,12 @@ def readings_by_repeating(result: Mapping[str, Any]) -> float:
 
 
 def _against_the_hardest(hidden: Hidden, right: Set[str]) -> float:
-    return min((float(ndtr(d / 2)) for name, d in _apart(hidden).items() if name not in right), default=1.0)
+    return min(
+        (float(ndtr(d / 2)) for name, d in _distances_of_rivals(hidden).items() if name not in right), default=1.0
+    )
 
 
-def _apart(hidden: Hidden) -> dict[str, float]:
+def _distances_of_rivals(hidden: Hidden) -> dict[str, float]:
     """Return the distance of every rival in noise sds; noise effects have no rivals."""
     cosines: Mapping[str, float] = hidden["cosines"]
     size = float(hidden["size_lambda"])

@@ -23,23 +23,31 @@ def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
     last = [r for r in results if "failed" not in r]
     first = [r | r["rounds"][0] for r in last]
     return (
-        *_both(last, first, "right name first, lambda 8", lambda rs: _named(rs, 8.0), least=0.985),
-        *_both(last, first, "right name first, lambda 12", lambda rs: _named(rs, 12.0), least=0.995),
-        *_both(last, first, "size of the credible set, lambda 8", lambda rs: _set_size(rs, 8.0), most=1.15),
-        *_both(last, first, "size of the credible set, lambda 12", lambda rs: _set_size(rs, 12.0), most=1.05),
-        *_both(last, first, "95 % credible set holds the truth", _covered, least=0.95),
-        *_both(last, first, "detection, alpha .01, lambda 8", _detected, least=0.995),
-        *_both(last, first, "two effects: both named", _pairs_named, least=0.96),
-        *_both(last, first, "two effects: a false extra", _pairs_extra, most=0.03),
-        *_both(last, first, "physics named, clean", _physics_on_clean, most=0.005),
-        Row("extra readings, median of those not settled at once", _extra(last), most=80.0),
+        *_rows_before_and_after(
+            last, first, "right name first, lambda 8", lambda rs: _share_named(rs, 8.0), least=0.985
+        ),
+        *_rows_before_and_after(
+            last, first, "right name first, lambda 12", lambda rs: _share_named(rs, 12.0), least=0.995
+        ),
+        *_rows_before_and_after(
+            last, first, "size of the credible set, lambda 8", lambda rs: _set_size(rs, 8.0), most=1.15
+        ),
+        *_rows_before_and_after(
+            last, first, "size of the credible set, lambda 12", lambda rs: _set_size(rs, 12.0), most=1.05
+        ),
+        *_rows_before_and_after(last, first, "95 % credible set holds the truth", _share_covered, least=0.95),
+        *_rows_before_and_after(last, first, "detection, alpha .01, lambda 8", _share_detected, least=0.995),
+        *_rows_before_and_after(last, first, "two effects: both named", _pairs_named, least=0.96),
+        *_rows_before_and_after(last, first, "two effects: a false extra", _pairs_extra, most=0.03),
+        *_rows_before_and_after(last, first, "physics named, clean", _physics_on_clean, most=0.005),
+        Row("extra readings, median of those not settled at once", _median_further_readings(last), most=80.0),
         Row("settled at last", share([r["rounds"][-1]["settled"] for r in last])),
         Row("processor time of an investigation (s)", mean([r["cpu_s"] for r in last])),
         Row("cases that failed", share(["failed" in r for r in results])),
     )
 
 
-def _both(
+def _rows_before_and_after(
     last: list[Result],
     first: list[Result],
     name: str,
@@ -51,7 +59,7 @@ def _both(
     return Row(name, scored(last), least, most), Row(f"  after one round: {name}", scored(first))
 
 
-def _named(results: list[Result], size: float) -> Estimate:
+def _share_named(results: list[Result], size: float) -> Estimate:
     return share([leading_name_right(r) for r in singles_of(results, size)])
 
 
@@ -59,11 +67,11 @@ def _set_size(results: list[Result], size: float) -> Estimate:
     return mean([float(len(r["credible_set"])) for r in singles_of(results, size)])
 
 
-def _covered(results: list[Result]) -> Estimate:
+def _share_covered(results: list[Result]) -> Estimate:
     return share([any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in results])
 
 
-def _detected(results: list[Result]) -> Estimate:
+def _share_detected(results: list[Result]) -> Estimate:
     return alarms([r for r in singles_of(results, 8.0) if on_mean(r)], 0.01)
 
 
@@ -87,7 +95,7 @@ def _physics_on_clean(results: list[Result]) -> Estimate:
     return share([bool(set(r["combination"]) - NOISE - {"unknown"}) for r in clean])
 
 
-def _extra(results: list[Result]) -> Estimate:
+def _median_further_readings(results: list[Result]) -> Estimate:
     """Estimate the median number of readings after the first round, over cases that took any, with its interval."""
     extra = np.array([sum(each["readings"] for each in r["rounds"][1:]) for r in results], dtype=np.float64)
     extra = extra[extra > 0]

@@ -95,7 +95,7 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
         *_intervals(done),
         *_held_out(done),
         *_pairs(done),
-        *_outside(done),
+        *_out_of_vocabulary(done),
         *_aliases(done),
         *_time(done),
         Row("cases that failed", share(["failed" in r for r in results])),
@@ -146,20 +146,20 @@ def _detection(done: list[Result]) -> list[Row]:
 def _naming(done: list[Result]) -> list[Row]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
     found = {size: share([leading_name_right(r) for r in singles_of(done, size)]) for size in targets}
-    falls = [_fall(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
+    falls = [_difference(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
     rows = []
     for size, least in targets.items():
         like = [oracle_name_rate(r["hidden"][0]) for r in singles_of(done, size)]
         rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
-        rows.append(Row(f"  by likeness to the hardest rival, lambda {size:g}", mean(like)))
+        rows.append(Row(f"  oracle against the hardest rival, lambda {size:g}", mean(like)))
     return [
         *rows,
         Row("right name first, largest fall as lambda grows", worst, most=0.0),
     ]
 
 
-def _fall(before: Estimate, after: Estimate) -> Estimate:
+def _difference(before: Estimate, after: Estimate) -> Estimate:
     """Return the difference of two proportions, with Newcombe's interval."""
     fall = before.value - after.value
     down = math.hypot(before.value - before.low, after.high - after.value)
@@ -180,7 +180,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
                 most=most,
             ),
             Row(f"  the truth and its aliases as one, lambda {size:g}", mean([merged_size(r) for r in singles])),
-            Row(f"  by likeness, aliases as one, lambda {size:g}", mean(like)),
+            Row(f"  oracle, aliases as one, lambda {size:g}", mean(like)),
         ]
     return [
         Row("95 % credible set holds the truth", share(covered), 0.95),
@@ -204,7 +204,7 @@ def _places(done: list[Result]) -> list[Row]:
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
         Row("right covariate first, lambda 8", share(first), 0.98),
-        Row("  by likeness to the hardest rival", mean([oracle_covariate_rate(r["hidden"][0]) for r in shown])),
+        Row("  oracle against the hardest rival", mean([oracle_covariate_rate(r["hidden"][0]) for r in shown])),
     ]
 
 
@@ -276,7 +276,7 @@ def _each_shows(result: Result) -> bool:
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
-def _outside(done: list[Result]) -> list[Row]:
+def _out_of_vocabulary(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.9, 20.0: 0.97}
     outside = [r for r in done if is_outside(r)]
     inside = [r for r in done if r["kind"] != "outside"]

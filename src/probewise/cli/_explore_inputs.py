@@ -100,7 +100,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     )
     if chosen.is_apart and geometry is not None and geometry.accuracy is not None:
         experiment = dataclasses.replace(experiment, fitted_arm=posing.FittedArm.of(geometry, sensor))
-    other, other_model = None, _other(arguments.model)
+    other, other_model = None, _other_model(arguments.model)
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)
     return Inputs(
@@ -108,7 +108,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     )
 
 
-def _other(model: Model) -> Model:
+def _other_model(model: Model) -> Model:
     return "naive" if model == "ssf" else "ssf"
 
 

@@ -87,7 +87,7 @@ def bring(
             base, shoulder, elbow = (arm.angles_rad - homes).tolist()
             height_mm = block_mm if answer == "ok" else math.nan
             return Touched((base, shoulder, elbow), (*mark_mm, height_mm))
-        moved = _moved(at, answer)
+        moved = _place_after(at, answer)
         if moved is None:
             tell(f"{answer!r} says nothing that can be done. {_HELP}")
             continue
@@ -100,7 +100,7 @@ def bring(
             at = moved
 
 
-def _moved(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
+def _place_after(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
     """Return the place after the move of an answer; None if it is not a move."""
     words = answer.split() or ["down", str(STEP_MM)]
     x, y, height = at_mm

@@ -106,16 +106,16 @@ def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = 
     folder = out / _FOLDER
     with locked(out / "results", patience_s=_PATIENCE_S):
         try:
-            _settle(out)
+            _finish_interrupted_commit(out)
             folder.mkdir()
             stage = Stage(folder)
             yield stage
             require_going_on()
             with deferred():
-                commit = _commit(out, folder, inputs, outdated)
+                commit = _prepare_commit(out, folder, inputs, outdated)
                 stage.kept = {out / name: out / kept for name, kept in commit.aside.items()}
                 write_text_atomically(folder / _COMMIT, json.dumps(asdict(commit)))
-                _settle(out)
+                _finish_interrupted_commit(out)
         except FileError as error:
             if not Path(error.path).is_relative_to(folder):
                 raise
@@ -135,19 +135,19 @@ class _Commit:
     remove: Sequence[str]
 
 
-def _commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[str]) -> _Commit:
+def _prepare_commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[str]) -> _Commit:
     names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     for name in names:
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
     own = {path.resolve() for path in inputs}
-    aside = _aside(out, [name for name in names if (out / name).resolve() in own])
+    aside = _names_kept(out, [name for name in names if (out / name).resolve() in own])
     old = itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated)
     gone = [path.relative_to(out).as_posix() for path in old if path.resolve() not in own]
     return _Commit(names, aside, [name for name in gone if name not in names])
 
 
-def _settle(out: Path) -> None:
+def _finish_interrupted_commit(out: Path) -> None:
     """Complete the changes of an interrupted commit in `out`; discard incomplete results.
 
     Every step is idempotent, so that it does not matter where the earlier process was killed.
@@ -181,7 +181,7 @@ def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _aside(out: Path, names: Sequence[str]) -> dict[str, str]:
+def _names_kept(out: Path, names: Sequence[str]) -> dict[str, str]:
     """Find for each file the first free NAME_kept, NAME_kept_2 ...; files of one stem get the same ending."""
     aside: dict[str, str] = {}
     for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):

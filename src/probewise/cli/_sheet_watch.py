@@ -68,18 +68,18 @@ class SheetWatch:
             return None
         self._told.add((name, is_white))
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
-        return f"sheet {name!r} contradicts its pattern: at {place} it is {_shade(is_white)}, and {wrong}"
+        return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour(is_white)}, and {wrong}"
 
     def looked(self, name: str, values: dict[bool, float]) -> str | None:
         """Check readings over the white and the black of a sheet, and keep them if they are right."""
         wrong = None
         if len(values) == 2:
             contrast = values[True] - values[False]
-            if self._bright and contrast < self._least(*values.values()):
+            if self._bright and contrast < self._least_difference(*values.values()):
                 wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
         for is_white, value in values.items():
             told = self._against_earlier(is_white, value)
-            wrong = wrong or (None if told is None else f"where it should be {_shade(is_white)} {told}")
+            wrong = wrong or (None if told is None else f"where it should be {_colour(is_white)} {told}")
         if wrong is not None:
             return f"sheet {name!r} contradicts its pattern: {wrong}"
         for is_white, value in values.items():
@@ -117,19 +117,21 @@ class SheetWatch:
         own, other = self._read[is_white], self._read[not is_white]
         if own and other:
             level, opposite = float(np.median(own)), float(np.median(other))
-            if abs(value - level) > max(_OFF * abs(opposite - level), self._least(level, opposite)):
-                return f"reads {value:g}; {_shade(is_white)} read {level:g} so far, {_shade(not is_white)} {opposite:g}"
+            if abs(value - level) > max(_OFF * abs(opposite - level), self._least_difference(level, opposite)):
+                return (
+                    f"reads {value:g}; {_colour(is_white)} read {level:g} so far, {_colour(not is_white)} {opposite:g}"
+                )
         elif len(own) >= _FEWEST:
             level = float(np.median(own))
             if abs(value - level) > _SPREAD_SHARE * (self._range if math.isfinite(self._range) else abs(level)):
-                return f"reads {value:g}; {_shade(is_white)} read {level:g} so far"
+                return f"reads {value:g}; {_colour(is_white)} read {level:g} so far"
         elif other and self._bright:
             opposite = float(np.median(other))
-            if (value - opposite) * (1 if is_white else -1) < self._least(value, opposite):
-                return f"reads {value:g}, where {_shade(not is_white)} read {opposite:g}"
+            if (value - opposite) * (1 if is_white else -1) < self._least_difference(value, opposite):
+                return f"reads {value:g}, where {_colour(not is_white)} read {opposite:g}"
         return None
 
-    def _least(self, *levels: float) -> float:
+    def _least_difference(self, *levels: float) -> float:
         return _SHARE * (self._range if math.isfinite(self._range) else max(abs(level) for level in levels))
 
 
@@ -141,5 +143,5 @@ def shades(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
     return np.where((low == high) & ((low >= 1) | (high <= 0)), np.clip(low, 0.0, 1.0), math.nan)
 
 
-def _shade(is_white: bool) -> str:
+def _colour(is_white: bool) -> str:
     return "white" if is_white else "black"

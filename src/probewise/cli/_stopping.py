@@ -61,7 +61,7 @@ def stoppable() -> Iterator[None]:
     except Stopped:
         raise
     except BaseException as error:
-        if (asked := _asked(error)) is None:
+        if (asked := _stop_request_in(error)) is None:
             raise
         raise asked from error
     finally:
@@ -90,12 +90,12 @@ def saying_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> It
     try:
         yield
     except BaseException as error:
-        if (asked := _asked(error)) is not None:
-            raise Stopped(asked.number, _told(kept)) from error
+        if (asked := _stop_request_in(error)) is not None:
+            raise Stopped(asked.number, _message_of(kept)) from error
         if isinstance(error, LinkError):
-            raise LinkError(f"{error}; {_told(kept)}") from error
+            raise LinkError(f"{error}; {_message_of(kept)}") from error
         if results and isinstance(error, FileError):
-            raise FileError(error.path, error.found, f"{error.allowed}; {_told(kept)}") from error
+            raise FileError(error.path, error.found, f"{error.allowed}; {_message_of(kept)}") from error
         raise
 
 
@@ -108,7 +108,7 @@ def _ask(number: int, frame: FrameType | None) -> None:
     raise Stopped(_request.number)
 
 
-def _asked(error: BaseException) -> Stopped | None:
+def _stop_request_in(error: BaseException) -> Stopped | None:
     """Return the stop request that caused an exception, or None."""
     if isinstance(error, Stopped):
         return error
@@ -117,7 +117,7 @@ def _asked(error: BaseException) -> Stopped | None:
     return Stopped() if isinstance(error, KeyboardInterrupt) else None
 
 
-def _told(kept: Callable[[], str]) -> str:
+def _message_of(kept: Callable[[], str]) -> str:
     try:
         return kept()
     except FileError as error:

@@ -419,7 +419,7 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
             looks.append(look(place, lowest_mm))
             if not arguments.dry_run:
                 found = check_heights(curve, looks)
-                say(_hangs(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
+                say(_hang(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
     if arguments.dry_run:
         return
     say(
@@ -434,12 +434,12 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
         worst = int(np.argmax(np.abs(found.off_mm / found.sd_mm)))
         caution(
             f"the light contradicts the heights (p = {found.p_value:.1g}), most at "
-            f"{_hangs(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the same everywhere? "
+            f"{_hang(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the same everywhere? "
             "Then bring the sensor to marks there and fit the geometry again (probewise arm fit-geometry)"
         )
 
 
-def _hangs(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
+def _hang(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
     side = "higher" if off_mm > 0 else "lower"
     x_mm, y_mm = place_mm
     return f"({x_mm:g}, {y_mm:g}) mm: it hangs {abs(off_mm):.1f} ± {sd_mm:.1f} mm {side} than its counters say"

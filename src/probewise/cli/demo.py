@@ -45,13 +45,13 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise._progress import progress_shown
 
     with progress_shown(quiet=arguments.quiet) as progress:
-        lines = _demonstrated(arguments, progress)
+        lines = _run_demo(arguments, progress)
     for line in lines:
         say(line, quiet=arguments.quiet)
     return 0
 
 
-def _demonstrated(arguments: argparse.Namespace, progress: Progress) -> tuple[str, ...]:
+def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, ...]:
     """Run all steps, and return the lines to print."""
     import json
     import time

@@ -120,7 +120,7 @@ class _Listener:
         stand = self._bench.arm.stand()
         if (stand.height_mm < 0) is not self._is_in_table:
             self._is_in_table = stand.height_mm < 0
-            say(f"{'the sensor went through' if self._is_in_table else 'it came out of'} the table: {_where(stand)}")
+            say(f"{'the sensor went through' if self._is_in_table else 'it came out of'} the table: {_place(stand)}")
         while self._is_heard and select.select([0], [], [], 0)[0] and _is_foreground():
             typed = os.read(0, 4096)
             self._is_heard = bool(typed)
@@ -130,7 +130,7 @@ class _Listener:
 
     def _obey(self, line: str) -> None:
         if line.strip() == "where":
-            say(_where(self._bench.arm.stand()))
+            say(_place(self._bench.arm.stand()))
             return
         try:
             self._bench.table.obey(line)
@@ -139,7 +139,7 @@ class _Listener:
             say(str(error))
 
 
-def _where(stand: Stand) -> str:
+def _place(stand: Stand) -> str:
     """Describe the sensor's position."""
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 

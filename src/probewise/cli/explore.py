@@ -136,7 +136,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--heights", type=_numbers, metavar="MM,...", help="reading heights to choose from, such as 10,14"
     )
     more.add_argument(
-        "--repeats", type=_counts, metavar="N,...", help="numbers of repeated readings to choose from, such as 1,2,4"
+        "--repeats",
+        type=_parse_counts,
+        metavar="N,...",
+        help="numbers of repeated readings to choose from, such as 1,2,4",
     )
     parser.add_argument("--resume", action="store_true", help="resume from the journal in DIR")
     add_common(parser)
@@ -151,12 +154,12 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.cli._explore_arm import open_site
     from probewise.cli._explore_inputs import inputs_of
     from probewise.cli._explore_pictures import Pictures
-    from probewise.experiment import Exploration, beside, explore, read_journal
+    from probewise.experiment import Exploration, explore, read_journal, shadow_run
 
     out = check_out_directory(arguments.out)
     inputs = inputs_of(arguments)
     journal = out / "journal.jsonl"
-    before = _before(journal, resume=arguments.resume)
+    before = _journal_so_far(journal, resume=arguments.resume)
     site = open_site(arguments, inputs, () if before is None else before.readings)
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     if inputs.geometry is not None and inputs.arm.is_apart:
@@ -201,8 +204,8 @@ def run(arguments: argparse.Namespace) -> int:
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
-            under = posing.Field.under(site.arm, inputs.other.grid)
-            pairs = beside(own, inputs.other, under, rng=inputs.streams.shadow)
+            under = posing.ArmOverGrid.under(site.arm, inputs.other.grid)
+            pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.add(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
@@ -253,12 +256,12 @@ def _numbers(text: str) -> tuple[float, ...]:
     return tuple(dict.fromkeys(values))
 
 
-def _counts(text: str) -> tuple[int, ...]:
+def _parse_counts(text: str) -> tuple[int, ...]:
     """Parse "N,M,...", integers above zero, each once, for argparse."""
     return tuple(dict.fromkeys(positive_int(cell) for cell in text.split(",")))
 
 
-def _before(journal: Path, *, resume: bool) -> Journal | None:
+def _journal_so_far(journal: Path, *, resume: bool) -> Journal | None:
     from probewise.experiment import read_journal
 
     if resume and not journal.exists():

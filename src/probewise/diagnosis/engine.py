@@ -136,7 +136,7 @@ def diagnose_prepared(
     noise = noise_found(searched, best, drawn.best, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)
-    grounds = _grounds(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
+    grounds = _facts_for_reason(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
     reason = with_agreement(reason_of(judged, grounds), weighings)
     if prepared.thinned:
         reason += f" (From {len(prepared.recording)} of {len(prepared.everything)} readings, evenly spread.)"
@@ -151,7 +151,7 @@ def diagnose_prepared(
     )
 
 
-def _grounds(
+def _facts_for_reason(
     searched: Searched,
     test: GlobalTest,
     best: Best,

@@ -43,7 +43,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
                 "reading unit", other.plan.instrumentation.unit, f"{first.plan.instrumentation.unit!r}, as the first"
             )
     for (i, one), (j, other) in itertools.combinations(enumerate(recordings), 2):
-        if _same(one, other):
+        if _same_readings(one, other):
             found = f"{_name(one, i)} (number {i + 1}) and {_name(other, j)} (number {j + 1})"
             raise ParameterError("recordings", found, "recordings that differ; these are the same")
     notes = [note for recording in recordings for note in recording.notes]
@@ -79,7 +79,7 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
             renamed.append(names.index(own))
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
-        scan_names += [_unused(s, scan_names) for s in plan.scan_names]
+        scan_names += [_unused_name(s, scan_names) for s in plan.scan_names]
     return Plan(
         x_mm=np.concatenate([p.x_mm for p in plans]),
         y_mm=np.concatenate([p.y_mm for p in plans]),
@@ -131,7 +131,7 @@ def _notes_on_covariates(recordings: Sequence[Recording]) -> list[str]:
     return out
 
 
-def _same(one: Recording, other: Recording) -> bool:
+def _same_readings(one: Recording, other: Recording) -> bool:
     """Return whether two recordings hold the same readings at the same places and times."""
     return (
         len(one) == len(other)
@@ -144,7 +144,7 @@ def _name(recording: Recording, index: int) -> str:
     return recording.source or f"recording {index + 1}"
 
 
-def _unused(name: str, taken: Sequence[str]) -> str:
+def _unused_name(name: str, taken: Sequence[str]) -> str:
     """Return an unused name, by appending a number."""
     numbered = (f"{name} ({k})" for k in itertools.count(2))
     return next(n for n in itertools.chain([name], numbered) if n not in taken)

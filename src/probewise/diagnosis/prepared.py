@@ -74,14 +74,14 @@ class Prepared:
         return LEAST_READINGS if self.null is None else self.null.least_readings
 
     @property
-    def constant(self) -> bool:
+    def has_equal_readings(self) -> bool:
         """Whether all usable readings are equal."""
         return float(np.ptp(self.recording.readings[self.usable])) == 0.0
 
     @property
     def too_little(self) -> bool:
         """Whether the readings are too few for a verdict, or all equal."""
-        return len(self.usable) < self.least_readings or self.constant
+        return len(self.usable) < self.least_readings or self.has_equal_readings
 
     def spread(self, values: FloatArray) -> FloatArray:
         """Expand values of usable readings to all rows, NaN elsewhere: (n_usable,) -> (n_points,)."""

@@ -49,7 +49,9 @@ class AlbedoGradient(LinearEffect[SceneView]):
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Multiply every pattern's albedo by the gradient."""
-        return replace(value, regions={name: GradedRegion(r, theta) for name, r in _under(value, plan).items()})
+        return replace(
+            value, regions={name: GradedRegion(r, theta) for name, r in _regions_under_readings(value, plan).items()}
+        )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say by how many percent the white fades over 100 mm."""
@@ -90,7 +92,9 @@ class AlbedoPatch(NamedEffect[SceneView]):
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Add the patch to every pattern."""
-        return replace(value, regions={name: PatchedRegion(r, theta) for name, r in _under(value, plan).items()})
+        return replace(
+            value, regions={name: PatchedRegion(r, theta) for name, r in _regions_under_readings(value, plan).items()}
+        )
 
     def variants(self) -> tuple[Self, ...]:
         """One variant for each scanned line."""
@@ -124,13 +128,13 @@ class GradedRegion:
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
-        return self.region.albedo(points_mm) * self._factor(points_mm)
+        return self.region.albedo(points_mm) * self._brightness_factor(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Mean albedo over pixels, with the gradient's value at their centres: (n_regions, n_points)."""
-        return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._factor(centers_mm)
+        return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._brightness_factor(centers_mm)
 
-    def _factor(self, points_mm: FloatArray) -> FloatArray:
+    def _brightness_factor(self, points_mm: FloatArray) -> FloatArray:
         return np.asarray(1 + self.per_mm @ points_mm.T)
 
 
@@ -165,13 +169,13 @@ class PatchedRegion:
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
-        return self.region.albedo(points_mm) + self._added(points_mm)
+        return self.region.albedo(points_mm) + self._added_albedo(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Mean albedo over pixels, with the patch's value at their centres: (n_regions, n_points)."""
-        return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added(centers_mm)
+        return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added_albedo(centers_mm)
 
-    def _added(self, points_mm: FloatArray) -> FloatArray:
+    def _added_albedo(self, points_mm: FloatArray) -> FloatArray:
         albedo, x, y, r = (self.patch[:, k : k + 1] for k in range(4))
         return albedo * bell((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
 
@@ -188,7 +192,7 @@ def _(region: PatchedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     return seen_by_one(region.region, gaussian, n_nodes) + added
 
 
-def _under(view: SceneView, plan: Plan) -> Mapping[str, Region]:
+def _regions_under_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
     """Keep the regions that lie under at least one reading."""
     return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
 

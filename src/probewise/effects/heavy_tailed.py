@@ -52,7 +52,7 @@ class HeavyTailed:
             return np.asarray(density)
         return np.where(np.asarray(value) >= 0, density + math.log(2.0), -np.inf)
 
-    def _upper(self, x: FloatArray) -> FloatArray:
+    def _upper_tail(self, x: FloatArray) -> FloatArray:
         """Probability above x of the two-sided mixture."""
         return np.asarray(0.5 * erfc(x[..., None] / (self._sds * math.sqrt(2))).mean(axis=-1))
 
@@ -69,7 +69,7 @@ class HeavyTailed:
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Cumulative distribution function, any shape."""
         value = np.asarray(value, dtype=np.float64)
-        tail = self._upper(np.abs(value))
+        tail = self._upper_tail(np.abs(value))
         if self.positive:
             return np.where(value > 0, 1.0 - 2.0 * tail, 0.0)
         return np.where(value < 0, tail, 1.0 - tail)

@@ -38,7 +38,7 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Shift the patterns."""
-        return _moved(value, theta * np.ones(len(plan)), plan)
+        return _shifted_patterns(value, theta * np.ones(len(plan)), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far off the pattern lies."""
@@ -67,7 +67,7 @@ class ScanMisplacement(OneScanEffect[SceneView]):
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         """Shift the pattern under that scan."""
-        return _moved(value, theta * in_scans(plan, self.scans), plan)
+        return _shifted_patterns(value, theta * in_scans(plan, self.scans), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Say how far off the pattern lies, and in which scan."""
@@ -77,7 +77,7 @@ class ScanMisplacement(OneScanEffect[SceneView]):
         )
 
 
-def _moved(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
+def _shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
     """Shift each reading's pattern by `by_mm`, (n_samples, n_points)."""
     angle = np.zeros(len(plan))
     for name, rows in plan.rows_by_pattern():

@@ -78,7 +78,7 @@ class MissingTooth(NamedEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical jump to 0.5 % of the longest scan; None where no axis takes more than two positions."""
-        places = tuple(_some(axis) for axis in (extent.plan.x_mm, extent.plan.y_mm))
+        places = tuple(_thinned_positions(axis) for axis in (extent.plan.x_mm, extent.plan.y_mm))
         return cls(0.005 * extent.length_mm, (places[0], places[1])) if any(len(own) > 2 for own in places) else None
 
     @cached_property
@@ -113,7 +113,7 @@ class MissingTooth(NamedEffect[Poses]):
         )
 
 
-def _some(axis_mm: FloatArray) -> tuple[float, ...]:
+def _thinned_positions(axis_mm: FloatArray) -> tuple[float, ...]:
     """List distinct positions of one axis, thinned to at most 160."""
     places = np.unique(np.round(axis_mm, 6))
     stride = -(-len(places) // _MOST_PLACES)

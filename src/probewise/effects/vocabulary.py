@@ -151,7 +151,7 @@ def require_effects(effects: object) -> None:
     for name, kind in effects.items():
         if not isinstance(kind, type) or not hasattr(kind, "for_extent"):
             raise ParameterError(f"effects[{name!r}]", kind, "a class that follows probewise.effects.NamedEffect")
-        lacking = [each for each in _OWN if getattr(kind, each, None) in (None, _inherited(kind, each))]
+        lacking = [each for each in _OWN if getattr(kind, each, None) in (None, _protocol_default(kind, each))]
         if lacking:
             raise ParameterError(
                 f"effects[{name!r}]", kind, f"a class of an effect with {', '.join(_OWN)}; {lacking[0]} is missing"
@@ -164,7 +164,7 @@ def require_effects(effects: object) -> None:
 _OWN = ("name", "stage", "units", "covariates", "amplitudes", "for_extent", "prior", "apply", "bank", "sentence")
 
 
-def _inherited(kind: type, name: str) -> object:
+def _protocol_default(kind: type, name: str) -> object:
     """Return a member as the bare protocol has it; a class method is bound to this class."""
     found = getattr(NamedEffect, name, None)
     return getattr(found, "__func__", found).__get__(kind) if name == "for_extent" else found  # type: ignore[union-attr]

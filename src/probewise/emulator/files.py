@@ -86,7 +86,7 @@ class Files:
         return bytes((handle,)) + struct.pack("<I", room)
 
     def _read(self, handle: int, wanted: int) -> bytes:
-        reader = self._held(handle)
+        reader = self._open_file(handle)
         n_read = min(wanted, _LONGEST_READ)
         part = bytes(self._files[reader.name][reader.at : reader.at + n_read])
         reader.at += len(part)
@@ -96,7 +96,7 @@ class Files:
         return payload
 
     def _write(self, handle: int, data: bytes) -> bytes:
-        writer = self._held(handle)
+        writer = self._open_file(handle)
         if writer.size is None:
             raise Refused(Status.ILLEGAL_HANDLE, struct.pack("<BH", handle, 0))
         part = data[: writer.size - writer.at]
@@ -108,7 +108,7 @@ class Files:
         return payload
 
     def _close(self, handle: int) -> bytes:
-        self._held(handle)
+        self._open_file(handle)
         del self._open[handle]
         return bytes((handle,))
 
@@ -137,7 +137,7 @@ class Files:
         return self._tell(handle)
 
     def _tell(self, handle: int) -> bytes:
-        search = self._held(handle)
+        search = self._open_file(handle)
         matches = tuple(name for name in search.matches if name in self._files)
         if not matches:
             raise Refused(Status.FILE_NOT_FOUND, bytes((handle,)) + bytes(24))
@@ -151,7 +151,7 @@ class Files:
                 return handle
         raise Refused(Status.NO_MORE_HANDLES)
 
-    def _held(self, handle: int) -> _Open:
+    def _open_file(self, handle: int) -> _Open:
         if handle >= _N_HANDLES:
             raise Refused(Status.ILLEGAL_HANDLE)
         if handle not in self._open:

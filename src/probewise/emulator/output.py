@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from probewise.emulator.motor import Motor
-from probewise.emulator.protocol import Field
+from probewise.emulator.protocol import FieldValue
 
-__all__ = ["Output", "RunState", "Setting", "bounded", "quotient"]
+__all__ = ["Output", "OutputSetting", "RunState", "bounded", "quotient"]
 
 _ON, _BRAKE, _REGULATED = 0x01, 0x02, 0x04  # bits of the mode byte
 _SPEED, _SYNC = 0x01, 0x02  # bits of the regulation byte
@@ -36,7 +36,7 @@ class RunState(IntEnum):
 
 
 @dataclass(frozen=True)
-class Setting:
+class OutputSetting:
     """The fields of SETOUTPUTSTATE, in byte order; a GETOUTPUTSTATE reply begins with them."""
 
     power: int = 0
@@ -52,7 +52,7 @@ class Output:
     """One output port: its motor and the firmware's state."""
 
     motor: Motor = field(default_factory=Motor)
-    setting: Setting = field(default_factory=Setting)
+    setting: OutputSetting = field(default_factory=OutputSetting)
     run_state: int = RunState.IDLE
     tacho_count: int = 0
     block_count: int = 0
@@ -78,7 +78,7 @@ class Output:
     def __post_init__(self) -> None:
         self._seen_deg = self._shown_deg
 
-    def apply(self, setting: Setting) -> None:
+    def apply(self, setting: OutputSetting) -> None:
         """Apply a command in the firmware's sequence: speed, then regulation, then limit."""
         self.setting, self._settled = setting, False
         self._brake = bool(setting.mode & _BRAKE)
@@ -101,7 +101,7 @@ class Output:
         else:
             self.rotation_count = 0
 
-    def report(self) -> tuple[Field, ...]:
+    def report(self) -> tuple[FieldValue, ...]:
         """Return the fields of a GETOUTPUTSTATE reply after the port's number."""
         s = self.setting
         asked = (s.power, s.mode, s.regulation, s.turn_ratio, self.run_state, s.tacho_limit)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from probewise.emulator.motor import Motor
-from probewise.emulator.output import Output, RunState, Setting, bounded, quotient
+from probewise.emulator.output import Output, OutputSetting, RunState, bounded, quotient
 from probewise.emulator.protocol import Refused, Status
 
 __all__ = ["Outputs"]
@@ -76,7 +76,7 @@ class Outputs:
     def release(self) -> None:
         """Let all motors coast, as the start or end of a program does."""
         for port in self.ports:
-            port.apply(Setting())
+            port.apply(OutputSetting())
 
     def _tick(self, moving: Sequence[Output], battery_mv: float) -> None:
         for port in moving:
@@ -92,7 +92,7 @@ class Outputs:
     def _set_state(
         self, port: int, power: int, mode: int, regulation: int, turn_ratio: int, run_state: int, tacho_limit: int
     ) -> bytes:
-        setting = Setting(power, mode, regulation, turn_ratio, run_state, tacho_limit)
+        setting = OutputSetting(power, mode, regulation, turn_ratio, run_state, tacho_limit)
         for output in self.ports if port == _ALL else (self._port(port),):
             output.apply(setting)
             if output.is_synchronised:

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TypeAlias
 
-__all__ = ["COMMANDS", "Command", "Field", "Frames", "Refused", "Request", "Status", "framed", "parse", "reply"]
+__all__ = ["COMMANDS", "Command", "FieldValue", "Frames", "Refused", "Request", "Status", "framed", "parse", "reply"]
 
-Field: TypeAlias = int | bytes
+FieldValue: TypeAlias = int | bytes
 
 _REPLY, _NO_REPLY = 0x02, 0x80
 _DIRECT, _SYSTEM = 0x00, 0x01
@@ -70,7 +70,7 @@ class Command:
     error_bytes: int = 0
     more: bool = False
 
-    def fields(self, body: bytes) -> tuple[Field, ...]:
+    def fields(self, body: bytes) -> tuple[FieldValue, ...]:
         """Parse the bytes after the opcode.
 
         Raises
@@ -81,7 +81,7 @@ class Command:
         size = struct.calcsize("<" + self.layout)
         if len(body) < size:
             raise Refused(Status.MALFORMED)
-        found: tuple[Field, ...] = struct.unpack("<" + self.layout, body[:size])
+        found: tuple[FieldValue, ...] = struct.unpack("<" + self.layout, body[:size])
         return (*found, body[size:]) if self.more else found
 
 

@@ -97,7 +97,7 @@ class Radio:
 
     def send(self, data: bytes) -> None:
         """Take bytes from the host, in pieces of any size; a fault may cut off the end of a piece."""
-        if len(data) > 1 and self._happens("half", self.faults.half / 2):
+        if len(data) > 1 and self._occurs("half", self.faults.half / 2):
             data = data[: int(self._rng.integers(1, len(data)))]
         for telegram in self._frames.feed(data, self._clock()):
             if self.is_open:
@@ -112,29 +112,29 @@ class Radio:
 
     def _arrived(self, telegram: bytes) -> None:
         self._note(">", telegram)
-        if self._happens("deaf", self.faults.deaf):
+        if self._occurs("deaf", self.faults.deaf):
             return
-        answer = self._refusal(telegram) if self._happens("error", self.faults.error) else self.brick.answer(telegram)
-        if self._happens("disconnect", self.faults.disconnect):
+        answer = self._refusal(telegram) if self._occurs("error", self.faults.error) else self.brick.answer(telegram)
+        if self._occurs("disconnect", self.faults.disconnect):
             self._ended = True
             return
-        if answer is None or self._happens("silence", self.faults.silence):
+        if answer is None or self._occurs("silence", self.faults.silence):
             return
         self._note("<", answer)
         at_s = self._clock() + self._turnaround_s
-        if self._happens("unasked", self.faults.unasked):
+        if self._occurs("unasked", self.faults.unasked):
             self._deliver(at_s, framed(_UNASKED))
-        if self._happens("late", self.faults.late):
+        if self._occurs("late", self.faults.late):
             at_s += self.faults.late_s
-        frame = self._harmed(framed(answer))
-        if self._happens("merge", self.faults.merge):
+        frame = self._with_faults(framed(answer))
+        if self._occurs("merge", self.faults.merge):
             self._held += frame
             return
         frame, self._held = self._held + frame, b""
         for piece in self._pieces(frame):
             self._deliver(at_s, piece)
             at_s += self._rng.uniform(0.0, _PIECE_S)
-        if self._happens("double", self.faults.double):
+        if self._occurs("double", self.faults.double):
             self._deliver(at_s + self._rng.uniform(0.0, _DOUBLED_S), frame)
 
     def _refusal(self, telegram: bytes) -> bytes | None:
@@ -145,17 +145,17 @@ class Radio:
         zeros = 0 if request.command is None else request.command.error_bytes
         return reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
 
-    def _harmed(self, frame: bytes) -> bytes:
+    def _with_faults(self, frame: bytes) -> bytes:
         """Apply faults to a frame on its way to the host."""
-        if self._happens("corrupt", self.faults.corrupt):
+        if self._occurs("corrupt", self.faults.corrupt):
             at, change = int(self._rng.integers(len(frame))), int(self._rng.integers(1, 256))
             frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
-        if self._happens("half", self.faults.half / 2):
+        if self._occurs("half", self.faults.half / 2):
             frame = frame[: int(self._rng.integers(1, len(frame)))]
-        return bytes(byte for byte in frame if not self._happens("drop", self.faults.drop))
+        return bytes(byte for byte in frame if not self._occurs("drop", self.faults.drop))
 
     def _pieces(self, frame: bytes) -> list[bytes]:
-        if len(frame) < 2 or not self._happens("fragment", self.faults.fragment):
+        if len(frame) < 2 or not self._occurs("fragment", self.faults.fragment):
             return [frame]
         n_cuts = int(self._rng.integers(1, min(len(frame), 4)))
         cuts = [0, *sorted(self._rng.choice(np.arange(1, len(frame)), n_cuts, replace=False).tolist()), len(frame)]
@@ -166,7 +166,7 @@ class Radio:
         self._last_s = max(at_s, self._last_s)
         self._coming.append((self._last_s, data))
 
-    def _happens(self, name: str, rate: float) -> bool:
+    def _occurs(self, name: str, rate: float) -> bool:
         happens = rate > 0 and self._rng.random() < rate
         if happens:
             self.mishaps[name] += 1

@@ -1,23 +1,21 @@
 """The autonomous experiment: measure, infer, inquire, with a journal of measurements (paper, sections 2.2, 2.3)."""
 
+from probewise.experiment.acquisition import ArmOverGrid
 from probewise.experiment.arm_error import with_arm_error
-from probewise.experiment.asking import Field
-from probewise.experiment.beside import beside
+from probewise.experiment.configuration import Experiment, OneScan
 from probewise.experiment.digest import value_digest
 from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.found import OFF_MM, FoundParameter, FoundShape, found_shape, result_json, samples_csv
 from probewise.experiment.hidden import Hidden, Truth, members_of
 from probewise.experiment.journal import (
-    Belief,
     Entry,
     Journal,
     JournalWriter,
+    PosteriorSummary,
     read_journal,
     recording_of,
     require_same_settings,
 )
-from probewise.experiment.judging import chance_off
-from probewise.experiment.learning import AdjustedMixture, Change, sensor_prior
 from probewise.experiment.left_out import CLEAN, LeftOut, left_out_of, repaired
 from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
@@ -30,7 +28,8 @@ from probewise.experiment.paper import (
     student_t_bounds,
 )
 from probewise.experiment.posed import MethodName, pose_experiment
-from probewise.experiment.setting import Experiment, OneScan
+from probewise.experiment.sensor_update import AdjustedMixture, Change, sensor_prior
+from probewise.experiment.shadow import shadow_run
 from probewise.experiment.simulation import (
     TRUST,
     Model,
@@ -47,7 +46,8 @@ from probewise.experiment.simulation import (
     world_like,
 )
 from probewise.experiment.start import run_from
-from probewise.experiment.values import PAPER_BITS, ArmError, Exploration, State, Step
+from probewise.experiment.state import PAPER_BITS, ArmError, Exploration, ExplorationState, Step
+from probewise.experiment.stopping_rule import chance_off
 
 __all__ = [
     "CLEAN",
@@ -56,12 +56,12 @@ __all__ = [
     "TRUST",
     "AdjustedMixture",
     "ArmError",
-    "Belief",
+    "ArmOverGrid",
     "Change",
     "Entry",
     "Experiment",
     "Exploration",
-    "Field",
+    "ExplorationState",
     "FittedArm",
     "FoundParameter",
     "FoundShape",
@@ -74,14 +74,13 @@ __all__ = [
     "Model",
     "NestedSampling",
     "OneScan",
+    "PosteriorSummary",
     "SequentialMonteCarlo",
-    "State",
     "Step",
     "Streams",
     "Truth",
     "arm_over",
     "begin",
-    "beside",
     "chance_off",
     "experiment_for",
     "explore",
@@ -104,6 +103,7 @@ __all__ = [
     "scale_of",
     "sensor_named",
     "sensor_prior",
+    "shadow_run",
     "shape_named",
     "shape_of",
     "step",
@@ -115,3 +115,15 @@ __all__ = [
     "with_cards",
     "world_like",
 ]
+
+Field = ArmOverGrid
+"""The old name of `ArmOverGrid`."""
+
+State = ExplorationState
+"""The old name of `ExplorationState`."""
+
+beside = shadow_run
+"""The old name of `shadow_run`."""
+
+Belief = PosteriorSummary
+"""The old name of `PosteriorSummary`."""

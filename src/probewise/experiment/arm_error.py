@@ -22,11 +22,11 @@ from probewise.arm.geometry import Accuracy, Geometry
 from probewise.arm.instrument import Reading
 from probewise.arm.uncertainty import FITTED, slopes_mm
 from probewise.errors import ParameterError
+from probewise.experiment.configuration import Experiment
 from probewise.experiment.fitted_arm import FittedArm
-from probewise.experiment.kinds import Kind
+from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.setting import Experiment
-from probewise.experiment.values import ArmError, Exploration
+from probewise.experiment.state import ArmError, Exploration
 from probewise.inference.problem import scores
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
@@ -120,7 +120,7 @@ def arm_error(
     width_mm, height_mm = geometry.field_mm
     middle = (width_mm / 2, height_mm / 2) if arm.calibrated_mm is None else arm.calibrated_mm
     places = np.stack([recording.plan.x_mm, recording.plan.y_mm], axis=-1)
-    off = _off(geometry, np.concatenate([places, [middle]]), accuracy)
+    off = _effect_of_errors(geometry, np.concatenate([places, [middle]]), accuracy)
     off[:, 2] -= off[-1, 2]
     off = off[:-1]
     dark, white = arm.levels
@@ -144,9 +144,9 @@ def moved_by_arm(
     return np.asarray(moved)
 
 
-def _off(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
+def _effect_of_errors(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
     """Tell what independent errors of one sd do to x, y, height and orientation at places: (n_points, 4, n_errors)."""
-    root = _root(np.array(accuracy.covariance))
+    root = _matrix_root(np.array(accuracy.covariance))
     place = slopes_mm(geometry, places_mm) @ root
     if not np.isfinite(place).all():
         raise ParameterError("readings", "a place out of the arm's reach", "readings of this arm")
@@ -154,7 +154,7 @@ def _off(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> Float
     return np.concatenate([place, turned], axis=1)
 
 
-def _root(covariance: FloatArray) -> FloatArray:
+def _matrix_root(covariance: FloatArray) -> FloatArray:
     """Write a covariance as a product of a matrix (n, n_errors) with its transpose."""
     scale = np.sqrt(np.diagonal(covariance))
     scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
@@ -204,7 +204,9 @@ def _centred(columns: FloatArray, weight: FloatArray) -> FloatArray:
     return columns - weight @ columns
 
 
-def _by_shape(kind: Kind, theta: FloatArray, recording: Recording, columns: IntArray, steps: FloatArray) -> FloatArray:
+def _by_shape(
+    kind: HypothesisKind, theta: FloatArray, recording: Recording, columns: IntArray, steps: FloatArray
+) -> FloatArray:
     """Give the slope of each hypothesis's log likelihood by each parameter of the shape, (n_samples, n_columns)."""
     problem, slopes = kind.problem(recording), []
     for column, step in zip(columns.tolist(), steps.tolist(), strict=True):
@@ -215,7 +217,9 @@ def _by_shape(kind: Kind, theta: FloatArray, recording: Recording, columns: IntA
     return np.stack(slopes, axis=-1)
 
 
-def _by_error(kind: Kind, theta: FloatArray, recording: Recording, off: FloatArray, dark: float) -> FloatArray:
+def _by_error(
+    kind: HypothesisKind, theta: FloatArray, recording: Recording, off: FloatArray, dark: float
+) -> FloatArray:
     """Give the slope of each hypothesis's log likelihood by each independent error, (n_samples, n_errors)."""
     plan, usable = recording.plan, recording.usable
     predicted = kind.model.predict(theta, plan)

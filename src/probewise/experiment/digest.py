@@ -27,16 +27,16 @@ def value_digest(value: object) -> str:
         If it holds anything else, such as a function, which has no reproducible digest.
     """
     digest = hashlib.sha256()
-    _feed(digest, value)
+    _add_to_digest(digest, value)
     return digest.hexdigest()
 
 
-def _feed(digest: Any, value: object) -> None:
+def _add_to_digest(digest: Any, value: object) -> None:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         digest.update(f"<{type(value).__qualname__}>".encode())
         for item in dataclasses.fields(value):
             digest.update(item.name.encode())
-            _feed(digest, getattr(value, item.name))
+            _add_to_digest(digest, getattr(value, item.name))
     elif isinstance(value, np.ndarray):
         digest.update(f"[{value.dtype.str}{value.shape}]".encode())
         digest.update(np.ascontiguousarray(value).tobytes())
@@ -48,12 +48,12 @@ def _feed(digest: Any, value: object) -> None:
     elif isinstance(value, Mapping):
         digest.update(f"{{{len(value)}".encode())
         for key in sorted(value, key=str):
-            _feed(digest, key)
-            _feed(digest, value[key])
+            _add_to_digest(digest, key)
+            _add_to_digest(digest, value[key])
     elif isinstance(value, Sequence):
         digest.update(f"({len(value)}".encode())
         for item in value:
-            _feed(digest, item)
+            _add_to_digest(digest, item)
     else:
         raise ParameterError(
             "fingerprint of", value, "frozen dataclasses of arrays, numbers and texts, so that a journal can name them"

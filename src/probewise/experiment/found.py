@@ -9,9 +9,9 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from probewise.experiment.judging import chance_off
 from probewise.experiment.left_out import left_out_of
-from probewise.experiment.values import Exploration, require_exploration
+from probewise.experiment.state import Exploration, require_exploration
+from probewise.experiment.stopping_rule import chance_off
 from probewise.nested.weights import weighted_quantiles
 from probewise.scene.albedo import Shape
 from probewise.scene.shapes import AnyOf, RegularPolygon

@@ -6,7 +6,7 @@ options. Every further line is a measurement: index, pose, time, reading and cov
 
 A line reaches the disk in two parts. The reading is written and synchronised as soon as it is taken; the posterior
 summary ("belief") follows after inference. So a process that is killed at any time loses no reading: a last line
-without its belief is read as a reading alone, and one truncated earlier is dropped with a note.
+without its summary is read as a reading alone, and one truncated earlier is dropped with a note.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ from probewise.recordings.text import read_bytes
 
 __all__ = [
     "FORMAT",
-    "Belief",
     "Entry",
     "Journal",
     "JournalWriter",
+    "PosteriorSummary",
     "read_journal",
     "recording_of",
     "require_same_settings",
@@ -49,13 +49,13 @@ __all__ = [
 
 FORMAT = "journal/1"
 PATTERN = "field"
-BELIEF = ', "belief": '
+SUMMARY_KEY = ', "belief": '
 # Settings in which a resumed run may differ: files may have moved, and an arm may have another name.
 _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
 
 
 @dataclass(frozen=True)
-class Belief:
+class PosteriorSummary:
     """Posterior summary after a measurement: mean and sd by parameter, bits gained, the next pose."""
 
     mean: Mapping[str, float]
@@ -66,11 +66,11 @@ class Belief:
 
 @dataclass(frozen=True)
 class Entry:
-    """One measurement of a journal; `belief` is None if the run was killed before inference."""
+    """One measurement of a journal; `summary` is None if the run was killed before inference."""
 
     index: int
     reading: Reading
-    belief: Belief | None
+    summary: PosteriorSummary | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,8 +193,8 @@ def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
 
 
 def _first_part(tail: bytes) -> bytes:
-    """Return the part of an incomplete line up to its reading, without the belief."""
-    mark = BELIEF.encode()
+    """Return the part of an incomplete line up to its reading, without the summary."""
+    mark = SUMMARY_KEY.encode()
     head = tail.split(mark)[0]
     torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
     return head[: len(head) - torn]
@@ -223,17 +223,17 @@ def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
         column = "covariates"
         covariates = {str(name): _or_nan(number) for name, number in line["covariates"].items()}
         column = "belief"
-        belief = _belief(line["belief"]) if "belief" in line else None
+        summary = _summary(line["belief"]) if "belief" in line else None
     except KeyError as error:
         raise FileError(path, f"{error} is missing", "a line as explore writes it", row=row, column=column) from error
     except (TypeError, ValueError, AttributeError) as error:
         raise FileError(path, f"unusable: {error}", "a line as explore writes it", row=row, column=column) from error
-    return Entry(index, Reading(value, pose, time_s, covariates), belief)
+    return Entry(index, Reading(value, pose, time_s, covariates), summary)
 
 
-def _belief(line: Mapping[str, Any]) -> Belief:
+def _summary(line: Mapping[str, Any]) -> PosteriorSummary:
     mean, sd = ({name: _number(value) for name, value in line[key].items()} for key in ("mean", "sd"))
-    return Belief(mean, sd, _number(line["bits"]), _pose(line["next"]))
+    return PosteriorSummary(mean, sd, _number(line["bits"]), _pose(line["next"]))
 
 
 def _or_null(value: float) -> float | None:
@@ -328,7 +328,7 @@ class JournalWriter:
     def resume(cls, journal: Journal) -> JournalWriter:
         """Continue after the last whole line of a journal, or the reading of a truncated one, and remove the rest.
 
-        A reading in an incomplete last line is kept, and its belief is appended.
+        A reading in an incomplete last line is kept, and its summary is appended.
 
         Raises
         ------
@@ -360,15 +360,15 @@ class JournalWriter:
         }
         self._write(json.dumps(line, allow_nan=False)[:-1])
 
-    def belief(self, belief: Belief) -> None:
-        """Write the belief after that reading, the rest of its line."""
+    def summary(self, summary: PosteriorSummary) -> None:
+        """Write the summary after that reading, the rest of its line."""
         line = {
-            "mean": dict(belief.mean),
-            "sd": dict(belief.sd),
-            "bits": belief.bits,
-            "next": _pose_line(belief.next_pose),
+            "mean": dict(summary.mean),
+            "sd": dict(summary.sd),
+            "bits": summary.bits,
+            "next": _pose_line(summary.next_pose),
         }
-        self._write(BELIEF + json.dumps(line, allow_nan=False) + "}\n")
+        self._write(SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n")
 
     def close(self) -> None:
         """Close the file and let other processes write to it."""

@@ -15,7 +15,7 @@ from probewise.errors import ParameterError
 from probewise.experiment.pace import Told
 from probewise.experiment.rivals import Rival
 from probewise.inference.problem import Likelihood, SensorProblem
-from probewise.inquiry import TabledChain
+from probewise.inquiry import TabulatedChain
 from probewise.priors import Joint, Prior
 from probewise.recordings.plan import Plan, Recording
 from probewise.scene.albedo import Shape
@@ -23,11 +23,11 @@ from probewise.scene.shapes import AnyOf
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["Kind", "kinds_of"]
+__all__ = ["HypothesisKind", "kinds_of"]
 
 
 @dataclass(frozen=True, eq=False)
-class Kind:
+class HypothesisKind:
     """A model with its own parameters and evidence, whose hypotheses are parameter values.
 
     Attributes
@@ -73,7 +73,7 @@ def kinds_of(
     *,
     trust: float = 1.0,
     rivals: Sequence[Rival] = (),
-) -> tuple[Kind, ...]:
+) -> tuple[HypothesisKind, ...]:
     """Return the kinds of an experiment.
 
     Parameters
@@ -97,26 +97,30 @@ def kinds_of(
     for part in _parts(shape, sensor_prior, prior):
         own, log_prior = part.prior, math.log(part.share)
         plain = log_prior + math.log(trust)
-        whole, model = _inferred(own, chain, quick) if trust < 1 else (own, quick)
-        kinds.append(Kind(part.label, "", plain, whole, part.model(model), likelihood, part.placed, prior.names))
+        whole, model = _with_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
+        kinds.append(
+            HypothesisKind(part.label, "", plain, whole, part.model(model), likelihood, part.placed, prior.names)
+        )
         for rival in rivals:
             log_p = log_prior + math.log((1.0 - trust) / (len(ways) * ways[rival.name]))
             if rival.effect is None:
                 model, law = part.model(quick), rival.likelihood or likelihood
-                kinds.append(Kind(part.label, rival.name, log_p, own, model, law, part.placed, prior.names))
+                kinds.append(HypothesisKind(part.label, rival.name, log_p, own, model, law, part.placed, prior.names))
                 continue
             if not isinstance(chain, Chain):
                 raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
             both = Joint((own, _Called(rival.name, rival.effect.prior)))
             acting = chain.with_effects(rival.effect)
-            model = part.model(TabledChain.of(acting, quick) or acting)
+            model = part.model(TabulatedChain.of(acting, quick) or acting)
             kinds.append(
-                Kind(part.label, rival.name, log_p, both, model, likelihood, part.placed, prior.names, rival.effect)
+                HypothesisKind(
+                    part.label, rival.name, log_p, both, model, likelihood, part.placed, prior.names, rival.effect
+                )
             )
     return tuple(kinds)
 
 
-def _inferred(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior, SensorModel]:
+def _with_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior, SensorModel]:
     """Return prior and model with the estimated effects of a repaired sensor among the parameters."""
     estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
     if not estimated or not isinstance(chain, Chain):
@@ -125,7 +129,7 @@ def _inferred(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior
     known = tuple(effect for effect in chain.effects if not isinstance(effect, Estimated))
     acting = replace(chain, effects=(*known, *informed))
     both = Joint((own, *(_Called(effect.name, effect.prior) for effect in informed)))
-    return both, TabledChain.of(acting, quick) or acting
+    return both, TabulatedChain.of(acting, quick) or acting
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +148,7 @@ class _Part:
     n_sensor: int
 
     def placed(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """See `Kind.placed`."""
+        """See `HypothesisKind.placed`."""
         if self.number is None:
             return theta[:, : len(self.columns)]
         u = rng.random((len(theta), len(self.whole.names)))

@@ -12,7 +12,7 @@ from probewise.calibration import FittedSensor
 from probewise.effects import AmbientStep, GainDrift, OffsetDrift, spoken_name
 from probewise.experiment.pace import clocked
 from probewise.experiment.rivals import WITH_CARDS
-from probewise.experiment.values import Step
+from probewise.experiment.state import Step
 
 __all__ = ["CLEAN", "LeftOut", "left_out_of", "repaired"]
 

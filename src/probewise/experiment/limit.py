@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
+from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
-from probewise.experiment.setting import Experiment
 from probewise.inquiry import Bound, capacity_bits, fewest_readings, prior_entropy, target_entropy
 
 __all__ = ["least_readings"]
@@ -33,11 +33,11 @@ def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_sample
     theta = prior.from_unit_cube(rng.random((n_samples, len(prior.names))))
     weight = np.full(n_samples, 1.0 / n_samples)
     designs = experiment.designs
-    outlook = experiment.forecast.outlook(
+    predictive = experiment.forecast.predictive(
         theta, weight, designs, designs.plan(PATTERN), np.arange(experiment.grid.n_places), experiment.noise_sd
     )
-    _, mass = next(outlook.maps(weight))
-    levels = outlook.levels
+    _, mass = next(predictive.maps(weight))
+    levels = predictive.levels
     beside = levels[int(mass.sum(axis=0).argmax())]
     covered = float(mass[:, np.abs(levels - beside) > _MET * experiment.noise_sd].sum(axis=1).max())
     prior_bits = prior_entropy(prior, rng=rng)

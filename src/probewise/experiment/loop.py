@@ -20,29 +20,38 @@ from probewise._kinds import require_callable, require_kind, require_path, requi
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
+from probewise.experiment.acquisition import ArmOverGrid, inquire, next_poses
 from probewise.experiment.arm_error import arm_error, moved_by_arm
-from probewise.experiment.asking import Field, inquire, next_poses
+from probewise.experiment.configuration import Experiment, widest_mm
 from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import (
-    Belief,
     Journal,
     JournalWriter,
+    PosteriorSummary,
     read_journal,
     require_same_settings,
 )
-from probewise.experiment.judging import OFF_SDS, chance_off, doubt, fit, information, learnt, moments, stop_reason
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import prior_posterior, reconsidered
-from probewise.experiment.setting import Experiment, widest_mm
 from probewise.experiment.settling import settling
-from probewise.experiment.values import ArmError, Exploration, State, Step
+from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
+from probewise.experiment.stopping_rule import (
+    OFF_SDS,
+    chance_off,
+    doubt,
+    fit,
+    information,
+    learnt,
+    moments,
+    stop_reason,
+)
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
 __all__ = ["begin", "explore", "run", "step"]
 
 
-def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> State:
+def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generator) -> ExplorationState:
     """Choose the first place, by the map of hypotheses drawn from the prior.
 
     Parameters
@@ -64,28 +73,28 @@ def begin(experiment: Experiment, field: Field, *, rng: np.random.Generator) -> 
     posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
     joined = posterior.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
-    prospect, outlook = inquire(experiment, joined, drawn, field, at=None)
-    if outlook.flat:
+    prospect, utilities = inquire(experiment, joined, drawn, field, at=None)
+    if utilities.flat:
         raise ParameterError(
             "utility",
-            f"{outlook.highest:g} everywhere",
+            f"{utilities.highest:g} everywhere",
             "one that differs between places: as it is, no reading within reach is expected to tell anything; "
             "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
         )
-    pose, *planned = next_poses(experiment, prospect, outlook, rng=rng)
-    return State((), posterior, pose, tuple(planned))
+    pose, *planned = next_poses(experiment, prospect, utilities, rng=rng)
+    return ExplorationState((), posterior, pose, tuple(planned))
 
 
 def step(
-    state: State,
+    state: ExplorationState,
     reading: Reading,
     experiment: Experiment,
-    field: Field,
+    field: ArmOverGrid,
     *,
     prior_bits: float,
     rng: np.random.Generator,
     max_readings: int | None = None,
-) -> tuple[State, Step]:
+) -> tuple[ExplorationState, Step]:
     """Update the posterior with one reading, and choose the next.
 
     Parameters
@@ -141,18 +150,18 @@ def step(
         return arm_error(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
 
     arm = arms() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
-    prospect, outlook = inquire(experiment, posterior, drawn, field, at=reading, goal=_left(experiment, arm))
+    prospect, utilities = inquire(experiment, posterior, drawn, field, at=reading, goal=_remaining_sd(experiment, arm))
     asks = False
     if experiment.trust < 1:
         known, _ = _is_known(experiment, posterior, arm, likely, rng)
-        outlook, asks = settling(experiment, wary, prospect, outlook, readings, rng=rng, known=known)
+        utilities, asks = settling(experiment, wary, prospect, utilities, readings, rng=rng, known=known)
         asks = asks and (max_readings is None or len(readings) < max_readings)
-    if arm is None and (outlook.flat or (max_readings is not None and len(readings) >= max_readings)):
+    if arm is None and (utilities.flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = arms()
     known, off = _is_known(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
-    reason = stop_reason(experiment, sd, known and not asks, p_value, outlook, len(readings), max_readings, arm_sd)
-    pose, *planned = state.planned or next_poses(experiment, prospect, outlook, rng=rng)
+    reason = stop_reason(experiment, sd, known and not asks, p_value, utilities, len(readings), max_readings, arm_sd)
+    pose, *planned = state.planned or next_poses(experiment, prospect, utilities, rng=rng)
     info = Step(
         number=len(readings),
         reading=reading,
@@ -161,7 +170,7 @@ def step(
         sd=sd,
         shapes=shapes,
         samples=prospect.drawn[:, experiment.shape_columns],
-        map=outlook,
+        map=utilities,
         next_pose=None if reason else pose,
         bits=bits_gained(information(posterior), problem.prior.log_prob(posterior.theta), posterior.weight, prior_bits),
         p_value=p_value,
@@ -175,10 +184,10 @@ def step(
         pace=Pace.of(readings),
         arm=arm,
     )
-    return State(readings, carried, pose, tuple(planned)), info
+    return ExplorationState(readings, carried, pose, tuple(planned)), info
 
 
-def _left(experiment: Experiment, arm: ArmError | None) -> Goal | None:
+def _remaining_sd(experiment: Experiment, arm: ArmError | None) -> Goal | None:
     """Return the sd that the readings have to reach, beside the arm's own error; None: the experiment's own."""
     goal = experiment.goal
     if arm is None or goal is None:
@@ -252,7 +261,7 @@ def explore(
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
     require_rng(rng)
     require_whole("max_readings", max_readings)
-    seed = _child(rng)
+    seed = _run_seed(rng)
     path = None if journal is None else require_path("journal", getattr(journal, "path", journal))
     before = journal if isinstance(journal, Journal) else None
     if before is None and path is not None and path.exists():
@@ -308,7 +317,7 @@ def _steps(
     settings: Mapping[str, Any],
 ) -> Generator[Step, None, None]:
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
-    field = Field.under(instrument, experiment.grid)
+    field = ArmOverGrid.under(instrument, experiment.grid)
     first = _rng_of(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
     state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
@@ -330,13 +339,13 @@ def _steps(
                 rng=_rng_of(seed, number),
                 max_readings=max_readings,
             )
-            if writer is not None and (entry is None or entry.belief is None):
-                writer.belief(_belief(info, state))
+            if writer is not None and (entry is None or entry.summary is None):
+                writer.summary(_summary(info, state))
             if entry is not None:
                 info = dataclasses.replace(info, replayed=True)
                 # The journal's pose is used, even if another machine's arithmetic would choose another.
-                if entry.belief is not None:
-                    state = dataclasses.replace(state, next_pose=entry.belief.next_pose)
+                if entry.summary is not None:
+                    state = dataclasses.replace(state, next_pose=entry.summary.next_pose)
             if number == 1 and notes:
                 info = dataclasses.replace(info, notes=(*info.notes, *notes))
             stopped = info.stop_reason is not None
@@ -359,7 +368,7 @@ def _writer(
     return contextlib.nullcontext() if path is None else JournalWriter.begin(path, settings)
 
 
-def _child(rng: np.random.Generator) -> np.random.SeedSequence:
+def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
     """Derive a run's seed: runs that share a generator differ, independent of other draws from it."""
     seed = rng.bit_generator.seed_seq
     if not isinstance(seed, np.random.SeedSequence):
@@ -372,7 +381,7 @@ def _rng_of(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
 
 
-def _belief(info: Step, state: State) -> Belief:
+def _summary(info: Step, state: ExplorationState) -> PosteriorSummary:
     known = [(n, float(m), float(s)) for n, m, s in zip(info.names, info.mean, info.sd, strict=True) if np.isfinite(m)]
     known += [(name, mean, sd) for name, (mean, sd) in info.sensor.items()]
-    return Belief({n: m for n, m, _ in known}, {n: s for n, _, s in known}, info.bits, state.next_pose)
+    return PosteriorSummary({n: m for n, m, _ in known}, {n: s for n, _, s in known}, info.bits, state.next_pose)

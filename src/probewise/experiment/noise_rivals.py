@@ -55,7 +55,7 @@ class Tailed:
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """See `Likelihood.log_prob`."""
-        narrow = _each(readings, predicted, self.sd, self.step)
+        narrow = _log_density_of_each(readings, predicted, self.sd, self.step)
         nodes = []
         for share, size in zip(self.shares, self.sizes, strict=True):
             wide = _about(readings, predicted, self.sd * size, self.step)
@@ -78,9 +78,9 @@ class Lost:
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """See `Likelihood.log_prob`."""
-        kept = _each(readings, predicted, self.sd, self.step)
-        to_black = _each(readings, np.array([[self.black]]), self.sd, self.step)
-        exactly = _each(readings, np.array([[self.black]]), self.sd * _EXACT, self.step)
+        kept = _log_density_of_each(readings, predicted, self.sd, self.step)
+        to_black = _log_density_of_each(readings, np.array([[self.black]]), self.sd, self.step)
+        exactly = _log_density_of_each(readings, np.array([[self.black]]), self.sd * _EXACT, self.step)
         low, high = min(self.low - _REACH * self.sd, 0.0), self.high + _REACH * self.sd
         within = (readings >= low) & (readings <= high)
         anywhere = np.where(within, math.log((self.step or 1.0) / (high - low)), -np.inf)
@@ -103,11 +103,11 @@ class Correlated:
         u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
         before = np.zeros_like(predicted)
         before[:, 1:] = (readings - predicted)[:, :-1]
-        first = _each(readings[:1], predicted[:, :1], self.sd, self.step)[:, 0]
+        first = _log_density_of_each(readings[:1], predicted[:, :1], self.sd, self.step)[:, 0]
         nodes = []
         for rho in CorrelatedNoise().prior.from_unit_cube(u)[:, 0].tolist():
             sd = self.sd * math.sqrt(1.0 - rho**2)
-            later = _each(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
+            later = _log_density_of_each(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
             nodes.append(first + later.sum(axis=1))
         return _mean_over(nodes)
 
@@ -128,7 +128,7 @@ class WithSignal:
         seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
         return _mean_over(
             [
-                _each(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(axis=1)
+                _log_density_of_each(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(axis=1)
                 for ratio in SignalDependentNoise().prior.from_unit_cube(u)[:, 0].tolist()
             ]
         )
@@ -167,10 +167,10 @@ class OnLattice:
         """See `Likelihood.log_prob`."""
         coarse = lattice_step(readings)
         if coarse <= max(_COARSE * self.sd, 1.5 * self.step):
-            return np.asarray(_each(readings, predicted, self.sd, self.step).sum(axis=1))
+            return np.asarray(_log_density_of_each(readings, predicted, self.sd, self.step).sum(axis=1))
         fine = self.step or _PRINTED * self.sd
         surprise = (len(readings) - _FREE) * math.log(coarse / fine)
-        density = _each(readings, predicted, self.sd, coarse) - math.log(coarse)
+        density = _log_density_of_each(readings, predicted, self.sd, coarse) - math.log(coarse)
         return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(self.step) if self.step else 0.0))
 
 
@@ -201,7 +201,9 @@ def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, L
     }
 
 
-def _each(readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, step: float) -> FloatArray:
+def _log_density_of_each(
+    readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, step: float
+) -> FloatArray:
     """Return the log density of each reading, or log probability of its cell, (n_samples, n_points)."""
     if not step:
         return log_gaussian_density(readings, predicted, np.asarray(sd))
@@ -212,6 +214,6 @@ def _each(readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, s
 def _about(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
     """Return the same for noise wider than the cell, by the density at the cell's middle with its variance added."""
     if sd < step:
-        return _each(readings, predicted, sd, step)
+        return _log_density_of_each(readings, predicted, sd, step)
     wide = math.hypot(sd, step / math.sqrt(12.0))
     return log_gaussian_density(readings, predicted, np.asarray(wide)) + (math.log(step) if step else 0.0)

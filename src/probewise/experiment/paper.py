@@ -19,10 +19,10 @@ from probewise.arm import LegoScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.experiment.kinds import Kind
+from probewise.experiment.configuration import Experiment, OneScan
+from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import Particles
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.setting import Experiment, OneScan
 from probewise.experiment.simulation import Model, bin_width_of, chain_of, levels_of, posing, scale_of
 from probewise.inference import Naive
 from probewise.inquiry import ReadingEntropy
@@ -93,7 +93,8 @@ class NestedSampling:
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.updated`; every kind of hypotheses has its own run."""
         found = tuple(
-            self._anew(had, kind, recording, rng) for kind, had in zip(previous.kinds, previous.particles, strict=True)
+            self._sampled_anew(had, kind, recording, rng)
+            for kind, had in zip(previous.kinds, previous.particles, strict=True)
         )
         now = replace(previous, particles=found)
         if not np.isfinite(now.log_odds).any():
@@ -113,7 +114,9 @@ class NestedSampling:
                 drawn.append(kind.placed(moved, rng))
         return np.concatenate(drawn)
 
-    def _anew(self, had: Particles, kind: Kind, recording: Recording, rng: np.random.Generator) -> Particles:
+    def _sampled_anew(
+        self, had: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
+    ) -> Particles:
         try:
             result = run(
                 kind.problem(recording),

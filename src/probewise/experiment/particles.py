@@ -157,7 +157,7 @@ def update(
     bridge = _Bridge(problem)
     predicted = problem.model.predict(before.theta, problem.recording.plan)
     strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
-    if bridge.missed(predicted) > SURPRISED:
+    if bridge.misfit_nats(predicted) > SURPRISED:
         if fall_back is not None:
             return _from_scratch(fall_back(), n, bridge, n, rng)
         strained = True
@@ -181,7 +181,9 @@ def update(
         if share == 1.0 and n_eff >= least:
             break
         rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
-        now, moves = _move(now.take(rows), share, bridge, rng, _parted(rows) if fall_back is None else None, effort)
+        now, moves = _move(
+            now.take(rows), share, bridge, rng, _partitioned(rows) if fall_back is None else None, effort
+        )
         n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
         if moves.accepted < STIFF:
             if fall_back is not None:
@@ -221,7 +223,7 @@ def resized(
     moved, moves = (
         _move(start, 1.0, _Bridge(problem), rng, effort=effort) if len(problem.recording) else (start, _Moves(0.0, 0))
     )
-    found = replace(_even(moved, had), n_calls=had.n_calls + moves.n_calls)
+    found = replace(_equally_weighted(moved, had), n_calls=had.n_calls + moves.n_calls)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
 
 
@@ -232,11 +234,11 @@ def sampled(
     bridge = _Bridge(problem)
     cloud = bridge.cloud(found.theta[resampled(found.weight, n, rng)])
     moved, moves = _move(cloud, 1.0, bridge, rng, effort=effort)
-    drawn = replace(_even(moved, found), n_calls=found.n_calls + n + moves.n_calls)
+    drawn = replace(_equally_weighted(moved, found), n_calls=found.n_calls + n + moves.n_calls)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 
 
-def _even(cloud: _Cloud, of: Weighted) -> Weighted:
+def _equally_weighted(cloud: _Cloud, of: Weighted) -> Weighted:
     n = len(cloud.theta)
     even = np.full(n, -math.log(n))
     return replace(
@@ -276,7 +278,7 @@ class _Bridge:
 
     problem: SensorProblem
 
-    def missed(self, predicted: FloatArray) -> float:
+    def misfit_nats(self, predicted: FloatArray) -> float:
         """Return the loss in nats of the best prediction of the last reading against a perfect one."""
         recording = self.problem.recording
         if not recording.usable[-1]:
@@ -369,7 +371,7 @@ def _along_differences(
     return theta + length * (theta[one] - theta[other]), np.zeros(n)
 
 
-def _parted(rows: IntArray) -> list[IntArray]:
+def _partitioned(rows: IntArray) -> list[IntArray]:
     """Partition resampled `rows` with copies of a sample together; one part if others would be too small."""
     parts = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]

@@ -6,8 +6,8 @@ from typing import Literal, TypeAlias, get_args
 
 from probewise.calibration import FittedSensor
 from probewise.errors import ParameterError
+from probewise.experiment.configuration import Experiment
 from probewise.experiment.paper import paper_experiment
-from probewise.experiment.setting import Experiment
 from probewise.experiment.simulation import Model, bin_width_of, experiment_for, usual_trust
 from probewise.inference import Naive
 from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
@@ -57,10 +57,15 @@ def pose_experiment(
         If an option does not go with the method.
     """
     bin_width = bin_width_of(sensor)
-    worth = utility_named(utility, bin_width=bin_width) if isinstance(utility, str) else utility
+    chosen = utility_named(utility, bin_width=bin_width) if isinstance(utility, str) else utility
     if method == "paper":
         refused = (
-            ("utility", utility, worth is None or isinstance(worth, ReadingEntropy), "entropy, which is the paper's,"),
+            (
+                "utility",
+                utility,
+                chosen is None or isinstance(chosen, ReadingEntropy),
+                "entropy, which is the paper's,",
+            ),
             ("learn_sensor", learn_sensor, not learn_sensor, "False, since the sensor is known,"),
             ("batch", batch, batch == 1, "1, since each reading is chosen by all before it,"),
             ("cards", cards, not cards, "none, since its scene is the shape alone,"),
@@ -85,14 +90,14 @@ def pose_experiment(
     for name, given in (("nested_stop", nested_stop), ("naive", naive)):
         if given is not None:
             raise ParameterError(name, given, "None, but with the paper's method")
-    worth = Finishing() if worth is None else worth
-    usual = usual_trust(shape, model=model, learn_sensor=learn_sensor, utility=worth)
+    chosen = Finishing() if chosen is None else chosen
+    usual = usual_trust(shape, model=model, learn_sensor=learn_sensor, utility=chosen)
     return experiment_for(
         sensor,
         shape,
         field,
         model=model,
-        utility=worth,
+        utility=chosen,
         learn_sensor=learn_sensor,
         batch=batch,
         trust=usual if trust is None else trust,

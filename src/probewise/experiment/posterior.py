@@ -18,7 +18,7 @@ from scipy.special import expit, logsumexp
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.experiment.evidence import Bridged, bridged, redrawn
-from probewise.experiment.kinds import Kind
+from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import (
     BRIEF,
     STEADY,
@@ -68,7 +68,7 @@ be right one time in ten, and whatever is concluded of a run that has it would m
 class Posterior:
     """Samples of every kind, in the order of the kinds."""
 
-    kinds: tuple[Kind, ...]
+    kinds: tuple[HypothesisKind, ...]
     particles: tuple[Particles, ...]
 
     @property
@@ -137,7 +137,7 @@ class Posterior:
         )
 
 
-def prior_posterior(kinds: Sequence[Kind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
+def prior_posterior(kinds: Sequence[HypothesisKind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
     """Draw samples of every kind's prior."""
     shares = [math.exp(kind.log_prior) for kind in kinds]
     sizes = [_size(kind, p, n_particles) for kind, p in zip(kinds, shares, strict=True)]
@@ -182,7 +182,7 @@ def updated(
     particles = _taken_in(previous, problems, STEADY if doubted else THOROUGH, rng)
     now = replace(previous, particles=tuple(particles))
     if doubted:
-        particles = _revived(now, problems, n_particles, rng)
+        particles = _sampled_from_others(now, problems, n_particles, rng)
         now = replace(previous, particles=tuple(particles))
         particles = [
             _weighed_again(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
@@ -193,7 +193,7 @@ def updated(
     while (k := _most_doubtful(now, settled, _DOUBTED_OFF if doubted else _MOST_OFF)) is not None:
         settled.add(k)
         n = min(n_particles, _MOST_DRAWS) if doubted else n_particles
-        particles[k] = _renewed(particles[k], problems[k], n, from_scratch, rng)
+        particles[k] = _reestimated(particles[k], problems[k], n, from_scratch, rng)
         now = replace(now, particles=tuple(particles))
     if not np.isfinite(now.log_odds).any():
         raise NotConvergedError("no hypothesis of any kind could have given these readings")
@@ -223,10 +223,10 @@ def reconsidered(
 ) -> Posterior:
     """Sample every rival anew that might matter, whatever its history: to be asked before a run ends."""
     problems = [kind.problem(recording) for kind in posterior.kinds]
-    return replace(posterior, particles=tuple(_revived(posterior, problems, n_particles, rng, each=True)))
+    return replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
 
 
-def _revived(
+def _sampled_from_others(
     now: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator, *, each: bool = False
 ) -> list[Particles]:
     """Sample a rival anew, from what other kinds believe, where its own samples may have lost the truth.
@@ -259,7 +259,7 @@ def _revived(
 
 
 def _from_others(
-    kind: Kind,
+    kind: HypothesisKind,
     problem: SensorProblem,
     own: Weighted,
     donors: list[Weighted],
@@ -284,7 +284,7 @@ def _from_others(
         return None
 
 
-def _size(kind: Kind, probability: float, n_particles: int) -> int:
+def _size(kind: HypothesisKind, probability: float, n_particles: int) -> int:
     """Return the number of samples of a kind by its probability; improbable rivals have few."""
     if kind.left_out:
         return max(n_particles // next(part for least, part in _SUSPECTED if probability >= least), 100)
@@ -319,7 +319,7 @@ def _share(odds: float) -> float:
     return float(expit(odds))
 
 
-def _renewed(
+def _reestimated(
     particles: Particles, problem: SensorProblem, n: int, from_scratch: FromScratch, rng: np.random.Generator
 ) -> Particles:
     """Re-estimate a kind's evidence from all readings, and its samples too if they may be incomplete."""

@@ -16,7 +16,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.experiment.kernels import LocalKernels
-from probewise.experiment.kinds import Kind
+from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.pace import EACH_S, run_time_s
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
@@ -39,7 +39,12 @@ _LEAST = 10  # possible draws from which on they are weighed
 
 
 def fits(
-    kind: Kind, problem: SensorProblem, donors: Sequence[Weighted], *, noise_sd: float, rng: np.random.Generator
+    kind: HypothesisKind,
+    problem: SensorProblem,
+    donors: Sequence[Weighted],
+    *,
+    noise_sd: float,
+    rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Fit a kind with an effect on the mean to all readings, from the samples of other kinds.
 
@@ -125,7 +130,7 @@ def fits(
 
 
 def refitted(
-    kind: Kind,
+    kind: HypothesisKind,
     problem: SensorProblem,
     own: Weighted,
     donors: Sequence[Weighted],

@@ -110,7 +110,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     shown = {**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD
     for name, wide in shown.items():
         reach_mm = math.hypot(*field_mm) if wide else _SCAN_MM
-        effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _scan(reach_mm)))
+        effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _there_and_back(reach_mm)))
         if effect is not None and name not in carried:
             found += [Rival(name, effect=way) for way in _ways(effect, field_mm)]
     noise = declared_noise(likelihood)
@@ -136,7 +136,7 @@ class GainLoss(GainDrift):
 
     @classmethod
     def like(cls, drift: GainDrift) -> Self:
-        """Build with the scales of a drift that ends as calibrated."""
+        """Take the scales of `drift`, whose signal ends as calibrated."""
         return cls(drift.typical, drift.shortest_s, drift.longest_s)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -162,7 +162,7 @@ def declared_noise(likelihood: Likelihood) -> tuple[float, float] | None:
     return None
 
 
-def _scan(length_mm: float) -> Plan:
+def _there_and_back(length_mm: float) -> Plan:
     """Lay out one scan there and back over the time that a run may take: what scales are taken from."""
     n = 2 * int(_DURATION_S / EACH_S / 2) + 1
     zeros = np.zeros(n, dtype=np.int64)

@@ -15,10 +15,10 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
 from probewise.experiment.checking import ENOUGH_BITS, FAR_SIDE, NAMES, bits_of_names, far_side
-from probewise.experiment.judging import OFF_SDS
+from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.setting import MOST_OFF, Experiment
+from probewise.experiment.stopping_rule import OFF_SDS
 from probewise.inquiry import Prospect, UtilityMap, entropy_bits
 from probewise.inquiry.given_reading import GivenReading
 from probewise.recordings.plan import Plan
@@ -46,7 +46,7 @@ def settling(
     experiment: Experiment,
     posterior: Posterior,
     prospect: Prospect,
-    outlook: UtilityMap,
+    utilities: UtilityMap,
     readings: tuple[Reading, ...],
     *,
     rng: np.random.Generator,
@@ -61,40 +61,42 @@ def settling(
     places, and some random ones.
     """
     if prospect.goal is None:
-        return outlook, False
-    theta, lengths, weight = _drawn(experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng)
+        return utilities, False
+    theta, lengths, weight = _draw_hypotheses(experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng)
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
-        return outlook, False
-    rows = _candidates(experiment, prospect, outlook, theta, readings, rng)
+        return utilities, False
+    rows = _candidates(experiment, prospect, utilities, theta, readings, rng)
     plan = Pace.of(readings).on(_plan(prospect, rows, readings[-1]))
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
     if known:
         names = np.array([kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own])
-        worth = bits_of_names(weight, answers, names, prospect.readout.noise_sd)
-        if worth.max() >= ENOUGH_BITS:
-            return _map(prospect, outlook, rows, worth, NAMES), True
+        utility = bits_of_names(weight, answers, names, prospect.readout.noise_sd)
+        if utility.max() >= ENOUGH_BITS:
+            return _map(prospect, utilities, rows, utility, NAMES), True
         far = far_side(prospect, experiment.shape.region(_middle(experiment, prospect)), readings)
         if far is not None:
-            return _map(prospect, outlook, np.array([far]), np.ones(1), FAR_SIDE), True
-        return _map(prospect, outlook, rows, worth, NAMES), False
-    worth, label = _bits(weight, answers, prospect), _LABEL
-    best = np.argsort(-worth, kind="stable")[:_ENDING]
-    chance = _ends(lengths, weight, answers[:, best], prospect, prospect.goal.sd, OFF_SDS * experiment.stop_sd_mm)
+            return _map(prospect, utilities, np.array([far]), np.ones(1), FAR_SIDE), True
+        return _map(prospect, utilities, rows, utility, NAMES), False
+    utility, label = _expected_bits(weight, answers, prospect), _LABEL
+    best = np.argsort(-utility, kind="stable")[:_ENDING]
+    chance = _probability_of_ending(
+        lengths, weight, answers[:, best], prospect, prospect.goal.sd, OFF_SDS * experiment.stop_sd_mm
+    )
     if chance.max() >= _LEAST_CHANCE:
-        worth, label = np.zeros(len(worth)), _ENDS
-        worth[best] = chance
-    return _map(prospect, outlook, rows, worth, label), False
+        utility, label = np.zeros(len(utility)), _ENDS
+        utility[best] = chance
+    return _map(prospect, utilities, rows, utility, label), False
 
 
-def _map(prospect: Prospect, outlook: UtilityMap, rows: IntArray, worth: FloatArray, label: str) -> UtilityMap:
+def _map(prospect: Prospect, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str) -> UtilityMap:
     """Return the map of the utility of some available designs, (n,)."""
     values = np.zeros(len(prospect.designs))
-    values[prospect.rows[rows]] = worth
+    values[prospect.rows[rows]] = utility
     values.flags.writeable = False
-    return UtilityMap(prospect.designs, values, outlook.reachable, label)
+    return UtilityMap(prospect.designs, values, utilities.reachable, label)
 
 
 def _middle(experiment: Experiment, prospect: Prospect) -> FloatArray:
@@ -103,7 +105,7 @@ def _middle(experiment: Experiment, prospect: Prospect) -> FloatArray:
     return np.asarray((prospect.weight @ theta)[None] / prospect.weight.sum())
 
 
-def _drawn(
+def _draw_hypotheses(
     experiment: Experiment, posterior: Posterior, least: int, rng: np.random.Generator
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
     """Draw hypotheses of each kind, with the lengths, (n, n_lengths), and weights, (n,), of all.
@@ -128,13 +130,13 @@ def _drawn(
 def _candidates(
     experiment: Experiment,
     prospect: Prospect,
-    outlook: UtilityMap,
+    utilities: UtilityMap,
     theta: list[FloatArray],
     readings: tuple[Reading, ...],
     rng: np.random.Generator,
 ) -> IntArray:
     """Choose candidates among the available designs, (n,)."""
-    worth = outlook.values[prospect.rows]
+    utility = utilities.values[prospect.rows]
     n_shape = len(experiment.shape.prior.names)
     start = int(experiment.shape_columns[0])
     shapes = np.concatenate([own[:, start : start + n_shape] for own in theta if len(own)])
@@ -149,7 +151,7 @@ def _candidates(
     wanted = np.concatenate(places)
     there = np.stack([prospect.plan.x_mm[prospect.rows], prospect.plan.y_mm[prospect.rows]], axis=1)
     nearest = np.array([int(np.argmin(((there - place) ** 2).sum(axis=1))) for place in wanted])
-    best = np.argsort(-worth, kind="stable")[:_BEST]
+    best = np.argsort(-utility, kind="stable")[:_BEST]
     return np.unique(np.concatenate([best, nearest, rng.integers(len(there), size=_ANYWHERE)]))
 
 
@@ -165,7 +167,7 @@ def _plan(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
     return replace(taken, x_mm=x_mm, y_mm=y_mm, time_s=time_s, scan=scan, scan_names=tuple(str(k) for k in range(n)))
 
 
-def _bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatArray:
+def _expected_bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatArray:
     """Return the expected information in bits from predictions (n, n_designs) of hypotheses (n,): (n_designs,)."""
     given = GivenReading(answers, weight, prospect.readout)
     middle = np.array([0.5 * float(answers.min() + answers.max())])
@@ -173,7 +175,7 @@ def _bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatA
     return np.maximum(entropy_bits(given.mass) - of_noise, 0.0)
 
 
-def _ends(
+def _probability_of_ending(
     lengths: FloatArray, weight: FloatArray, answers: FloatArray, prospect: Prospect, goal_sd_mm: float, off_mm: float
 ) -> FloatArray:
     """Return the probability that a reading at each design meets the stopping rule, (n_designs,)."""

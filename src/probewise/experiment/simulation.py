@@ -20,10 +20,10 @@ from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
-from probewise.experiment.learning import AdjustedMixture, sensor_prior
+from probewise.experiment.configuration import Experiment
 from probewise.experiment.pace import FromRest, Told
 from probewise.experiment.rivals import OF_MOTION
-from probewise.experiment.setting import Experiment
+from probewise.experiment.sensor_update import AdjustedMixture, sensor_prior
 from probewise.inference import Naive, Rounded
 from probewise.inquiry import Finishing, Grid, Utility
 from probewise.priors import LogNormal, Marginal, Normal

@@ -8,10 +8,10 @@ import numpy as np
 
 from probewise.arm.instrument import Instrument, Pose
 from probewise.errors import ParameterError
-from probewise.experiment.asking import Field
+from probewise.experiment.acquisition import ArmOverGrid
+from probewise.experiment.configuration import Experiment
 from probewise.experiment.loop import begin, step
-from probewise.experiment.setting import Experiment
-from probewise.experiment.values import Exploration, Step
+from probewise.experiment.state import Exploration, Step
 from probewise.inquiry import prior_entropy
 
 __all__ = ["run_from"]
@@ -42,7 +42,7 @@ def run_from(
     """
     if max_readings < 1:
         raise ParameterError("max_readings", max_readings, "1 or more")
-    field = Field.under(instrument, experiment.grid)
+    field = ArmOverGrid.under(instrument, experiment.grid)
     prior_bits = prior_entropy(experiment.prior, rng=rng)
     state = dataclasses.replace(begin(experiment, field, rng=rng), next_pose=first, planned=())
     steps: list[Step] = []

@@ -1,11 +1,11 @@
 """Choose the next measurement (paper, the machine learning system, figures 3 and 8).
 
 Hypotheses that are still believed predict a reading at every place of a fine grid; where
-their predictions differ most, a reading tells most. The worth of a reading is a small function
+their predictions differ most, a reading tells most. The utility of a reading is a small function
 behind one seam, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses; `InformationGain`
 asks the whole posterior and leaves out what is only noise. Thousands of hypotheses are not asked one by one
-(`AskedForecast`) but looked up: discs in a table of the sensor's own (`DiscForecast`), ellipses and convex polygons in
-tables of what the unit Gaussian sees of a corner and of a bent edge (`SilhouetteForecast`). An instrument that sees no
+(`DirectForecast`) but looked up: discs in a table of the sensor's own (`DiscForecast`), ellipses and convex polygons in
+tables of what the unit Gaussian sees of a corner and of a bent edge (`TabulatedForecast`). An instrument that sees no
 field of shapes has an `Inquiry` over its own settings.
 """
 
@@ -17,15 +17,15 @@ from probewise.inquiry.choice import best_places, choose
 from probewise.inquiry.designs import Design, Designs
 from probewise.inquiry.discs import DiscTable
 from probewise.inquiry.finishing import Finishing
-from probewise.inquiry.forecast import AskedForecast, Forecast, Outlook
+from probewise.inquiry.forecast import DirectForecast, Forecast, PredictiveDistributions
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.information import bits_gained, gaussian_entropy, neighbour_entropy, prior_entropy
 from probewise.inquiry.labels import FunctionValue, Label, ParameterValue, WhichShape
 from probewise.inquiry.named import UTILITY_NAMES, utility_named
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.readout import Readout, entropy_bits
-from probewise.inquiry.tabled import DiscForecast, SilhouetteForecast, forecast_of
-from probewise.inquiry.tabled_effects import TabledChain
+from probewise.inquiry.tabulated import DiscForecast, TabulatedForecast, forecast_of
+from probewise.inquiry.tabulated_effects import TabulatedChain
 from probewise.inquiry.telling_apart import Rival, tell_apart
 from probewise.inquiry.utility import (
     InformationAbout,
@@ -39,11 +39,11 @@ from probewise.inquiry.utility_map import UtilityMap, entropy_map, reachable_row
 
 __all__ = [
     "UTILITY_NAMES",
-    "AskedForecast",
     "Bound",
     "CardedForecast",
     "Design",
     "Designs",
+    "DirectForecast",
     "DiscForecast",
     "DiscTable",
     "Finishing",
@@ -55,17 +55,17 @@ __all__ = [
     "InformationGain",
     "Inquiry",
     "Label",
-    "Outlook",
     "ParameterValue",
     "PerSecond",
     "Predictive",
+    "PredictiveDistributions",
     "Prospect",
     "ReadingEntropy",
     "ReadingNoise",
     "Readout",
     "Rival",
-    "SilhouetteForecast",
-    "TabledChain",
+    "TabulatedChain",
+    "TabulatedForecast",
     "Utility",
     "UtilityMap",
     "WhichShape",
@@ -89,3 +89,15 @@ __all__ = [
     "utility_map",
     "utility_named",
 ]
+
+SilhouetteForecast = TabulatedForecast
+"""The old name of `TabulatedForecast`."""
+
+AskedForecast = DirectForecast
+"""The old name of `DirectForecast`."""
+
+Outlook = PredictiveDistributions
+"""The old name of `PredictiveDistributions`."""
+
+TabledChain = TabulatedChain
+"""The old name of `TabulatedChain`."""

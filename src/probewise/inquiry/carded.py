@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.forecast import Forecast, Outlook, by_level, thinned
+from probewise.inquiry.forecast import Forecast, PredictiveDistributions, by_level, thinned
 from probewise.recordings.plan import Plan
 from probewise.scene.cards import Card, CardedScene, laid_over
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -99,11 +99,11 @@ class CardedForecast:
         """See `Forecast.predict`."""
         return CardedModel(self.chain, _Predicts(self.base)).predict(theta, plan)
 
-    def outlook(
+    def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
-    ) -> Outlook:
-        """See `Forecast.outlook`."""
-        base = self.base.outlook(theta, weight, designs, plan, rows, noise_sd)
+    ) -> PredictiveDistributions:
+        """See `Forecast.predictive`."""
+        base = self.base.predictive(theta, weight, designs, plan, rows, noise_sd)
         there, model = plan.take(rows), self.model
         covered = model.covered(Poses(there.x_mm[None], there.y_mm[None], there.orientation_rad[None]), there)
         near = np.flatnonzero(sum(share[0] for share in covered) > _SHOWS)
@@ -111,7 +111,7 @@ class CardedForecast:
             return base
         asked, share = thinned(weight, _MOST_ASKED)
         answers = model.predict(theta[asked], there.take(near))
-        return _CardedOutlook(base, asked, share / weight[asked], answers, near, len(rows))
+        return _CardedPredictive(base, asked, share / weight[asked], answers, near, len(rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,10 +129,10 @@ class _Predicts:
 
 
 @dataclass(frozen=True, eq=False)
-class _CardedOutlook:
+class _CardedPredictive:
     """Predictions by tables except for designs near a card; `answers` are predictions of `asked` hypotheses there."""
 
-    base: Outlook
+    base: PredictiveDistributions
     asked: IntArray
     stands_for: FloatArray
     answers: FloatArray
@@ -144,7 +144,7 @@ class _CardedOutlook:
         return self.base.levels
 
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `Outlook.maps`."""
+        """See `PredictiveDistributions.maps`."""
         own, n = weight[self.asked] * self.stands_for, len(self.near)
         levels = self.levels
         index = np.rint((self.answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)

@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.effects import EdgeBlur, Halo, Known
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
-from probewise.inquiry.spans import ROWS, Interval, Ring, Spans, single
+from probewise.inquiry.scanlines import ROWS, Interval, Ring, Spans, single
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor

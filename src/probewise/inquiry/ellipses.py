@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.inquiry.spans import Interval, single
+from probewise.inquiry.scanlines import Interval, single
 from probewise.inquiry.unit_gaussian import seen_of_bend
 from probewise.scene import EllipseRegion
 from probewise.sensor import FixedMixture

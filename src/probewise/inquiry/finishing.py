@@ -53,14 +53,14 @@ class Finishing:
 
     def measure(self, prospect: Prospect) -> tuple[FloatArray, str]:
         """Return the utility of every available design, (n,), and the label of the measure used."""
-        worth = self.of(prospect)
+        plain = self.of(prospect)
         if prospect.goal is None or not _is_near(prospect, prospect.goal):
-            return worth, self.of.label
-        best = np.argsort(-worth, kind="stable")[:_MOST_DESIGNS]
-        chance = _ends(prospect, prospect.goal, best)
+            return plain, self.of.label
+        best = np.argsort(-plain, kind="stable")[:_MOST_DESIGNS]
+        chance = _probability_of_ending(prospect, prospect.goal, best)
         if chance.max() < self.least:
-            return worth, self.of.label
-        out = np.zeros(len(worth))
+            return plain, self.of.label
+        out = np.zeros(len(plain))
         out[best] = chance
         return out, "probability that a reading there ends the run"
 
@@ -72,7 +72,7 @@ def _is_near(prospect: Prospect, goal: Goal) -> bool:
     return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)
 
 
-def _ends(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
+def _probability_of_ending(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
     """Return the probability that a reading at each design reaches the target precision, (n_designs,)."""
     rows, share = thinned(prospect.weight, _MOST_ASKED)
     away = prospect.theta[rows][:, goal.columns]

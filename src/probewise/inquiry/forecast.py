@@ -9,16 +9,16 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.inquiry.culling import CullingBounds
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.sight import Sight
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
 __all__ = [
     "MOST_LEVELS",
-    "AskedForecast",
+    "DirectForecast",
     "Forecast",
-    "Outlook",
+    "PredictiveDistributions",
     "by_combination",
     "by_level",
     "predicted",
@@ -35,7 +35,7 @@ _MOST_ASKED = 400  # hypotheses predicted directly
 _PER_SD = 8.0  # levels per noise sd: fine, since each of a few hundred hypotheses matters
 
 
-class Outlook(Protocol):
+class PredictiveDistributions(Protocol):
     """Predictive distribution of the noise-free reading at some designs, as weights of levels."""
 
     @property
@@ -70,9 +70,9 @@ class Forecast(Protocol):
         """Noise-free readings of hypotheses at the rows of a plan, (n_samples, n_params) -> (n_samples, n_points)."""
         ...
 
-    def outlook(
+    def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
-    ) -> Outlook:
+    ) -> PredictiveDistributions:
         """Return the predictive distribution at designs.
 
         Parameters
@@ -90,7 +90,7 @@ class Forecast(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class AskedForecast:
+class DirectForecast:
     """A forecast for any model: direct predictions of at most 400 hypotheses, resampled systematically."""
 
     model: SensorModel
@@ -99,20 +99,20 @@ class AskedForecast:
         """See `Forecast.predict`."""
         return predicted(self.model, theta, plan)
 
-    def outlook(
+    def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
-    ) -> Outlook:
-        """See `Forecast.outlook`."""
+    ) -> PredictiveDistributions:
+        """See `Forecast.predictive`."""
         asked, share = thinned(weight, _MOST_ASKED)
         answers = predicted(self.model, theta[asked], plan.take(rows))
         levels = spread_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD, most=MOST_LEVELS)
         per_level = 1.0 / (levels[1] - levels[0])
         index = np.rint((answers - levels[0]) * per_level).astype(np.int32)
-        return _AskedOutlook(asked, share / weight[asked], index, levels, rows, designs.grid.n_places)
+        return _DirectPredictive(asked, share / weight[asked], index, levels, rows, designs.grid.n_places)
 
 
 @dataclass(frozen=True, eq=False)
-class _AskedOutlook:
+class _DirectPredictive:
     asked: IntArray
     stands_for: FloatArray
     index: IntArray
@@ -121,7 +121,7 @@ class _AskedOutlook:
     n_places: int
 
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `Outlook.maps`."""
+        """See `PredictiveDistributions.maps`."""
         own, n_levels = weight[self.asked] * self.stands_for, len(self.levels)
         for _, at, _ in by_combination(self.rows, self.n_places):
             yield at, by_level(self.index[:, at], own, n_levels)
@@ -145,10 +145,10 @@ def by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArra
 
 def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
     """Predict every hypothesis at every row of a long plan, skipping rows that cannot see it: (n_samples, n_points)."""
-    sight = Sight.of(model, theta, plan)
-    if sight is not None:
-        out = np.full((len(theta), len(plan)), sight.beside)
-        for rows, shown in sight.parts(plan):
+    bounds = CullingBounds.of(model, theta, plan)
+    if bounds is not None:
+        out = np.full((len(theta), len(plan)), bounds.outside)
+        for rows, shown in bounds.parts(plan):
             if shown.size:
                 out[np.ix_(shown, rows)] = model.predict(theta[shown], plan.take(rows))
         return out

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.inquiry.spans import Interval, single
+from probewise.inquiry.scanlines import Interval, single
 from probewise.inquiry.unit_gaussian import N_OPENINGS, seen_of_corner
 from probewise.scene import PolygonRegion
 from probewise.sensor import FixedMixture

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, require_finite
 from probewise.errors import ShapeError
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.forecast import MOST_LEVELS, Forecast, Outlook
+from probewise.inquiry.forecast import MOST_LEVELS, Forecast, PredictiveDistributions
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 
@@ -89,15 +89,15 @@ class Prospect:
         return answers
 
     @cached_property
-    def outlook(self) -> Outlook:
+    def predictive(self) -> PredictiveDistributions:
         """Predictive distribution under the whole posterior."""
         noise_sd = self.readout.noise_sd / np.sqrt(max(self.designs.repeats))
-        return self.forecast.outlook(self.theta, self.weight, self.designs, self.plan, self.rows, noise_sd)
+        return self.forecast.predictive(self.theta, self.weight, self.designs, self.plan, self.rows, noise_sd)
 
     def information(self, weight: FloatArray) -> FloatArray:
         """Return the expected information in bits of a reading at every design, for weights (n_samples,)."""
         out = np.empty(len(self.rows))
-        for at, mass in self.outlook.maps(weight):
+        for at, mass in self.predictive.maps(weight):
             chance = self._chance(at)
             out[at] = np.maximum(_entropy_of_readings(mass, chance) - _entropy_of_noise(mass, chance), 0.0)
         return out
@@ -108,14 +108,14 @@ class Prospect:
         The weights, (n_samples,), are normalised, and may be 0 for some hypotheses.
         """
         out = np.empty(len(self.rows))
-        for at, mass in self.outlook.maps(weight):
+        for at, mass in self.predictive.maps(weight):
             out[at] = _entropy_of_readings(mass, self._chance(at))
         return out
 
     def _chance(self, at: IntArray) -> FloatArray:
         """Return the probability of each cell given each level, for designs with equal repeats."""
         n = int(self.designs.n_repeats[self.rows[at[0]]])
-        chance = self.readout.probability(self.outlook.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
+        chance = self.readout.probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)
         return np.asarray(chance.astype(np.float32))
 
 

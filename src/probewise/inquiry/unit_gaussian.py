@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.inquiry.spans import single, whole
+from probewise.inquiry.scanlines import single, whole
 
 __all__ = ["N_OPENINGS", "REACH", "seen_of_bend", "seen_of_corner"]
 
@@ -33,19 +33,19 @@ def seen_of_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> 
 
     `opening` numbers the correlation r of the two distances: floor((arcsin(r) / pi + 1 / 2) N_OPENINGS).
     """
-    index = opening * (_N * _N) + _entry(second) * _N
-    index += _entry(first)
+    index = opening * (_N * _N) + _index_of(second) * _N
+    index += _index_of(first)
     return np.asarray(_corners().reshape(-1)[index])
 
 
 def seen_of_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
     """Return the mass of the unit Gaussian within a curved edge; `bend` is the curvature times the sd."""
     index = np.minimum(whole(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
-    index += _entry(distance)
+    index += _index_of(distance)
     return np.asarray(_bends().reshape(-1)[index])
 
 
-def _entry(distance: FloatArray) -> IntArray:
+def _index_of(distance: FloatArray) -> IntArray:
     return whole(np.clip(distance, -REACH, REACH) * _PER_SD + (REACH * _PER_SD + 0.5))
 
 

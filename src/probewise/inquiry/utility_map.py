@@ -11,7 +11,7 @@ from probewise.errors import ReachError, ShapeError
 from probewise.inquiry.choice import best_places, choose
 from probewise.inquiry.designs import Designs
 from probewise.inquiry.finishing import Finishing
-from probewise.inquiry.forecast import AskedForecast
+from probewise.inquiry.forecast import DirectForecast
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.prospect import Prospect
 from probewise.inquiry.readout import Readout
@@ -86,8 +86,8 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
         If one of its values is not finite.
     """
     # The utility with two measures reports which one these values are.
-    worth, label = utility.measure(prospect) if isinstance(utility, Finishing) else (utility(prospect), utility.label)
-    found = np.asarray(worth, dtype=np.float64)
+    value, label = utility.measure(prospect) if isinstance(utility, Finishing) else (utility(prospect), utility.label)
+    found = np.asarray(value, dtype=np.float64)
     if found.shape != prospect.rows.shape:
         raise ShapeError(f"the utility gives {found.shape} values; allowed: {prospect.rows.shape}, one per design")
     values = np.zeros(len(prospect.designs))
@@ -133,7 +133,7 @@ def entropy_map(
     rows = reachable_rows(reachable, grid.n_places)
     even = np.full(len(theta), 1.0 / len(theta))
     prospect = Prospect(
-        AskedForecast(model), Readout(noise_sd), theta, even, theta, Designs(grid), plan, rows, np.ones(rows.size)
+        DirectForecast(model), Readout(noise_sd), theta, even, theta, Designs(grid), plan, rows, np.ones(rows.size)
     )
     return utility_map(prospect, ReadingEntropy() if utility is None else utility)
 

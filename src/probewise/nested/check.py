@@ -139,7 +139,7 @@ def checked(
 
     now, above, estimates = first, NOTHING, list[NestedResult]()
     try:
-        above = _above(first, problem, int(budget - spent), rng)
+        above = _search_above(first, problem, int(budget - spent), rng)
         spent += above.n_calls
         curved = False
         for route in _second_routes(now, problem, move, least_live, rng):
@@ -155,7 +155,7 @@ def checked(
             )
             return _with_peak(replace(first, n_calls=spent, warnings=(*first.warnings, note)), above)
         name = route.name
-        if _suspicious(now, estimates, _APART):
+        if _is_suspicious(now, estimates, _APART):
             left, again_costs = budget - spent, _AGAIN * first.n_calls
             room = left - again_costs if left > again_costs else left
             n_live = int(min(max(route.n_live, now.n_live), room / estimates[0].n_calls * route.n_live))
@@ -163,10 +163,10 @@ def checked(
             if n_live > route.n_live and (found := estimated(sharper)) is not None:
                 estimates = [found] if estimates[0].warnings else [*estimates, found]
         n_check = sum(each.n_calls for each in estimates) + above.n_calls
-        if _suspicious(now, estimates, DISAGREE):
-            again = estimated(_Route(problem, now.n_live, _longer(move), "the run again"))
+        if _is_suspicious(now, estimates, DISAGREE):
+            again = estimated(_Route(problem, now.n_live, _with_longer_chains(move), "the run again"))
             if again is not None and not again.warnings:
-                if not _suspicious(again, estimates, DISAGREE):
+                if not _is_suspicious(again, estimates, DISAGREE):
                     now = again
                 elif curved and _overlooks(estimates, now, again):
                     now, estimates, name = again, [now], "the same run with shorter chains"
@@ -176,7 +176,7 @@ def checked(
     return _with_peak(_with_check(now, name, estimates, n_check, spent), above)
 
 
-def _above(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Beyond:
+def _search_above(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Beyond:
     """Look for a higher peak, where the prior's coordinates allow it."""
     if not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
         return NOTHING
@@ -211,24 +211,24 @@ def _second_routes(
         wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
         enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
         n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
-        return _Route(near, n_live, _longer(move), "a second pass from near the posterior", **limits)
+        return _Route(near, n_live, _with_longer_chains(move), "a second pass from near the posterior", **limits)
 
     if first.information > 0:
         theta = first.samples(_N_SAMPLES, rng=rng)
         # Clusters describe a posterior that they cover. A curved ridge they may not, and then mislead the live points.
-        clustered = _near(problem, theta, clustered=True)
+        clustered = _repartitioned_near(problem, theta, clustered=True)
         if clustered is not None and (nats := _nats(first, clustered)) < _FEW_NATS < _GAIN * first.information:
             yield from_near(clustered, nats, most_calls=_MOST_COST * first.n_calls, expected=nats + first.log_z)
-        single = _near(problem, theta, clustered=False)
+        single = _repartitioned_near(problem, theta, clustered=False)
         # With a log Z that is far too large the nats come out too few, or negative.
         if single is not None and (nats := _nats(first, single)) < _GAIN * first.information:
             yield from_near(single, nats)
             return
     n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
-    yield _Route(problem, n_live, _longer(move), "a second run with longer chains")
+    yield _Route(problem, n_live, _with_longer_chains(move), "a second run with longer chains")
 
 
-def _near(problem: Samplable, theta: FloatArray, *, clustered: bool) -> Repartitioned | None:
+def _repartitioned_near(problem: Samplable, theta: FloatArray, *, clustered: bool) -> Repartitioned | None:
     """Repartition the problem about posterior samples; None where the prior or the samples do not allow it."""
     if not hasattr(problem.prior, "log_prob"):
         return None
@@ -246,7 +246,7 @@ def _nats(first: NestedResult, near: Repartitioned) -> float:
     return float(first.weight[possible] @ (first.log_likelihood[possible] + made_up)) - first.log_z
 
 
-def _longer(move: Move) -> SliceMove:
+def _with_longer_chains(move: Move) -> SliceMove:
     """Double the length of the chains, to twice the default at least; other moves are replaced by slice sampling."""
     least = SliceMove().longer()
     if not isinstance(move, SliceMove):
@@ -275,7 +275,7 @@ def _distance(run: NestedResult, estimates: list[NestedResult]) -> float:
     return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
 
-def _suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -> bool:
+def _is_suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -> bool:
     return abs(_distance(run, estimates)) > most or bool(estimates[-1].warnings)
 
 

@@ -196,7 +196,7 @@ class Keeper:
             arrays |= {f"dead_{name}": getattr(origin, name) for name in _ORIGIN}
             arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_plain)), **arrays)
+        np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_as_json)), **arrays)
         return buffer.getvalue()
 
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> Run | None:
@@ -248,7 +248,7 @@ class Keeper:
             )
         return FileError(
             self.path,
-            f"of a run with {name} = {_short(settings.get(name))}, not {_short(self.settings.get(name))}",
+            f"of a run with {name} = {_shortened(settings.get(name))}, not {_shortened(self.settings.get(name))}",
             "the same problem, settings and seed; give another file, or delete this one to start anew",
         )
 
@@ -256,7 +256,7 @@ class Keeper:
         points, way_out = now.live.points, "give another file, or delete this one to start anew"
         theta, log_density = evaluate.space.leave(points.u)
         scale = np.abs(points.theta).max(axis=0)
-        if not (_near(theta, points.theta, scale) and _near(log_density, points.log_density, 1.0)):
+        if not (_nearly_equal(theta, points.theta, scale) and _nearly_equal(log_density, points.log_density, 1.0)):
             raise FileError(
                 self.path,
                 "of a run with another prior: it leads from its live points' coordinates to other parameters",
@@ -264,7 +264,7 @@ class Keeper:
             )
         then = points.log_likelihood[:1]
         again = evaluate.log_likelihood(points.theta[:1])
-        if not _near(again, then, 1.0 + np.abs(then)):
+        if not _nearly_equal(again, then, 1.0 + np.abs(then)):
             raise FileError(
                 self.path,
                 f"of a run with another likelihood: its first live point had {then[0]:.10g}, now {again[0]:.10g}",
@@ -306,13 +306,13 @@ def _run_from(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move
     return Run(live, tuple(dead), moving, rng_state=_state(head["rng_state"]), **plain)  # type: ignore[arg-type]
 
 
-def _near(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
+def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
     """Compare up to rounding: a row's last digits depend on how many rows are computed with it."""
     with np.errstate(invalid="ignore"):  # inf - inf
         return a.shape == b.shape and bool(((a == b) | (np.abs(a - b) <= _ROUNDING * scale)).all())
 
 
-def _short(value: object) -> str:
+def _shortened(value: object) -> str:
     text = str(value)
     return text if len(text) <= 200 else f"{text[:200]}..."
 
@@ -331,7 +331,7 @@ def _with_numbers(move: Move, numbers: object) -> Move:
     return restored
 
 
-def _plain(value: object) -> object:
+def _as_json(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 

@@ -87,7 +87,7 @@ def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
     equal modes 5 sd apart gain a quarter of a nat per point. A false split costs little: the moves are exact
     however space is divided.
     """
-    least = _least(points.shape[1]) if least is None else least
+    least = _least_points(points.shape[1]) if least is None else least
     queue, done = [points], list[FloatArray]()
     while queue:
         group = queue.pop()
@@ -141,7 +141,7 @@ def _split(points: FloatArray, least: int) -> tuple[FloatArray, FloatArray] | No
     return halves
 
 
-def _least(n_params: int) -> int:
+def _least_points(n_params: int) -> int:
     """Fewest points of a cluster, so that its covariance is well determined."""
     return 2 * n_params + 2
 

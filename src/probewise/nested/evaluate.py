@@ -164,7 +164,7 @@ class Evaluator:
             for answer in self._answers(parts):
                 answers.append(answer)  # one by one: their number identifies the part that failed
         except Exception as error:
-            raise NotConvergedError(self._why(error, parts[len(answers)])) from error
+            raise NotConvergedError(self._failure(error, parts[len(answers)])) from error
         # Concatenation copies: a likelihood may return the same array every time.
         values = np.concatenate([self._numbers(a, part) for a, part in zip(answers, parts, strict=True)])
         fine = values < np.inf
@@ -196,19 +196,19 @@ class Evaluator:
     def _numbers(self, answer: object, theta: FloatArray) -> FloatArray:
         if isinstance(answer, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(answer).sum())):
             raise NotConvergedError(
-                f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: "
-                f"plain numbers; return answer.filled(-np.inf) if masked means impossible; {self._first(theta)}"
+                f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: plain "
+                f"numbers; return answer.filled(-np.inf) if masked means impossible; {self._first_in_words(theta)}"
             )
         if np.asarray(answer).dtype.kind == "c":
             raise NotConvergedError(
                 "the likelihood returned complex numbers; allowed: real ones; return their real part if that is "
-                f"meant; {self._first(theta)}"
+                f"meant; {self._first_in_words(theta)}"
             )
         try:
             values = np.asarray(answer, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise NotConvergedError(
-                f"the likelihood returned something other than numbers ({error}); {self._first(theta)}"
+                f"the likelihood returned something other than numbers ({error}); {self._first_in_words(theta)}"
             ) from error
         if values.shape == () and len(theta) == 1:
             return values.reshape(1)  # many functions drop the axis of a batch of one, scipy.stats among them
@@ -216,11 +216,11 @@ class Evaluator:
             raise NotConvergedError(
                 f"the likelihood returned shape {values.shape}; "
                 f"allowed: ({len(theta)},), one number per hypothesis: theta is a batch of shape {theta.shape}, "
-                f"one hypothesis per row; {self._first(theta)}"
+                f"one hypothesis per row; {self._first_in_words(theta)}"
             )
         return values
 
-    def _why(self, error: Exception, theta: FloatArray) -> str:
+    def _failure(self, error: Exception, theta: FloatArray) -> str:
         """Describe the failure of a batch, (n, n_params), and of which hypothesis in it."""
         said = f"{type(error).__name__}: {error}"
         if self.executor is not None and "pickle" in said.lower():
@@ -229,13 +229,13 @@ class Evaluator:
                 "functions and classes at the top level of a module, without lambdas; or take a ThreadPoolExecutor"
             )
         # A hypothesis that killed its worker could kill this process too.
-        culprit = None if isinstance(error, BrokenExecutor) else self._culprit(theta)
+        culprit = None if isinstance(error, BrokenExecutor) else self._failing_row(theta)
         if culprit is not None:
             return f"the likelihood raised {said}; at {self._show(culprit)}"
         batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
-        return f"the likelihood raised {said}; {batch}; {self._first(theta)}"
+        return f"the likelihood raised {said}; {batch}; {self._first_in_words(theta)}"
 
-    def _culprit(self, theta: FloatArray) -> FloatArray | None:
+    def _failing_row(self, theta: FloatArray) -> FloatArray | None:
         """Find by bisection a hypothesis that fails by itself; None where only the batch as a whole fails."""
         while len(theta) > 1:
             half = len(theta) // 2
@@ -252,7 +252,7 @@ class Evaluator:
             return True
         return False
 
-    def _first(self, theta: FloatArray) -> str:
+    def _first_in_words(self, theta: FloatArray) -> str:
         return f"first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
 
     def _show(self, row: FloatArray) -> str:

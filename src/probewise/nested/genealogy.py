@@ -72,10 +72,10 @@ class _Genealogy:
     def memory(self, ends: IntArray, lag: int) -> float:
         """Estimate the variance ratio from windows of `lag` rounds."""
         starts = np.unique(np.linspace(0, len(ends) - 1 - lag, _MOST_WINDOWS).astype(int))
-        excess, own = np.array([self._excess(ends[i], ends[i + lag]) for i in starts]).sum(axis=0)
+        excess, own = np.array([self._excess_variance(ends[i], ends[i + lag]) for i in starts]).sum(axis=0)
         return 1.0 + float(excess / own)
 
-    def _excess(self, first: int, last: int) -> tuple[float, float]:
+    def _excess_variance(self, first: int, last: int) -> tuple[float, float]:
         """Excess variance of log Z over that of independent draws, and the variance of the shrinkage, in a window.
 
         Lineages are traced back from `last` to `first`; the points alive at `last` share the evidence beyond it.

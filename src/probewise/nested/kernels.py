@@ -133,7 +133,7 @@ class KernelMove:
         log_target[inside] += tried.log_density
         admitted[inside] = bound.admits(tried.log_likelihood, tried.label)
         log_odds = np.log(rng.random((self.n_proposals, n_chains)))
-        last = _decide(admitted, log_target, start.log_density - kernels.log_density(start.u), log_odds)
+        last = _accept_in_turn(admitted, log_target, start.log_density - kernels.log_density(start.u), log_odds)
         where = np.empty(n_tries, dtype=np.int64)
         where[inside] = np.arange(inside.size)
         moved = last.index >= 0
@@ -160,7 +160,7 @@ class _Decided:
     n_accepted: int
 
 
-def _decide(possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray) -> _Decided:
+def _accept_in_turn(possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray) -> _Decided:
     """Let every chain accept or reject its proposals in turn (Metropolis-Hastings, independent proposals).
 
     `possible` and `log_target`, the log of target over proposal density, have one entry per proposal,
@@ -242,7 +242,7 @@ def diversify_by_kernels(
             log_target[possible] += evaluate.log_likelihood(proposed[possible]) - kernels.log_density(
                 proposed[possible]
             )
-        decided = _decide(possible, log_target, log_now, np.log(rng.random((n, n_samples))))
+        decided = _accept_in_turn(possible, log_target, log_now, np.log(rng.random((n, n_samples))))
         taken = decided.index >= 0
         now[taken] = proposed[decided.index[taken]]
         log_now[taken] = log_target[decided.index[taken]]

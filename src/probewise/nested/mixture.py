@@ -46,7 +46,7 @@ def _fitted(
     off = x - centre
     whole = (off * weight[:, None]).T @ off / weight.sum()
     whole_root = _root(whole[None])[0]
-    share, mean, root = _started(x, weight, centre, whole_root, n_components, rng)
+    share, mean, root = _kmeans_start(x, weight, centre, whole_root, n_components, rng)
     # A component borrows one sample's worth of the whole's covariance, scaled to a component's volume.
     borrowed = whole * n_components ** (-2.0 / n_params)
     for _ in range(n_iterations):
@@ -86,7 +86,7 @@ def _root(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.cholesky(covariance + ridge[:, :, None] * np.eye(covariance.shape[1])))
 
 
-def _started(
+def _kmeans_start(
     x: FloatArray,
     weight: FloatArray,
     middle: FloatArray,

@@ -185,7 +185,7 @@ class SliceMove:
         def begin(rows: IntArray) -> None:
             """Set up the next step's line, bracket and level."""
             at = step[rows]
-            kinds, measure = kind[rows, at], metrics.measure(rows, home[rows])
+            kinds, measure = kind[rows, at], metrics.row_of(rows, home[rows])
             toward = np.zeros((rows.size, n_params))
             turned, along, follow = ((kinds == one).nonzero()[0] for one in (_FRAME, _AXIS, _DIFFERENCE))
             if turned.size:
@@ -381,13 +381,13 @@ class _Metrics:
             np.argmax(same, axis=1),
         )
 
-    def measure(self, rows: IntArray, home: IntArray) -> IntArray:
+    def row_of(self, rows: IntArray, home: IntArray) -> IntArray:
         """Return the row of cluster `home`'s metric for chains `rows`; a start's own cluster is taken without it."""
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
     def hop(self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
         """Map points to their counterparts in other clusters; also return the log of the volume ratio."""
-        here, there = self.measure(rows, home), self.measure(rows, goal)
+        here, there = self.row_of(rows, home), self.row_of(rows, goal)
         z = np.matmul(self.inverse_root[here], (u - self.mean[here])[:, :, None])
         moved = self.mean[there] + np.matmul(self.root[there], z)[:, :, 0]
         return moved, self.log_det[there] - self.log_det[here]

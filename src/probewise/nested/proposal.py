@@ -75,7 +75,7 @@ def joined(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
     """Combine proposals into a mixture with these shares, which need not be normalised."""
     total = math.fsum(share)
     return Proposal(
-        _all([p.clusters for p in proposals]),
+        _joined_clusters([p.clusters for p in proposals]),
         tuple(centres for p in proposals for centres in p.centres),
         tuple(width for p in proposals for width in p.width),
         np.concatenate([s / total * p.share for p, s in zip(proposals, share, strict=True)]),
@@ -104,10 +104,10 @@ def find_parts(x: FloatArray) -> Clusters:
     if len(large) < 2:
         return find_clusters(x)
     home = Clusters.of([x[piece == k] for k in large]).assign(x)
-    return _all([find_clusters(x[home == k]) for k in range(len(large))])
+    return _joined_clusters([find_clusters(x[home == k]) for k in range(len(large))])
 
 
-def _all(parts: Sequence[Clusters]) -> Clusters:
+def _joined_clusters(parts: Sequence[Clusters]) -> Clusters:
     return Clusters(
         np.concatenate([c.mean for c in parts]),
         np.concatenate([c.root for c in parts]),

@@ -132,7 +132,7 @@ def search(
             Path(checkpoint).parent.mkdir(parents=True, exist_ok=True)
         keeper = Keeper(Path(checkpoint), checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
-    now = _first(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
+    now = _first_live_points(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)
 
@@ -272,7 +272,9 @@ def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Genera
     return after, state
 
 
-def _first(evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator) -> Run:
+def _first_live_points(
+    evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator
+) -> Run:
     """Draw the first live points from the part of the prior with nonzero likelihood.
 
     Impossible hypotheses (zero likelihood) are counted and discarded; the initial volume is the share

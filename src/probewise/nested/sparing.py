@@ -162,7 +162,9 @@ def run_slow(
     original = replace(second, log_likelihood=second.log_likelihood - near.prior.made_up(second.theta))
     told(evaluate.n_calls + second.n_calls)
     wanted = error if n_params <= _DENSE else max(error, _LEAST_ERROR)
-    found = _weighed(explored, original, evaluate, space, wanted=wanted, max_calls=max_calls - second.n_calls, rng=rng)
+    found = _importance_sampled(
+        explored, original, evaluate, space, wanted=wanted, max_calls=max_calls - second.n_calls, rng=rng
+    )
     n_calls = evaluate.n_calls + second.n_calls
     told(n_calls)
     thin = () if n_params <= _DENSE else (_THIN,)
@@ -190,7 +192,7 @@ def _of_run(run: NestedResult, log_likelihood: FloatArray, n_calls: int, k: floa
     )
 
 
-def _weighed(
+def _importance_sampled(
     explored: _Explored,
     second: NestedResult,
     evaluate: Evaluator,

@@ -42,7 +42,7 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, notes = _read(_named(path), progress)
+    plan, readings, notes = _read(_table_path(path), progress)
     if readings is None:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
@@ -63,7 +63,7 @@ def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    return _read(_named(path), progress)[0]
+    return _read(_table_path(path), progress)[0]
 
 
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
@@ -74,7 +74,7 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, _ = _read(_named(path), progress)
+    plan, readings, _ = _read(_table_path(path), progress)
     return plan, readings
 
 
@@ -139,7 +139,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     return columns | {name: _cells(name, values) for name, values in plan.covariates.items()}
 
 
-def _named(path: object) -> Path:
+def _table_path(path: object) -> Path:
     """Return a file name as a Path; a table in memory is the usual mistake."""
     allowed = (
         "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), Recording.from_arrays(...)"

@@ -41,7 +41,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
     path = Path(path)
     lock = path.with_name(f".{path.name}.lock")
     deadline_s = time.monotonic() + patience_s
-    while (handle := _acquired(lock, path)) is None:
+    while (handle := _locked_file(lock, path)) is None:
         if time.monotonic() >= deadline_s:
             raise FileError(path, f"{_holder(lock)} is writing to it", "one process at a time")
         time.sleep(_RETRY_S)
@@ -54,7 +54,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
         _let_go(handle, lock)
 
 
-def _acquired(lock: Path, path: Path) -> int | None:
+def _locked_file(lock: Path, path: Path) -> int | None:
     """Open and lock the lock file; None where another process holds it."""
     while True:
         try:

@@ -54,7 +54,11 @@ def strict_json(text: str | bytes) -> Any:
     text = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
     try:
         value = json.loads(
-            text, object_pairs_hook=_once, parse_constant=_no_constant, parse_int=_whole, parse_float=_number
+            text,
+            object_pairs_hook=_unique_names,
+            parse_constant=_no_constant,
+            parse_int=_whole_number,
+            parse_float=_number,
         )
         if "\\u" in text:  # an escaped lone surrogate could not be written to a file
             json.dumps(value, ensure_ascii=False).encode()
@@ -65,7 +69,7 @@ def strict_json(text: str | bytes) -> Any:
     return value
 
 
-def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) < len(pairs):
         names = [name for name, _ in pairs]
@@ -77,7 +81,7 @@ def _no_constant(name: str) -> float:
     raise ValueError(f"{name} is no JSON number")
 
 
-def _whole(digits: str) -> int:
+def _whole_number(digits: str) -> int:
     # Python refuses to convert texts of thousands of digits.
     if len(digits) > _MOST_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits, beyond every float")

@@ -91,7 +91,7 @@ class Table:
         there = np.ones(len(cells), dtype=np.bool_)
         if missing:
             there = np.fromiter((cell not in MISSING for cell in cells), dtype=np.bool_, count=len(cells))
-        values = _parsed(list(itertools.compress(cells, there)))
+        values = _parsed_numbers(list(itertools.compress(cells, there)))
         if values is None or not (np.abs(values) <= most).all():
             allowed = "a finite number" if largest is None else f"a finite number of magnitude up to {largest:g}"
             allowed += ", or empty, nan or n/a where it is missing" if missing else ""
@@ -100,13 +100,13 @@ class Table:
                 for k, cell in enumerate(cells)
                 if there[k] and not (_is_number(cell) and abs(float(cell)) <= most)
             )
-            raise FileError(self.path, _described(cell), allowed, row=self.row(k), column=name)
+            raise FileError(self.path, _cell_words(cell), allowed, row=self.row(k), column=name)
         out = np.full(len(cells), math.nan)
         out[there] = values
         return out
 
 
-def _parsed(cells: Sequence[str]) -> FloatArray | None:
+def _parsed_numbers(cells: Sequence[str]) -> FloatArray | None:
     """Convert cells to numbers in one pass; None if one of them is not a plain decimal number."""
     if _OF_NUMBERS.fullmatch("".join(cells)) is None:
         return None
@@ -122,12 +122,12 @@ def _is_number(cell: str) -> bool:
 
 def count_numbers(cells: Sequence[str]) -> int:
     """Count the cells that hold a plain decimal number (float() would accept 'infinity' and '1_000' too)."""
-    if _parsed(cells) is not None:
+    if _parsed_numbers(cells) is not None:
         return len(cells)
     return sum(n for cell, n in Counter(cells).items() if _is_number(cell))
 
 
-def _described(cell: str) -> str:
+def _cell_words(cell: str) -> str:
     return shown(cell) if cell else "the cell is empty"
 
 

@@ -30,18 +30,20 @@ def where_white(pattern: Pattern) -> str:
         case Uniform(albedo):
             return f"all {_shade(albedo)}"
         case HalfPlane(normal, offset, inside, outside):
-            return _two(_half_plane(normal, offset), inside, outside)
+            return _inside_and_outside(_half_plane(normal, offset), inside, outside)
         case Quadrant((x, y), (dx, dy), inside, outside):
             sides = f"{'above' if dy > 0 else 'below'} y = {y:g} mm and {'right' if dx > 0 else 'left'} of x = {x:g} mm"
-            return _two(sides, inside, outside)
+            return _inside_and_outside(sides, inside, outside)
         case Disc((x, y), radius, inside, outside):
-            return _two(f"inside the circle of radius {radius:g} mm about ({x:g}, {y:g}) mm", inside, outside)
+            return _inside_and_outside(
+                f"inside the circle of radius {radius:g} mm about ({x:g}, {y:g}) mm", inside, outside
+            )
         case Polygon(_, inside, outside):
-            return _two("inside the polygon", inside, outside)
+            return _inside_and_outside("inside the polygon", inside, outside)
         case Stripes(normal, period, duty, _, inside, outside):
             way = math.degrees(normal)
             stripes = f"in stripes of {duty * period:g} mm, one every {period:g} mm, across {way:g} degrees"
-            return _two(stripes, inside, outside)
+            return _inside_and_outside(stripes, inside, outside)
         case Ramp(normal, per_mm):
             return f"a ramp that brightens by {per_mm:g} of white per mm towards {math.degrees(normal):g} degrees"
         case Image(_, _, _, file):
@@ -57,7 +59,7 @@ def _half_plane(normal_rad: float, offset_mm: float) -> str:
     return _SIDES[side].format((offset_mm if side < 2 else -offset_mm) + 0.0)
 
 
-def _two(where: str, inside: float, outside: float) -> str:
+def _inside_and_outside(where: str, inside: float, outside: float) -> str:
     return f"{_shade(inside)} {where}, {_shade(outside)} elsewhere"
 
 

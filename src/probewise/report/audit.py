@@ -57,7 +57,7 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
         "nats.",
     )
     sections = [
-        Section("Effects that cannot be told apart", _classes(audit))
+        Section("Effects that cannot be told apart", _alias_classes(audit))
         if audit.classes is not None
         else Section(_CURED_BY, _cures(audit)),
         Section("Every effect", (audit_table(audit.effects, audit.words.null),)),
@@ -84,7 +84,7 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
     )
 
 
-def _classes(audit: PlanAudit) -> tuple[Markup, ...]:
+def _alias_classes(audit: PlanAudit) -> tuple[Markup, ...]:
     if not audit.classes:
         return (paragraph("These rows can tell all effects apart that they can detect."),)
     opening = "Classes of aliased effects, directly or through others in the class:"

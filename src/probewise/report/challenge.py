@@ -40,7 +40,7 @@ def table_of_rows(rows: Sequence[Row]) -> Markup:
         header,
         (
             (
-                _indented(row.name),
+                _keep_indentation(row.name),
                 _value(row.found) if row.found.n else "–",
                 readable(_interval(row.found)),
                 str(row.found.n),
@@ -52,7 +52,7 @@ def table_of_rows(rows: Sequence[Row]) -> Markup:
     )
 
 
-def _indented(name: str) -> str:
+def _keep_indentation(name: str) -> str:
     """Keep the indentation of a sub-row as an em space: HTML drops plain spaces."""
     own = name.lstrip()
     return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")

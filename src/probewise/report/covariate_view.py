@@ -89,8 +89,8 @@ def telling(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
     """
     values = covariate_values(diagnosis)
     alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
-    places = sorted(alarming, key=lambda place: -_likeness(diagnosis, place))
-    found = _folded(diagnosis)
+    places = sorted(alarming, key=lambda place: -_probability_of_dependence(diagnosis, place))
+    found = _at_period(diagnosis)
     for place in places:
         found += _views(diagnosis, place, values[place.witness])
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
@@ -110,7 +110,7 @@ def seen_first(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place,
     for place in diagnosis.where:
         views = _views(diagnosis, place, values[place.witness])
         seen[place.witness] = any(chance.means(diagnosis, w, after=False).stands_out >= _SEEN for w in views)
-    ordered = sorted(diagnosis.where, key=lambda p: (-_likeness(diagnosis, p), not seen[p.witness]))
+    ordered = sorted(diagnosis.where, key=lambda p: (-_probability_of_dependence(diagnosis, p), not seen[p.witness]))
     shown: list[Place] = []
     for place in ordered:  # with one scan, a place in all scans and one in that scan are the same
         if not any(_is_same(values, place, other) for other in shown):
@@ -172,7 +172,7 @@ def is_line(plan: Plan | RunTable, rows: IntArray) -> bool:
     return bool(across <= _ASTRAY * widest)
 
 
-def _likeness(diagnosis: Diagnosis, place: Place) -> float:
+def _probability_of_dependence(diagnosis: Diagnosis, place: Place) -> float:
     """Return the probability that the unknown effect depends on a place's covariate; 0 where the effect is named."""
     shares = diagnosis.judged.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
@@ -181,7 +181,7 @@ def _likeness(diagnosis: Diagnosis, place: Place) -> float:
     return sum(p for family, p in shares.items() if family.partition(",")[0] == place.covariate + within)
 
 
-def _folded(diagnosis: Diagnosis) -> list[CovariateView]:
+def _at_period(diagnosis: Diagnosis) -> list[CovariateView]:
     """Fold time, or X, at the period of a named wave."""
     plan, out = diagnosis.recording.plan, []
     for effect in diagnosis.effects:

@@ -63,7 +63,7 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
         Section("Where it shows", _places(diagnosis, drawn)),
         Section(
             "Before and after the repair" if diagnosis.repair.changes_predictions else "The model",
-            _fits(diagnosis, drawn),
+            _before_and_after(diagnosis, drawn),
         ),
         Section("Does the repaired model predict held-out readings?", _gain(diagnosis, drawn)),
         Section("Aliased effects, and what would separate them", _aliases(diagnosis)),
@@ -108,7 +108,7 @@ def _first_caption(diagnosis: Diagnosis) -> str:
     if isinstance(shown, str):
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
     after = ", blue squares the repaired model" if diagnosis.repair.changes_predictions else ""
-    where = f" {_where(diagnosis, shown.place)}" if shown.place else ""
+    where = f" {_place_words(diagnosis, shown.place)}" if shown.place else ""
     circles = f"Orange circles: the model as calibrated{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
     return f"Residuals, averaged in bins. {circles} {band}{where} {bars}"
@@ -218,12 +218,12 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
             f"Bayes factor of {number(told, 1)} nats. It is in {file}: {description} ({asked})."
         )
     said = f"{description}: {asked}, {file}."
-    *others, last = map(_plain, plan.between)
+    *others, last = map(_in_words, plan.between)
     rivals = f"{others[0]} from {last}" if len(others) == 1 else f"{', '.join(others)} and {last}"
     return f"{said[:1].upper()}{said[1:]} Expected to separate {rivals} by {number(told, 1)} nats."
 
 
-def _plain(label: str) -> str:
+def _in_words(label: str) -> str:
     """Write a rival hypothesis of a plan in words; a label that holds no effect names is a phrase already."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
@@ -249,7 +249,7 @@ def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         ),
         *_credible(credible),
         *_candidates(diagnosis),
-        *_carried(diagnosis),
+        *_unlisted_corrections(diagnosis),
         *_weighings(diagnosis),
         *_effects(diagnosis),
     )
@@ -280,7 +280,7 @@ def _candidate(name: str) -> str:
     return effect_in_words(name) if is_in_words(name) else family_words(name)
 
 
-def _carried(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _unlisted_corrections(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """List corrections in the repaired sensor that are in none of the explanations above."""
     return tuple(
         paragraph(_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
@@ -315,7 +315,7 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
     if not diagnosis.where:
         return (paragraph("No residual is larger than noise explains."),)
     shown = [
-        figure(drawn[place.witness], _where(diagnosis, place, seen=seen))
+        figure(drawn[place.witness], _place_words(diagnosis, place, seen=seen))
         for place, seen in seen_first(diagnosis, ResidualNoise.of(diagnosis))
     ]
     opening = paragraph(
@@ -328,7 +328,7 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
     return (opening, *first, *more)
 
 
-def _fits(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _before_and_after(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     run = diagnosis.apparatus.words.run
     which = f"The {run} that the repair changes most" if diagnosis.repair.changes_predictions else f"One {run}"
     colours = "orange as calibrated, blue repaired" if diagnosis.repair.changes_predictions else "orange"
@@ -499,7 +499,7 @@ def _sentence(text: str) -> str:
     return readable(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
 
 
-def _where(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
+def _place_words(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
     """Describe where residuals are significant, and whether their means leave the band."""
     run = diagnosis.apparatus.words.run
     covariate, unit = words_and_unit(diagnosis, place.covariate)

@@ -43,7 +43,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     """Draw all figures: the first screen, before and after, noise, held-out gain, and one for each located residual."""
     chance, values = ResidualNoise.of(diagnosis), covariate_values(diagnosis)
     drawn = {
-        "first.svg": _first(diagnosis, chance),
+        "first.svg": _draw_evidence(diagnosis, chance),
         "before_after.svg": _before_and_after(diagnosis),
         "residuals.svg": _residuals(diagnosis),
         "noise.svg": _noise(diagnosis, chance),
@@ -73,7 +73,7 @@ def shown_first(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> Co
     return telling(diagnosis, ResidualNoise.of(diagnosis) if chance is None else chance)
 
 
-def _first(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     """Draw the evidence for the verdict and, below it, every explanation with its probability."""
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names = [hypothesis_in_words(h.effects) for h in listed]
@@ -85,7 +85,7 @@ def _first(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     elif isinstance(shown, str):
         _noise_panel(diagnosis, chance, shown)(above)
     else:
-        _along(diagnosis, chance, shown, after=True, each=False, ax=above)
+        _draw_means_along(diagnosis, chance, shown, after=True, each=False, ax=above)
     # All are passed on: the last bar adds up those that are not drawn.
     rest = [h.probability for h in diagnosis.hypotheses[len(listed) :]]
     hypothesis_probabilities(
@@ -107,12 +107,12 @@ def _witness(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: Floa
         axes = stack_of_axes([2.6])
     else:
         axes = stack_of_axes([2.4, 2.6])
-        _along(diagnosis, chance, along_scan(diagnosis, place.scan), after=False, each=True, ax=axes[0])
-    _along(diagnosis, chance, by_covariate, after=False, each=True, ax=axes[-1])
+        _draw_means_along(diagnosis, chance, along_scan(diagnosis, place.scan), after=False, each=True, ax=axes[0])
+    _draw_means_along(diagnosis, chance, by_covariate, after=False, each=True, ax=axes[-1])
     return svg(axes)
 
 
-def _along(
+def _draw_means_along(
     diagnosis: Diagnosis, chance: ResidualNoise, witness: CovariateView, *, after: bool, each: bool, ax: Axes
 ) -> Axes:
     names = witness.shown_names

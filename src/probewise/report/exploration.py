@@ -128,11 +128,11 @@ def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
     found = figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1
-    sections = (_doubt((*earlier, step), trust),) if trust < 1 else ()
+    sections = (_fault_probabilities((*earlier, step), trust),) if trust < 1 else ()
     return page("The robot's search", answer=f"{state}.", key_figure=found, sections=sections, reload_s=every_s)
 
 
-def _doubt(steps: Sequence[Step], trust: float) -> Section:
+def _fault_probabilities(steps: Sequence[Step], trust: float) -> Section:
     """Show the probabilities of the sensor's possible faults after each reading."""
     doubted = left_out_of(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
@@ -159,7 +159,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Say how far from the truth the estimates are, each beside its posterior sd."""
     step = run.last
     return ", ".join(
-        f"{without_unit(_own(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
+        f"{without_unit(_own_name(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
@@ -172,8 +172,10 @@ def answer(run: Exploration) -> str:
     known = ", ".join(f"{without_unit(p.name)} {with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters)
     if not run.reached:
         taken = count(len(run.steps), "reading")
-        return f"Not found to the target precision in {taken}; so far {_a(found.name)}{several} with {known}."
-    return f"Found in {count(len(run.steps), 'reading')}: {_a(found.name)}{several} with {known}."
+        return (
+            f"Not found to the target precision in {taken}; so far {_with_article(found.name)}{several} with {known}."
+        )
+    return f"Found in {count(len(run.steps), 'reading')}: {_with_article(found.name)}{several} with {known}."
 
 
 def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> Markup:
@@ -279,7 +281,7 @@ def write_page(
                 *(paragraph(f"Doubtful: {note}.") for note in run.notes),
             ),
         ),
-        *((_doubt(run.steps, run.experiment.trust),) if run.experiment.trust < 1 else ()),
+        *((_fault_probabilities(run.steps, run.experiment.trust),) if run.experiment.trust < 1 else ()),
         Section(
             "How fast",
             (
@@ -323,10 +325,10 @@ def _fit(p_value: float) -> str:
     return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
 
 
-def _own(step: Step, name: str) -> str:
+def _own_name(step: Step, name: str) -> str:
     """Drop the shape's name in front of a parameter name."""
     return name.removeprefix(f"{step.likely_shape}.")
 
 
-def _a(noun: str) -> str:
+def _with_article(noun: str) -> str:
     return f"{'an' if noun[0] in 'aeiou' else 'a'} {noun}"

@@ -32,11 +32,13 @@ def figures(fit: SystemFit) -> dict[str, bytes]:
     recording, own = fit.recording, fit.fitted.simulator
     unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
     drawn = svg(predicted_and_recorded(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
-    clouds = residual_clouds(_along(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit)
+    clouds = residual_clouds(
+        _columns_to_draw(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
+    )
     return {"predicted.svg": drawn, "residuals.svg": svg(clouds)}
 
 
-def _along(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
+def _columns_to_draw(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
     own = fit.fitted.simulator
     time = f"{plan.time} ({own.time_unit})" if plan.has_time else "row of the table"
     out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]

@@ -22,10 +22,10 @@ _MOST_RIVALS = 3
 
 def headline(diagnosis: Diagnosis) -> str:
     """Return the verdict in words: the most complete version that is short enough."""
-    return next(said for said in _sayings(diagnosis) if len(said.split()) <= MOST_WORDS)
+    return next(said for said in _versions(diagnosis) if len(said.split()) <= MOST_WORDS)
 
 
-def _sayings(diagnosis: Diagnosis) -> list[str]:
+def _versions(diagnosis: Diagnosis) -> list[str]:
     """List versions of the verdict, the most complete first; the last is always short enough."""
     n = int(diagnosis.recording.usable.sum())
     if diagnosis.judged.too_little:
@@ -88,7 +88,9 @@ def _undecided(diagnosis: Diagnosis) -> list[str]:
         plain = "These readings cannot tell whether anything is missing"
         return [f"{plain}; if so, most likely {hypothesis_in_words(leading)}.", f"{plain}."]
     rivals = [h.effects for h in diagnosis.hypotheses[:_MOST_RIVALS] if h.probability > _RIVAL]
-    said = [f"Something is missing: {_either(rivals[:n])}; these readings cannot tell which." for n in (3, 2)]
+    said = [
+        f"Something is missing: {_join_alternatives(rivals[:n])}; these readings cannot tell which." for n in (3, 2)
+    ]
     if len(rivals) < len(said):
         said = [
             f"Something is missing; {hypothesis_in_words(name)} fits best, but predicts new readings worse."
@@ -97,7 +99,7 @@ def _undecided(diagnosis: Diagnosis) -> list[str]:
     return [*said, "Something is missing, but these readings cannot tell what."]
 
 
-def _either(rivals: Sequence[tuple[str, ...]]) -> str:
+def _join_alternatives(rivals: Sequence[tuple[str, ...]]) -> str:
     """Join hypotheses by the effects in which they differ."""
     shared = frozenset.intersection(*map(frozenset, rivals))
     *others, last = (hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals)

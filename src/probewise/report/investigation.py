@@ -79,7 +79,7 @@ def write_page(
         )
     )
     known: set[str] = set()
-    story = Section("How it came to that", (), tuple(_told(each) for each in found.rounds))
+    story = Section("How it came to that", (), tuple(_round_words(each) for each in found.rounds))
     details = Section("The diagnosis of all readings", (), tuple(of_a_diagnosis.sections(last.diagnosis, drawn)))
     return page(
         f"Investigation: {last.diagnosis.verdict.replace('_', ' ')} after {count(len(found.rounds), 'round')}",
@@ -102,7 +102,7 @@ def _beliefs(each: Round) -> dict[str, float]:
     return out
 
 
-def _told(each: Round) -> Section:
+def _round_words(each: Round) -> Section:
     """Describe one round: the readings and their reason, the diagnosis, the next plan."""
     diagnosis = each.diagnosis
     why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.asked}"

@@ -99,18 +99,18 @@ def _in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[In
     if values.size == 0:
         return []
     if window is None:
-        return _even(values, np.arange(values.size), _LEAST_ROWS)
+        return _equal_groups(values, np.arange(values.size), _LEAST_ROWS)
     inside = (values >= window[0]) & (values <= window[1])
     least = int(np.clip(inside.sum(), 1, _LEAST_ROWS))
     parts = (values < window[0], inside, values > window[1])
-    return [group for part in parts if part.any() for group in _even(values, np.flatnonzero(part), least)]
+    return [group for part in parts if part.any() for group in _equal_groups(values, np.flatnonzero(part), least)]
 
 
-def _even(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
+def _equal_groups(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
     mine = values[rows]
     share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
     n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
-    groups = _joined(_steps(mine, rows, n), least)
+    groups = _merged_groups(_steps(mine, rows, n), least)
     if len(groups) >= min(_FEW_STEPS, n) or rows.size < _FEW_STEPS * least:
         return groups
     # Where most readings share a few values, groups of equal size show more than bins of equal width.
@@ -122,7 +122,7 @@ def _steps(mine: FloatArray, rows: IntArray, n: int) -> list[IntArray]:
     return [rows[step == k] for k in range(n)]
 
 
-def _joined(parts: Sequence[IntArray], least: int) -> list[IntArray]:
+def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
     groups: list[IntArray] = []
     waiting = np.empty(0, dtype=np.int64)
     for part in parts:

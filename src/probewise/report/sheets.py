@@ -139,7 +139,7 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     if paper not in PAPERS_MM:
         raise ParameterError("paper", paper, " or ".join(PAPERS_MM))
     width, height = PAPERS_MM[paper]
-    ways = [(_counts(sheet, page), page) for page in ((width, height), (height, width))]
+    ways = [(_pages_needed(sheet, page), page) for page in ((width, height), (height, width))]
     (n_columns, n_rows), page = min(ways, key=lambda way: way[0][0] * way[0][1])
     if n_columns * n_rows > _MOST_PAGES:
         w, h = sheet.size_mm
@@ -235,7 +235,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     crosses = np.array([*joints, face])
     beams = [_beam(a, b) for a, b in itertools.pairwise(joints)]
     drawn = np.concatenate([crosses, *beams, [[0.0, 0.0]]])
-    low, high = _around(drawn, _JIG_MM)
+    low, high = _sheet_around(drawn, _JIG_MM)
     if drawn[:, 1].min() >= 0:
         low = low[0], 0.0  # cut there, the sheet stands on the table
     middles = [(a + b) / 2 for a, b in itertools.pairwise(joints)]
@@ -271,7 +271,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     axis, out = np.array(geometry.axis_mm), float(face[0])
     along = np.array([math.cos(base), math.sin(base)])
     rest = axis + out * along
-    low, high = _around(np.array([axis, rest]), _JIG_BASE_MM)
+    low, high = _sheet_around(np.array([axis, rest]), _JIG_BASE_MM)
     x_low, y_low, x_high, y_high = *low, *high
     width, height = geometry.field_mm
     edges = [np.array([[max(x_low, 0.0), y], [min(x_high, width), y]]) for y in (0.0, height) if y_low < y < y_high]
@@ -307,14 +307,14 @@ def _beam(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
     return np.concatenate([*ends, ends[0][:1]])
 
 
-def _around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _sheet_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Corners of a sheet that shows these points, (n, 2)."""
     low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
     return _pair(low), _pair(high)
 
 
-def _counts(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
+def _pages_needed(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
     width, height = page_mm[0] - LEFT_MM - RIGHT_MM, page_mm[1] - BOTTOM_MM - TOP_MM
     w, h = sheet.size_mm
     return _count(w, width), _count(h, height)

@@ -63,7 +63,7 @@ def table_of_rows(study: Study) -> Markup:
         "arm time (s)",
         "processor time per decision (s)",
     )
-    lines = [(_needed(row, found), _told(row, found)) for row, found in study.table().items()]
+    lines = [(_readings_row(row, found), _information_row(row, found)) for row, found in study.table().items()]
     return fragment(
         table(readings, (first for first, _ in lines), caption=_INTERVALS),
         table(worth, (second for _, second in lines), caption="Information per reading, errors of the runs, and cost."),
@@ -80,9 +80,11 @@ def table_of_bounds(study: Study) -> Markup | None:
     for row, found in study.table().items():
         if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
             least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
-            search = _over(least.search_bits, least.search_capacity_bits)
-            refinement = _over(least.refinement_bits, least.capacity_bits)
-            lines.append((row.name, search, _shown(found.to_white), refinement, _shown(found.after_white)))
+            search = _ratio_words(least.search_bits, least.search_capacity_bits)
+            refinement = _ratio_words(least.refinement_bits, least.capacity_bits)
+            lines.append(
+                (row.name, search, _estimate_words(found.to_white), refinement, _estimate_words(found.after_white))
+            )
     header = (
         "row",
         "up to white, at least (bits over bits per reading)",
@@ -151,16 +153,16 @@ def _legend() -> Markup:
     )
 
 
-def _needed(row: Row, found: Summary) -> tuple[str, ...]:
+def _readings_row(row: Row, found: Summary) -> tuple[str, ...]:
     reached = found.reached
     return (
         row.name,
         str(found.n_runs),
         f"{number(100 * reached.value, 1)} % ({number(100 * reached.low, 1)} to {number(100 * reached.high, 1)})",
-        _shown(found.mean),
+        _estimate_words(found.mean),
         _with_interval(found.median),
-        _shown(found.to_white),
-        _shown(found.after_white),
+        _estimate_words(found.to_white),
+        _estimate_words(found.after_white),
     )
 
 
@@ -170,30 +172,30 @@ def _with_interval(estimate: Estimate) -> str:
     )
 
 
-def _told(row: Row, found: Summary) -> tuple[str, ...]:
+def _information_row(row: Row, found: Summary) -> tuple[str, ...]:
     return (
         row.name,
-        _shown(found.bits_each),
+        _estimate_words(found.bits_each),
         number(found.error_mm, 1),
         f"{count(found.wrong, 'run')} ({number(found.wrong_expected, 1)}, {found.wrong_limit})",
         _percent(found.held),
-        _shown(found.arm_s),
+        _estimate_words(found.arm_s),
         number(found.cpu_s, 2),
     )
 
 
-def _over(bits: float, capacity_bits: float) -> str:
+def _ratio_words(bits: float, capacity_bits: float) -> str:
     return f"{number(bits / capacity_bits, 1)} = {number(bits, 1)} / {number(capacity_bits, 2)}"
 
 
-def _shown(estimate: Estimate) -> str:
+def _estimate_words(estimate: Estimate) -> str:
     half = _half(estimate)
     return with_error(estimate.value, half) if half > 0 else number(estimate.value, 1)
 
 
 def _percent(estimate: Estimate) -> str:
     scaled = Estimate(100 * estimate.value, 100 * estimate.low, 100 * estimate.high)
-    return f"{_shown(scaled)} %" if math.isfinite(estimate.value) else "–"
+    return f"{_estimate_words(scaled)} %" if math.isfinite(estimate.value) else "–"
 
 
 def _half(estimate: Estimate) -> float:

@@ -77,13 +77,15 @@ def share_in_edges(edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float
         rise = yb - ya
         flat = np.abs(rise) < 1e-9
         mean_height = np.where(
-            flat, np.clip(0.5 * (ya + yb), -0.5, 0.5), (_clamped(yb) - _clamped(ya)) / np.where(flat, 1.0, rise)
+            flat,
+            np.clip(0.5 * (ya + yb), -0.5, 0.5),
+            (_integral_of_clip(yb) - _integral_of_clip(ya)) / np.where(flat, 1.0, rise),
         )
         total -= np.where(upright, 0.0, (b - a) * (mean_height + 0.5))
     return np.clip(total, 0.0, 1.0)
 
 
-def _clamped(y: FloatArray) -> FloatArray:
+def _integral_of_clip(y: FloatArray) -> FloatArray:
     """Antiderivative of clip(y, -1/2, 1/2)."""
     inner = np.clip(y, -0.5, 0.5)
     return 0.5 * inner**2 + 0.5 * np.abs(y - inner)

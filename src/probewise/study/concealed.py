@@ -291,7 +291,7 @@ def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[
     rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
     for trial, result in results.items():
         rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.name, result))
-    return [_summed(key, runs) for key, runs in rows.items()]
+    return [_summary_row(key, runs) for key, runs in rows.items()]
 
 
 def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -299,7 +299,7 @@ def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list
     return [{name: _cell(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
 
 
-def _summed(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> ConcealedRow:
+def _summary_row(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> ConcealedRow:
     effect, size, trust = key
     found = [run for _, run in runs]
     held = [hit for run in found for hit in run["held"]]

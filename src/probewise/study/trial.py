@@ -94,7 +94,7 @@ def experiment_of(row: Row) -> Experiment:
             return Experiment(shape, chain, student_t_bounds(levels, None), **common)
         return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
     free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
-    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_changed())
+    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_sensor_changes())
 
 
 def experiment_for_trial(trial: Trial) -> Experiment:
@@ -198,7 +198,7 @@ def spot_of() -> Spot:
     return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
 
 
-def _changed() -> Product:
+def _sensor_changes() -> Product:
     """Return the prior of changes of the sensor, the default of `experiment.sensor_prior`."""
     change = Change()
     level = change.level * (BRIGHT - DARK)

@@ -233,7 +233,7 @@ def solve(problem: Problem, steps: Steps, known: Sequence[Known], nearest: IntAr
     search.states[:, astray, 1:] = guess[:, astray, 1:]
     search.change[~search.done] = np.inf
     bands = _own_jacobians(search)
-    moved = _largest(search.states - guess, guess)
+    moved = _largest_change(search.states - guess, guess)
     return Solved(search.states, search.done, bands, moved, search.n_evaluated)
 
 
@@ -251,7 +251,7 @@ def _share_jacobians(search: _Search, known: Sequence[Known], nearest: IntArray)
             if not known[number].bands:
                 at = known[number].states[:, None]
                 known[number].bands.append(search.bands(samples[own][:1], at)[0])
-            correction[:, own] = _corrected(known[number].bands[0], missed[:, own], shared=True)
+            correction[:, own] = _solution(known[number].bands[0], missed[:, own], shared=True)
         search.correct(samples, correction)
         far = ~(search.change < _FAR)
         if samples.size == len(nearest) and far.sum() * search.steps.n_runs > _FEW_FAR:
@@ -268,7 +268,7 @@ def _own_jacobians(search: _Search) -> dict[int, FloatArray]:
         if not samples.size:
             break
         bands = search.bands(samples, search.states[:, samples])
-        correction = _corrected(np.concatenate(bands), search.missed(samples), shared=False)
+        correction = _solution(np.concatenate(bands), search.missed(samples), shared=False)
         last |= dict(zip(samples.tolist(), bands, strict=True))
         search.correct(samples, correction)
     return last
@@ -290,7 +290,7 @@ class _Search:
         self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
         self._chosen = np.zeros(0, dtype=np.int64)
         motion, parameters, _ = self.problem(np.arange(n_samples))
-        start = motion.settled({}, starts_of(motion.law, self.steps.places, parameters, n_samples))
+        start = motion.at_end_of_step({}, starts_of(motion.law, self.steps.places, parameters, n_samples))
         self.states[:, :, 0] = np.stack(list(start.values()))
 
     @property
@@ -311,7 +311,7 @@ class _Search:
         return self.ends(samples, states) - states[:, :, 1:]
 
     def bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
-        """Return the Jacobian of each of some samples about states (n_states, n, n_steps + 1, n_runs), by `_bands`."""
+        """Return the Jacobian of each of some samples about states (n_states, n, n_steps + 1, n_runs), by `_banded`."""
         at_end, columns = self.ends(samples, states), []
         for values in states:
             nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
@@ -319,11 +319,11 @@ class _Search:
             values += nudge
             columns.append((self.ends(samples, states) - at_end) / nudge)
             values[:] = before
-        return _bands(np.stack(columns, axis=1))
+        return _banded(np.stack(columns, axis=1))
 
     def correct(self, samples: IntArray, correction: FloatArray) -> None:
         """Add a correction (n_states, n, n_steps, n_runs) to some samples' states, and see who has converged."""
-        change = _largest(correction, self.states[:, samples])
+        change = _largest_change(correction, self.states[:, samples])
         self.states[:, samples, 1:] += correction
         with np.errstate(all="ignore"):
             rate = np.where(np.isfinite(self.change[samples]), change / self.change[samples], 0.0)
@@ -351,13 +351,13 @@ def _every_step(problem: Problem, steps: Steps, samples: IntArray) -> Callable[[
     return ends
 
 
-def _largest(change: FloatArray, states: FloatArray) -> FloatArray:
+def _largest_change(change: FloatArray, states: FloatArray) -> FloatArray:
     """Return the largest change (n_states, n_samples, ...), in the largest state of its kind, (n_samples,)."""
     size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
     return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
 
 
-def _bands(slopes: FloatArray) -> list[FloatArray]:
+def _banded(slopes: FloatArray) -> list[FloatArray]:
     """Return the system of all steps, for each sample the bands below its diagonal of ones, (n_unknowns, 2 n_states).
 
     `slopes` (n_states, n_states, n_samples, n_steps, n_runs) are those of a step's end by its begin. Unknowns are
@@ -371,7 +371,7 @@ def _bands(slopes: FloatArray) -> list[FloatArray]:
     return list(out.reshape(n_samples, -1, 2 * n_states))
 
 
-def _corrected(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
+def _solution(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
     """Solve for corrections (n_states, n_samples, n_steps, n_runs); samples share one Jacobian or each has its own."""
     n_states, n_samples, n_steps, n_runs = missed.shape
     right = missed.transpose(1, 3, 2, 0).reshape((n_samples, -1) if shared else (1, -1))

@@ -16,7 +16,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.progress import Progress
 from probewise.systems.simulator import Simulate
 
-__all__ = ["Caller", "CountedCalls", "Tally"]
+__all__ = ["Caller", "CountedCalls", "IntegrationTally"]
 
 MOST_CALLS = 20_000
 """Limit of calls in a diagnosis, for a `simulate` that takes one sample at a time."""
@@ -27,7 +27,7 @@ _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 
 
 @dataclass(eq=False)
-class Tally:
+class IntegrationTally:
     """Counts the integration steps of a law, and the samples at which it raises an error."""
 
     n_failed: int = 0
@@ -95,7 +95,7 @@ class Caller:
             raise ParameterError(name, "NaN at every place of the prior that was tried", "finite readings")
         together = cls(simulate, broadcasts=True, name=name)
         try:
-            if _alike(together(samples, columns, strict=True), alone):
+            if _nearly_equal(together(samples, columns, strict=True), alone):
                 return together
         except Exception:
             pass
@@ -113,7 +113,7 @@ class Caller:
         n_points = max(np.shape(v)[-1] for v in columns.values())
         with np.errstate(all="ignore"):
             if self.broadcasts:
-                self._counted()
+                self._count_call()
                 try:
                     readings = np.asarray(self.simulate(dict(parameters), dict(columns)), dtype=np.float64)
                 except Exception:
@@ -130,7 +130,7 @@ class Caller:
                     for name, values in columns.items()
                 }
                 try:
-                    out[k] = self._one(own, table, n_points)
+                    out[k] = self._call_for_one_sample(own, table, n_points)
                 except (ShapeError, KeyboardInterrupt):
                     raise
                 except Exception as error:
@@ -140,7 +140,7 @@ class Caller:
                 raise first_error
         return out
 
-    def _remembered(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
+    def _cached_call(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
         """Call `simulate`, or return its cached result: effects on the readings do not change its arguments."""
         digest = hashlib.blake2b(digest_size=16)
         for name, values in (*own.items(), *columns.items()):
@@ -148,7 +148,7 @@ class Caller:
             digest.update(np.ascontiguousarray(values).tobytes())
         known = self._known.pop(key := digest.digest(), None)
         if known is None:
-            self._counted()
+            self._count_call()
             returned = np.array(self.simulate(dict(own), dict(columns)), dtype=np.float64)
             known = _of_shape(returned, (n_points,), self.name)
         self._known[key] = known
@@ -156,14 +156,16 @@ class Caller:
             self._known.pop(next(iter(self._known)))
         return known
 
-    def _counted(self) -> None:
+    def _count_call(self) -> None:
         self.n_calls += 1
         self.on_call()
 
-    def _one(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
+    def _call_for_one_sample(
+        self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int
+    ) -> FloatArray:
         vary = [name for name, v in own.items() if np.ndim(v) == 1 and name not in self.by_row]
         if not vary:
-            return self._remembered(own, columns, n_points)
+            return self._cached_call(own, columns, n_points)
         self.interpolated.update(vary)
         nodes = [_nodes(own[name]) for name in vary]
         out = np.zeros(n_points)
@@ -172,7 +174,7 @@ class Caller:
             share = np.ones(n_points)
             for name, each, i in zip(vary, nodes, at, strict=True):
                 share = share * _lagrange(each, i, own[name])
-            out += share * self._one({**own, **fixed}, columns, n_points)
+            out += share * self._call_for_one_sample({**own, **fixed}, columns, n_points)
         return out
 
 
@@ -190,14 +192,14 @@ class CountedCalls:
     def __init__(self, progress: Progress, caller: Caller) -> None:
         self._progress, self._caller = progress, caller
         self._now = ("calling simulate", 0, 0, "")
-        caller.on_call = self._again
+        caller.on_call = self._report_again
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
         """Report the progress of a stage."""
         self._now = stage, done, total, note
-        self._again()
+        self._report_again()
 
-    def _again(self) -> None:
+    def _report_again(self) -> None:
         stage, done, total, note = self._now
         most = "" if self._caller.broadcasts else f" of at most {MOST_CALLS:,}"
         calls = f"{self._caller.n_calls:,}{most} calls of simulate"
@@ -219,7 +221,7 @@ def _taken_by_row(
         trial = Caller(one.simulate, broadcasts=False, by_row=frozenset({*per_run, name}))
         spread = {**samples, name: np.broadcast_to(values, (len(values), n_points))}
         try:
-            if _alike(trial(spread, columns, strict=True), alone):
+            if _nearly_equal(trial(spread, columns, strict=True), alone):
                 taken.append(name)
         except Exception:
             continue
@@ -244,7 +246,7 @@ def _lagrange(nodes: FloatArray, i: int, at: FloatArray) -> FloatArray:
     return np.asarray(np.prod((at[:, None] - others) / (nodes[i] - others), axis=1))
 
 
-def _alike(first: FloatArray, second: FloatArray) -> bool:
+def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
     if first.shape != second.shape or not np.array_equal(np.isfinite(first), np.isfinite(second)):
         return False
     there = np.isfinite(first)

@@ -90,7 +90,7 @@ def _simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
         per_run=_texts(said, "per_run"),
         controls=_texts(said, "controls"),
         noise=Noise.of(said.get("noise", {})),
-        extra={name: _extra(name, each) for name, each in _mapping(said, "extra").items()},
+        extra={name: _extra_input(name, each) for name, each in _mapping(said, "extra").items()},
         vectorized=bool(said.get("vectorized", False)),
         source=path.name,
         fingerprint=hashlib.sha256(text.encode()).hexdigest()[:16],
@@ -125,7 +125,7 @@ def _function(said: Mapping[str, Any], name: str) -> Any:
     return value
 
 
-def _extra(name: str, given: object) -> Extra:
+def _extra_input(name: str, given: object) -> Extra:
     if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
         raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
     return Extra(marginal_of(name, given["prior"]), float(given["null"]), str(given["says"]))

@@ -54,7 +54,7 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
         beyond = [name for name in table.columns if name not in first.columns]
         notes += [f"column {name} of {source} left out: {sources[0]} has none" for name in beyond]
     columns = {
-        name: _joined(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
+        name: _joined_column(name, [t.columns.get(name) for t in tables], [len(t) for t in tables], sources)
         for name in first.columns
     }
     run = first.run or unused_name(_FILE, columns)
@@ -68,7 +68,7 @@ def behind(table: RunTable, more: Sequence[RunTable]) -> RunTable:
     return replace(table, columns=columns, like={key: value for t in (table, *more) for key, value in t.like.items()})
 
 
-def _joined(
+def _joined_column(
     name: str, parts: Sequence[NDArray[Any] | None], lengths: Sequence[int], sources: Sequence[str]
 ) -> NDArray[Any]:
     first = parts[0]

@@ -104,7 +104,7 @@ class Motion:
             out[limit.state] = np.where(stopped, 0.0, rate)
         return out
 
-    def settled(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+    def at_end_of_step(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
         """Correct states at the end of a step: clip to bounds, and stop states that friction brought to rest."""
         for state, way in ways.items():
             after[state] = np.where(way * after[state] < 0, 0.0, after[state])
@@ -234,7 +234,7 @@ def path(
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
     start = starts_of(motion.law, places, parameters, n_samples)
     gaps = gaps_of(places, columns)
-    s = motion.settled({}, dict(start))
+    s = motion.at_end_of_step({}, dict(start))
     with np.errstate(all="ignore"):
         given_there = Given.of(motion, places, parameters, columns, start)
         yield s
@@ -284,7 +284,7 @@ def stepped(
         anew = motion.ways(at_rest, *between(begin + ran_out))
         after = _runge_kutta(motion, at_rest, between, gap, begin + ran_out, length - ran_out, anew)
         ways = anew
-    return motion.settled(ways, after) if ways or motion.limits else after
+    return motion.at_end_of_step(ways, after) if ways or motion.limits else after
 
 
 def _runge_kutta(

@@ -17,7 +17,7 @@ from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
 from probewise.systems.all_steps import Trajectories, integrate_near, steps_of
-from probewise.systems.calls import Caller, Tally
+from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.mistakes import mistake_in
 from probewise.systems.motion import Motion, RowsInRuns, integrate, observed
 from probewise.systems.simulator import Simulator
@@ -57,7 +57,7 @@ class System:
     max_step: float = np.inf
     caller: Caller | None = None
     first: FloatArray | None = None
-    tally: Tally = field(default_factory=Tally)
+    tally: IntegrationTally = field(default_factory=IntegrationTally)
     trajectories: Trajectories = field(default_factory=Trajectories, repr=False)
 
     @classmethod
@@ -306,10 +306,10 @@ class SystemChain:
         if system.caller is not None:
             readings = system.caller(parameters, columns)
         else:
-            readings = self._moved(parameters, columns, theta, plan)
+            readings = self._integrated(parameters, columns, theta, plan)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
-    def _moved(
+    def _integrated(
         self,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
@@ -352,7 +352,7 @@ class SystemChain:
             return values[min(k, len(values) - 1)][None] if np.ndim(values) == 2 else values
 
         each = [
-            self._moved(
+            self._integrated(
                 {name: of_one(values, k) for name, values in parameters.items()},
                 {name: of_one(values, k) for name, values in columns.items()},
                 theta[k : k + 1],

@@ -65,7 +65,7 @@ def rival(name: str, probability: float, settings: list[float], plan: Plan) -> R
     sensor = default_sensor(extent, 1)
     effect = VOCABULARY[name].for_extent(extent)
     model = Model(sensor, (effect,), plan)
-    z = np.concatenate([np.zeros(sensor.n_params), model.scores_of(np.array([settings]))[0]])
+    z = np.concatenate([np.zeros(sensor.n_params), model.coordinates_of_last_effect(np.array([settings]))[0]])
     return Rival(name.replace("_", " "), model, z, 0.01 * np.eye(len(z)), probability)
 
 

@@ -25,7 +25,7 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
     sensor = default_sensor(EXTENT, 1)
     effect = VOCABULARY["ambient_gradient"].for_extent(EXTENT)
     model = Model(sensor, (effect,), PLAN)
-    z = np.concatenate([np.full(sensor.n_params, 0.2), model.scores_of(np.array([[amount, 0.0]]))[0]])
+    z = np.concatenate([np.full(sensor.n_params, 0.2), model.coordinates_of_last_effect(np.array([[amount, 0.0]]))[0]])
     predicted, slopes = model.jacobian(z)
     found = Fit(model, z, predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
     law = white(len(PLAN))

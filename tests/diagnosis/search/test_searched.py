@@ -64,6 +64,6 @@ def test_the_most_probable_noise_is_that_under_any_mean_or_of_those_that_are_sta
             ((), ("drifting_noise",)): 0.05,
         },
     )
-    assert found.noise() == ("outliers",)
-    assert found.noise(()) == ()  # a noise that has no name counts as none
-    assert found.noise(("outliers",)) == ("outliers",)
+    assert found.likeliest_noise() == ("outliers",)
+    assert found.likeliest_noise(()) == ()  # a noise that has no name counts as none
+    assert found.likeliest_noise(("outliers",)) == ("outliers",)

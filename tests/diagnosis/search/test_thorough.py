@@ -73,8 +73,8 @@ def test_the_weighing_says_first_how_long_it_may_take_and_then_how_far_it_is(ste
 
 
 def test_the_time_of_a_weighing_grows_with_its_live_points_and_its_hypotheses(stepped):
-    leaders = thorough._leaders(stepped)
-    few, many = (thorough._minutes(leaders, stepped, n, rng=np.random.default_rng(0)) for n in (100, 10_000))
+    leaders = thorough._leading_hypotheses(stepped)
+    few, many = (thorough._estimated_minutes(leaders, stepped, n, rng=np.random.default_rng(0)) for n in (100, 10_000))
     assert few[0] < few[1] < many[1]
     assert thorough._in_words((3.2, 14.1)) == "3 to 15 minutes"
 
@@ -147,14 +147,14 @@ def test_a_peak_that_the_search_has_lost_is_found_from_the_fit(stepped, monkeypa
             samples=lambda n, rng: 5.0 + 0.001 * result.samples(n, rng=rng),
         )
 
-    plain = thorough._about
+    plain = thorough._evidence_near_posterior
     about = []
 
     def noted(*given):
         about.append(plain(*given))
         return about[-1] if len(about) % 2 == 0 else replace(about[-1], log_z=about[-1].log_z - 20.0)
 
-    monkeypatch.setattr(thorough, "_about", noted)
+    monkeypatch.setattr(thorough, "_evidence_near_posterior", noted)
     stub_of_the_whole_prior(monkeypatch, lost)
     _, weighings = weigh_thoroughly(stepped, rng=np.random.default_rng(2), n_live=50)
     assert len(about) == 2 * len(weighings)

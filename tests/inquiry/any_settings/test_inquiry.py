@@ -67,17 +67,17 @@ def test_a_surprising_reading_starts_nested_sampling_anew():
 def test_the_first_reading_of_a_line_is_taken_where_the_predictions_differ_most():
     asked = inquiry()
     bits = 0.5 * np.log2(1 + (4.0 + PLACES**2) / 0.09)
-    np.testing.assert_allclose(asked.worth, bits, atol=0.1)
+    np.testing.assert_allclose(asked.utility, bits, atol=0.1)
     assert asked.next() == 2.0
     assert asked.next() == 2.0
-    assert asked.worth_label == "expected information (bits)"
+    assert asked.utility_label == "expected information (bits)"
 
 
 def test_readings_are_chosen_for_what_the_goal_names():
     """The offset alone: read at zero. The slope alone, with the offset known: read at the far end."""
     asked = inquiry(goal={"offset": 0.9})
     assert asked.next() == 0.0
-    assert "sd / goal" in asked.worth_label
+    assert "sd / goal" in asked.utility_label
     known = {"slope": Normal(0.0, 1.0), "offset": Normal(0.0, 0.01)}
     far = inquiry(goal={"slope": 0.4}, prior=known, noise=1.0)
     assert far.next() == 2.0
@@ -98,7 +98,7 @@ def test_seconds_count():
     asked = inquiry(cost_s=lambda last: np.ones(5) if last is None else 0.01 + 100 * np.abs(PLACES - last))
     asked.tell(0.3, 1.0)
     assert asked.next() == 1.0
-    assert asked.worth_label.endswith("per second")
+    assert asked.utility_label.endswith("per second")
 
 
 def test_the_same_generator_and_readings_give_the_same_choices():

@@ -206,7 +206,7 @@ class Motor:
             here = self._synchronise()
         target = goal - side * self._coasts(self.drive.fast_power, side)
         if min(side * (target - here), side * (target - self._known_target)) > 0:
-            here = self._go(target, side, self.drive.fast_power, here)
+            here = self._limited_move(target, side, self.drive.fast_power, here)
         return here
 
     def find_stop(self, side: Side, farthest: int) -> int:
@@ -257,8 +257,8 @@ class Motor:
         least = max(side * here, side * self._known_target) + 1  # a target behind this position causes no motion
         short = goal - side * (2 * self.drive.lead_counts + self._coasts(fast, side))
         if side * short > least + self.drive.lead_counts:
-            return self._go(short, side, fast, here)
-        return self._go(side * max(side * target, least), side, slow, here)
+            return self._limited_move(short, side, fast, here)
+        return self._limited_move(side * max(side * target, least), side, slow, here)
 
     def _back_off(self, goal: int, side: Side, here: int) -> int:
         """Back off behind the goal, far enough for a slow move to start and take up the play."""
@@ -268,14 +268,14 @@ class Motor:
         least = max(back * here, back * self._known_target) + 1
         short = behind + side * self._coasts(fast, back)
         if back * short > least + self.drive.lead_counts:
-            return self._go(short, back, fast, here)
-        return self._go(back * max(back * behind, least), back, slow, here)
+            return self._limited_move(short, back, fast, here)
+        return self._limited_move(back * max(back * behind, least), back, slow, here)
 
     def _coasts(self, power: int, side: Side) -> int:
         share = power / self.drive.fast_power
         return round(self._coast.get((power, side), share * self.drive.coast_counts))
 
-    def _go(self, target: int, side: Side, power: int, here: int) -> int:
+    def _limited_move(self, target: int, side: Side, power: int, here: int) -> int:
         """Make one limited move to a firmware target, and read the resulting count."""
         stop = target + side * self._coasts(power, side)
         if self._guard is not None:
@@ -365,14 +365,14 @@ class Motor:
 
         A corrupted byte shifts one of the three counters against the others.
         """
-        state, before = self._asked(), None
+        state, before = self._output_state(), None
         n_asked = 1
-        while (_datum_of(state) != self._datum or not is_likely(state)) and _essence(state) != before:
+        while (_datum_of(state) != self._datum or not is_likely(state)) and _settings_of(state) != before:
             if n_asked == N_ASKED:
                 raise MotorError(
                     f"motor {self.letter} reports another state each of {N_ASKED} times; is the brick near?"
                 )
-            before, state = _essence(state), self._asked()
+            before, state = _settings_of(state), self._output_state()
             n_asked += 1
         self.last_counts = state.rotation_counts
         if _datum_of(state) != self._datum:
@@ -380,7 +380,7 @@ class Motor:
             self._target, self._datum = None, _datum_of(state)
         return state
 
-    def _asked(self) -> OutputState:
+    def _output_state(self) -> OutputState:
         return self._link.ask(GetOutputState(self.port))
 
     def _command(self, power: int, limit: int) -> SetOutputState:
@@ -392,6 +392,6 @@ def _datum_of(state: OutputState) -> tuple[int, int]:
     return state.tacho_counts - state.rotation_counts, state.tacho_counts - state.block_counts
 
 
-def _essence(state: OutputState) -> tuple[object, ...]:
+def _settings_of(state: OutputState) -> tuple[object, ...]:
     """Return the fields that do not change while a motor turns."""
     return _datum_of(state), state.power, state.mode, state.regulation, state.run_state, state.limit_counts

@@ -59,20 +59,20 @@ class SerialPort:
             self._port.timeout = timeout_s
             return bytes(self._port.read(size))
         except OSError as error:
-            raise self._cut(error) from error
+            raise self._link_cut_error(error) from error
 
     def write(self, data: bytes) -> None:
         """Send all bytes."""
         try:
             self._port.write(data)
         except OSError as error:
-            raise self._cut(error) from error
+            raise self._link_cut_error(error) from error
 
     def close(self) -> None:
         """Close the port."""
         self._port.close()
 
-    def _cut(self, error: OSError) -> LinkError:
+    def _link_cut_error(self, error: OSError) -> LinkError:
         return LinkError(f"the line to the NXT on {self.name} is cut ({_reason(error)}); is the brick on and near?")
 
 

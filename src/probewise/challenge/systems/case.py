@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from probewise.challenge.case import Task, said
-from probewise.challenge.covering import parameters_within
+from probewise.challenge.covering import truths_and_intervals
 from probewise.challenge.systems.held_out import log_densities_of_runs
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.system.diagnose import diagnose_system
@@ -106,7 +106,7 @@ def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
     return {
         **said(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
-        "parameters": {e.name: parameters_within(e.parameters, found[e.name]) for e in named},
+        "parameters": {e.name: truths_and_intervals(e.parameters, found[e.name]) for e in named},
         "formula": _has_formula(diagnosis),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, rng=later),
         "cpu_s": cpu_s,

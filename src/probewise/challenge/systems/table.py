@@ -38,7 +38,7 @@ def score_systems(results: Sequence[Result]) -> tuple[Row, ...]:
         *_probabilities(done),
         *_intervals(done),
         *_held_out(done),
-        *_strange(done),
+        *_unlisted_laws(done),
         *_time(done),
         Row("cases that failed", share(["failed" in r for r in results])),
     )
@@ -138,7 +138,7 @@ def _median(rows: FloatArray) -> float:
     return float(np.median(rows))
 
 
-def _strange(done: list[Result]) -> list[Row]:
+def _unlisted_laws(done: list[Result]) -> list[Row]:
     outside = [r for r in done if r["kind"] == "outside"]
     inside = [r for r in done if r["kind"] != "outside"]
     good = [_as_good(r) for r in outside]

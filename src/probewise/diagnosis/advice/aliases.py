@@ -108,7 +108,7 @@ def settle(
     shapes = {}
     for name in names:
         model = found.model.with_effect(effects[name])
-        z = np.concatenate([found.z, model.scores_of(effects[name].bank()[0][:1])[0]])
+        z = np.concatenate([found.z, model.coordinates_of_last_effect(effects[name].bank()[0][:1])[0]])
         here = model.predict(z[None, :])[0] - null
         shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
     best = {pair.effects: (_LEAST_NATS, pair) for pair in pairs}

@@ -102,7 +102,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
     offered = apparatus.commands(plan, strides=_STRIDES, level=level)
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
-    offered = [offered[k] for k in _promising(rivals, sd, offered, plan, apparatus)]
+    offered = [offered[k] for k in _shortlisted(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
     everywhere, rows = apparatus.one_after_another(offered, plan), rows_of(offered)
@@ -155,7 +155,7 @@ def mutual_information(predictives: Sequence[PredictiveNormal], weights: FloatAr
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
 
 
-def _promising(
+def _shortlisted(
     rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
 ) -> list[int]:
     """Keep, for each pair of rivals, the few scans in which their predictions differ most per minute."""

@@ -49,7 +49,7 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     if apparatus.refits_are_over():
         return None
     others = dict.fromkeys(n for names in ranked for n in names if n in prepared.effects)
-    imagined = (_imagined(searched, null, name) for name in others)
+    imagined = (_insignificant_rival(searched, null, name) for name in others)
     tried = islice((rival for rival in imagined if rival is not None), _TRIED)
     wanted = (next_scans([*rivals, rival], sd, plan, apparatus) for rival in tried)
     return next((asked for asked in wanted if asked is not None), None)
@@ -60,7 +60,7 @@ def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> 
     return Rival(label, candidate.found.model, candidate.found.z, _root_of(candidate), probability)
 
 
-def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
+def _insignificant_rival(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
     """Return a rival with an insignificant effect of the size that gives lambda 3 here, or None."""
     effect, found = searched.prepared.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
@@ -77,7 +77,7 @@ def _imagined(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
         return np.asarray(model.predict(z[None, :])[0, searched.prepared.usable] - found.predicted)
 
     for _ in range(_SIZES if amplitudes else 1):
-        z = np.concatenate([found.z, model.scores_of(setting[None, :])[0]])
+        z = np.concatenate([found.z, model.coordinates_of_last_effect(setting[None, :])[0]])
         z[: len(found.z)] += problem.absorbed(found, change(z))  # the sensor refitted to readings with the effect
         if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.sd:
             root = np.zeros((len(z), len(z)))  # its size is fixed

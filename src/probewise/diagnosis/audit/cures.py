@@ -68,10 +68,10 @@ def cures_of(
         together = behind(current, [option.plan for option in options])
         laid = PlanTemplates.of(expected, together, effects, most=_MOST_SETTINGS)
         now = np.arange(len(current))
-        trouble = _trouble(laid, now, ailing)
+        trouble = _total_deficit(laid, now, ailing)
         worth = []
         for start, end in itertools.pairwise(np.cumsum([len(current), *(len(o.plan) for o in options)]).tolist()):
-            gained = trouble - _trouble(laid, np.concatenate([now, np.arange(start, end)]), ailing)
+            gained = trouble - _total_deficit(laid, np.concatenate([now, np.arange(start, end)]), ailing)
             readings = end - start
             worth.append(gained / readings if gained >= max(_WORTHWHILE, _WORTHWHILE_EACH * readings) else 0.0)
         best = int(np.argmax(worth))
@@ -82,7 +82,7 @@ def cures_of(
     return chosen
 
 
-def _trouble(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
+def _total_deficit(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
     """Return the summed deficit of effects: 0 fine, up to 1 aliased, 1 to 2 invisible."""
     detectability = ProjectedTemplates.of(laid, rows).detectability(ailing)
     total = 0.0

@@ -157,7 +157,7 @@ class ProjectedTemplates:
         Both are medians over the effect's settings; the cosine is to the best-imitating setting of the other effect.
         """
         laid = self.laid
-        present = {name: self._present(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
+        present = {name: self._active_entries(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
         shares = {
             name: float(np.median(self.kept[mine] / self.raw[mine])) if mine.size else 0.0
             for name, mine in present.items()
@@ -170,19 +170,19 @@ class ProjectedTemplates:
         mine = np.concatenate([present[name] for name in wanted])
         columns = np.flatnonzero(np.isin(laid.entry, mine))
         onto = (self.basis.T @ self.left[:, columns]) ** 2  # of each column, on every direction of the others
-        onto = np.add.reduceat(onto, _starts(laid.entry), axis=0)
-        onto = np.add.reduceat(onto, _starts(laid.entry[columns]), axis=1)
+        onto = np.add.reduceat(onto, _first_of_runs(laid.entry), axis=0)
+        onto = np.add.reduceat(onto, _first_of_runs(laid.entry[columns]), axis=1)
         mine = np.unique(laid.entry[columns])
-        best = np.maximum.reduceat(onto, _starts(laid.owner), axis=0) / np.maximum(self.kept[mine] ** 2, 1e-300)
+        best = np.maximum.reduceat(onto, _first_of_runs(laid.owner), axis=0) / np.maximum(self.kept[mine] ** 2, 1e-300)
         cosines = np.sqrt(np.minimum(best, 1.0))
-        owners = [laid.names[k] for k in laid.owner[_starts(laid.owner)]]
+        owners = [laid.names[k] for k in laid.owner[_first_of_runs(laid.owner)]]
         for name in wanted:
             typical = np.median(cosines[:, laid.owner[mine] == laid.names.index(name)], axis=1)
             like = dict(zip(owners, typical.tolist(), strict=True))
             out[name] = (shares[name], {other: like[other] for other in visible if other != name})
         return out
 
-    def _present(self, effect: int) -> IntArray:
+    def _active_entries(self, effect: int) -> IntArray:
         """Return the entries of an effect that act on these rows."""
         mine = np.flatnonzero(self.laid.owner == effect)
         return mine[self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)]
@@ -201,7 +201,7 @@ class ProjectedTemplates:
         return tuple(out)
 
 
-def _starts(codes: IntArray) -> IntArray:
+def _first_of_runs(codes: IntArray) -> IntArray:
     """Return the first index of each run of equal codes."""
     return np.flatnonzero(np.diff(codes, prepend=-1))
 

@@ -187,9 +187,9 @@ class PlanAudit(ShowsItself):
     def summary(self) -> str:
         """Return a plain-text summary."""
         lines = [f"{len(self.plan)} readings in {count_of(self.plan.scan_names, self.words.run)}; {self.assumed}"]
-        lines += _listed("fine", [e.name for e in self.seen_as("fine")])
-        lines += _listed("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
-        lines += _listed("invisible", [e.name for e in self.seen_as("invisible")])
+        lines += _wrapped_list("fine", [e.name for e in self.seen_as("fine")])
+        lines += _wrapped_list("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
+        lines += _wrapped_list("invisible", [e.name for e in self.seen_as("invisible")])
         lines += _READING_GUIDE
         if not self.cures:
             cured = "not needed" if len(self.seen_as("fine")) == len(self.effects) else self.words.no_cure
@@ -201,7 +201,7 @@ class PlanAudit(ShowsItself):
             said = f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}"
             lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
         left = [e.name for e in self.after if e.detectability != "fine"]
-        return "\n".join([*lines, *_listed("left", left or ["nothing"])])
+        return "\n".join([*lines, *_wrapped_list("left", left or ["nothing"])])
 
 
 def count_of(names: Sequence[str], noun: str) -> str:
@@ -213,7 +213,7 @@ def _with_aliases(effect: EffectAudit) -> str:
     return f"{effect.name} ({effect.alike[0][0]} {effect.alike[0][1]:.2f})"
 
 
-def _listed(label: str, names: Sequence[str], width: int = 100) -> list[str]:
+def _wrapped_list(label: str, names: Sequence[str], width: int = 100) -> list[str]:
     """Wrap names after a label."""
     lines, line = [], f"{label:<10} "
     for k, name in enumerate(names):
@@ -264,7 +264,7 @@ def audit_plan(
     require_described(plan)
     if noise_sd is None and isinstance(sensor, FittedSensor):
         noise_sd = float(sensor.noise_sd.mean())
-    expected, said = _expected(plan, sensor, noise_sd)
+    expected, said = _expected_sensor(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
     progress("judging the plan")
     before, cosines = judged(PlanTemplates.of(expected, plan, effects), effects, unit)
@@ -337,7 +337,7 @@ def audit_recorded(
     return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
 
 
-def _expected(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) -> tuple[Expected, str]:
+def _expected_sensor(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) -> tuple[Expected, str]:
     """Return the expected sensor, and its description."""
     if sensor is not None:
         mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
@@ -381,12 +381,12 @@ def judged(
             share, like = detectability[name]
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
-            out.append(_seen(effect, share, like, seen.smallest(effect), unit))
+            out.append(_audit_of(effect, share, like, seen.smallest(effect), unit))
         cosines[own, own] = out[-1].share
     return tuple(out), cosines
 
 
-def _seen(
+def _audit_of(
     effect: NamedEffect[Any], share: float, like: Mapping[str, float], amounts: tuple[float | None, ...], unit: str
 ) -> EffectAudit:
     if share < LEAST_SHARE:

@@ -49,11 +49,11 @@ class Bank:
 
     def __getitem__(self, at: int) -> FloatArray:
         """Return one template, (n_points, k)."""
-        first = int(self._starts[at])
+        first = int(self._first_columns[at])
         return self.columns[:, first : first + int(self.widths[at])]
 
     @cached_property
-    def _starts(self) -> IntArray:
+    def _first_columns(self) -> IntArray:
         """First column of each template, (n_templates,)."""
         return np.cumsum(self.widths) - self.widths
 
@@ -65,7 +65,7 @@ class Bank:
 
     def take(self, members: IntArray) -> Bank:
         """Return the bank of these templates."""
-        at = [self._starts[k] + np.arange(self.widths[k]) for k in members]
+        at = [self._first_columns[k] + np.arange(self.widths[k]) for k in members]
         columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
         return Bank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
 
@@ -85,7 +85,7 @@ class Bank:
         """
         own = problem.residual[:, None] if residuals is None else residuals
         n = problem.n_points
-        whitened = self._under(problem.law)
+        whitened = self._scaled_under(problem.law)
         taken = problem.basis[:n].T @ whitened.templates  # the part that the fit absorbs, (n_params, n_columns)
         along = whitened.templates.T @ own[:n]
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
@@ -103,17 +103,17 @@ class Bank:
 
     def surviving(self, problem: Linearised) -> FloatArray:
         """Return the share of each template that a fit does not absorb, (n_templates,)."""
-        templates = self._under(problem.law).templates
+        templates = self._scaled_under(problem.law).templates
         taken = problem.basis[: problem.n_points].T @ templates
-        whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._starts) for a in (templates, taken))
+        whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._first_columns) for a in (templates, taken))
         return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
 
     def _of_width(self, width: int) -> tuple[IntArray, IntArray]:
         """Return the indices of the templates of one width, (n,), and of their columns, (n, width)."""
         members = np.flatnonzero(self.widths == width)
-        return members, self._starts[members, None] + np.arange(width)
+        return members, self._first_columns[members, None] + np.arange(width)
 
-    def _under(self, law: NoiseLaw) -> _Whitened:
+    def _scaled_under(self, law: NoiseLaw) -> _Whitened:
         """Whiten all templates and scale each to unit rms."""
         key = law.linear
         if key in self._whitened:

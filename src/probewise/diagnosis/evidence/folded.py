@@ -50,7 +50,7 @@ class FoldedNormal(StandardNormal):
         shift = np.stack([self.sensor.permuted(np.zeros((1, n_own)), order) for order in orders])
         return np.stack([self.sensor.permuted(np.eye(n_own), order) for order in orders]) - shift, shift
 
-    def _images(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _reordered_copies(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return every order's coordinates, (n_orders, n_samples, n_params), and their distances from the point."""
         turn, shift = self._other_orders
         images = np.repeat(z[None], len(turn) + 1, axis=0)
@@ -60,7 +60,7 @@ class FoldedNormal(StandardNormal):
 
     def fold(self, z: FloatArray) -> FloatArray:
         """Reorder the Gaussians to be nearest to the point, (n_samples, n_params) both ways."""
-        images, far = self._images(z)
+        images, far = self._reordered_copies(z)
         return np.asarray(images[np.argmin(far, axis=0), np.arange(len(z))])
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
@@ -69,7 +69,7 @@ class FoldedNormal(StandardNormal):
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the log density summed over all orders, (n_samples,); -inf if another order is nearer."""
-        images, far = self._images(theta)
+        images, far = self._reordered_copies(theta)
         density = logsumexp([super(FoldedNormal, self).log_prob(image) for image in images], axis=0)
         return np.where(far[0] <= far[1:].min(axis=0), density, -np.inf)
 

@@ -84,7 +84,7 @@ class JointProblem:
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
         residuals = (self.recording.readings[usable] - predicted).T
-        nodes, kept = self.noise.nodes, self._kept
+        nodes, kept = self.noise.nodes, self._n_nodes_kept
         laws, log_share = [nodes.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
         terms = [
             log_weight + log_likelihood_of_whitened(law, law(residuals))
@@ -94,7 +94,7 @@ class JointProblem:
         return np.where(np.isfinite(out), out, -np.inf)
 
     @cached_property
-    def _kept(self) -> list[int]:
+    def _n_nodes_kept(self) -> list[int]:
         """Fewest noise nodes that hold the given share of the evidence."""
         order = np.argsort(-self.noise.weights)
         n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1

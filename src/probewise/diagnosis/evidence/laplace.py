@@ -137,7 +137,7 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) ->
     for _ in range(3):
         variance = np.maximum(squares() / n_points, least)
         curvature = jj / variance[:, None, None] + np.eye(p)
-        steps = _solved(curvature, jr / variance[:, None] - found.z)
+        steps = _newton_steps(curvature, jr / variance[:, None] - found.z)
     fit_and_prior = _peak(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
     rss = squares()
     variance = np.maximum(rss / n_points, least)
@@ -159,7 +159,7 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> Float
         variance = sigma**2 / tail.information
         curvature = gram / variance[:, None, None] + np.eye(p)
         downhill = slopes.T @ tail.as_normal(left, sigma) / variance - found.z[:, None] - steps
-        steps += _solved(curvature, downhill.T).T
+        steps += _newton_steps(curvature, downhill.T).T
     left = residual - slopes @ steps
     sigma = tail.scale(left, n_points, floor=least, start=sigma)
     fit_and_prior = _peak((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
@@ -167,7 +167,7 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> Float
     return np.asarray(fit_and_prior - tail.misfit(left, sigma, n_points) + scale)
 
 
-def _solved(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
     """Return the Newton steps to the modes, (n_laws, n_params), for curvatures (n_laws, n_params, n_params)."""
     try:
         return np.asarray(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0])

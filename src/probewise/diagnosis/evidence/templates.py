@@ -19,7 +19,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.effects import NamedEffect, in_scans
 from probewise.sensor import Stage
 
-__all__ = ["EffectTemplates", "TemplateMemory", "effect_templates", "subsets"]
+__all__ = ["EffectTemplates", "TemplateMemory", "combinations_of", "effect_templates"]
 
 _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
 _ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none
@@ -83,14 +83,14 @@ def effect_templates(
         choice, entries = choice[kept], entries[kept]
     gates = effect.gates(found.model.plan)
     if gates is not None:
-        (everywhere,) = _columns(found, effect, gates.always[None, :, :], usable)
+        (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
         columns = [everywhere * gates.opened[k][usable, None] for k in choice]
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
         for _, group in itertools.groupby(range(len(choice)), key=lambda at: _bound_to(variants[choice[at]])):
             at = list(group)
-            columns += _columns(found, variants[choice[at[0]]], entries[at], usable)
+            columns += _predicted_changes(found, variants[choice[at[0]]], entries[at], usable)
     return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
 
 
@@ -98,7 +98,7 @@ def _bound_to(variant: NamedEffect[Any]) -> tuple[object, object]:
     return variant.scans, variant.patterns
 
 
-def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
+def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
     """Predict the settings of a bank, in the scans that the effect is bound to: each (n_usable, n_columns)."""
     plain, plan = found.model, found.model.plan
     model = plain.with_effect(effect)
@@ -127,7 +127,7 @@ def _columns(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: Int
     return np.split(columns, len(bank), axis=1)
 
 
-def subsets(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
+def combinations_of(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
     """List every combination of up to `most` names, each sorted, the empty one first."""
     for size in range(most + 1):
         yield from itertools.combinations(sorted(names), size)

@@ -30,7 +30,7 @@ __all__ = [
     "CalibratedSensor",
     "SensorCoordinates",
     "default_sensor",
-    "effect_scores",
+    "effect_coordinates",
     "effect_values",
     "known_scene",
     "natural_to_theta",
@@ -124,17 +124,17 @@ class CalibratedSensor(ABC):
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
-        return self.from_natural(self._natural(z))
+        return self.from_natural(self._natural_parameters(z))
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Invert `theta`."""
         return self._scores(self.to_natural(theta))
 
-    def _natural(self, z: FloatArray) -> FloatArray:
+    def _natural_parameters(self, z: FloatArray) -> FloatArray:
         return self.center + z @ self.factor.T
 
     def _scores(self, natural: FloatArray) -> FloatArray:
-        """Invert `_natural`."""
+        """Invert `_natural_parameters`."""
         return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
@@ -179,7 +179,7 @@ class SensorCoordinates(CalibratedSensor):
 
     def permuted(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
         """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians permuted."""
-        n, natural = self.n_gaussians, self._natural(z)
+        n, natural = self.n_gaussians, self._natural_parameters(z)
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
         blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
         parts = [logits[:, 1:] - logits[:, :1], blocks.reshape(len(z), 5 * n), natural[:, -2:]]
@@ -238,6 +238,6 @@ def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:
     return effect.prior.from_unit_cube(ndtr(z))
 
 
-def effect_scores(effect: NamedEffect[Any], values: FloatArray) -> FloatArray:
+def effect_coordinates(effect: NamedEffect[Any], values: FloatArray) -> FloatArray:
     """Invert `effect_values`, within the bounds."""
     return np.clip(ndtri(effect.prior.to_unit_cube(values)), -FARTHEST + 0.5, FARTHEST - 0.5)

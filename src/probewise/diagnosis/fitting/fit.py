@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.fitting.coordinates import FARTHEST, SensorCoordinates, effect_scores, effect_values
+from probewise.diagnosis.fitting.coordinates import FARTHEST, SensorCoordinates, effect_coordinates, effect_values
 from probewise.diagnosis.fitting.null import Null, Predictor
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.effects import NamedEffect
@@ -110,9 +110,9 @@ class Model:
         stay[self.columns_of(name)] = False
         return Model(self.sensor, tuple(e for e in self.effects if e.name != name), self.plan), stay
 
-    def scores_of(self, values: FloatArray) -> FloatArray:
-        """Return the last effect's coordinates for its own parameters (n_samples, n_params)."""
-        return effect_scores(self.effects[-1], values)
+    def coordinates_of_last_effect(self, values: FloatArray) -> FloatArray:
+        """Return the last effect's coordinates z of values of its parameters, (n_samples, n_params) both."""
+        return effect_coordinates(self.effects[-1], values)
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
     NotConvergedError
         If the fit of the null did not converge, with enough readings to tell.
     """
-    prepared, null, noise = searched.prepared, searched.null, searched.posterior.noise()
+    prepared, null, noise = searched.prepared, searched.null, searched.posterior.likeliest_noise()
     problem = Linearised.of(null.found, null.evidence[noise].law)
     if not prepared.too_little:
         require_converged(null.found, Linearised.of(null.found, null.law))
@@ -49,7 +49,7 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
     p_value = global_p_value(problem, searched.looks(null.found), draws)
     p_value = _at_every_order(searched, null, noise, p_value, rng=rng)
     # Constant readings have no noise to compare a residual with.
-    return GlobalTest(null, noise, problem, draws, 1.0 if prepared.constant else p_value)
+    return GlobalTest(null, noise, problem, draws, 1.0 if prepared.has_equal_readings else p_value)
 
 
 def _at_every_order(

@@ -88,7 +88,7 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
             once = rescheduled(plan, rows, start_s, gap_s, label)
             both = np.concatenate([rows[: MOST_READINGS // 2 * 2 : 2], rows[: MOST_READINGS // 2 * 2 : 2][::-1]])
             out += [
-                Scan("repeat", f"take scan {name} again{every}", _named(once, "again")),
+                Scan("repeat", f"take scan {name} again{every}", _with_scan_name(once, "again")),
                 Scan(
                     "reverse",
                     f"take scan {name} backwards{every}",
@@ -96,21 +96,21 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
                 ),
                 Scan(
                     "respeed",
-                    f"scan {name} forth and back {_faster(part)}",
+                    f"scan {name} forth and back {_faster_scan_words(part)}",
                     rescheduled(plan, both, start_s, gap_s, f"{label}_both"),
                 ),
             ]
             if "orientation_deg" in controls:
                 turned = replace(once, orientation_rad=once.orientation_rad + math.radians(_TURN_DEG))
                 words = f"take scan {name} with the sensor turned to {degrees + _TURN_DEG:.0f} degrees{every}"
-                out.append(Scan("rotate", words, _named(turned, "turned")))
+                out.append(Scan("rotate", words, _with_scan_name(turned, "turned")))
             if "led" in controls:
                 dark = _commanded(once, "led", 0.0)
-                out.append(Scan("relight", f"take scan {name} with the LED off{every}", _named(dark, "dark")))
+                out.append(Scan("relight", f"take scan {name} with the LED off{every}", _with_scan_name(dark, "dark")))
             if "height_mm" in controls and height_mm is not None:
                 high = _commanded(once, "height_mm", _RAISE * height_mm)
                 words = f"take scan {name} with the sensor at {_RAISE * height_mm:.4g} mm{every}"
-                out.append(Scan("raise", words, _named(high, "raised")))
+                out.append(Scan("raise", words, _with_scan_name(high, "raised")))
     return out
 
 
@@ -136,14 +136,14 @@ def rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: 
     )
 
 
-def _faster(part: Excerpt) -> str:
+def _faster_scan_words(part: Excerpt) -> str:
     """Describe the speed of a scan of every second reading of an excerpt, with unchanged time per reading."""
     if part.stride == 1:
         return f"at double speed{part.words}"
     return f"at {2 * part.stride} times the speed (every {2 * part.stride}th reading)"
 
 
-def _named(plan: Plan, how: str) -> Plan:
+def _with_scan_name(plan: Plan, how: str) -> Plan:
     return replace(plan, scan_names=(f"{plan.scan_names[0]}_{how}",))
 
 

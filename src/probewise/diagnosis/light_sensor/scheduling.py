@@ -85,7 +85,7 @@ def one_after_another(scans: Sequence[Scan], after: Plan) -> Plan:
 
     Covariates that they lack, such as battery voltage, keep their last value of that plan.
     """
-    return _as_left(_joined(scans), after)
+    return _as_left(_joined_plan(scans), after)
 
 
 def in_turn(scans: Sequence[Scan], after: Plan) -> Plan:
@@ -95,8 +95,8 @@ def in_turn(scans: Sequence[Scan], after: Plan) -> Plan:
     """
     out: list[Scan] = []
     for scan in scans:
-        out.append(_from(scan, start_after(out[-1].plan) if out else float(scan.plan.time_s[0])))
-    return _as_left(_joined(out), after)
+        out.append(_started_at(scan, start_after(out[-1].plan) if out else float(scan.plan.time_s[0])))
+    return _as_left(_joined_plan(out), after)
 
 
 def _as_left(plan: Plan, after: Plan) -> Plan:
@@ -106,16 +106,16 @@ def _as_left(plan: Plan, after: Plan) -> Plan:
     return replace(plan, covariates={**kept, **plan.covariates})
 
 
-def _joined(scans: Sequence[Scan]) -> Plan:
+def _joined_plan(scans: Sequence[Scan]) -> Plan:
     return join_plans([scan.plan for scan in scans])
 
 
 def put_off(scan: Scan, plan: Plan) -> Scan:
     """Move a scan to after a plan, with time to lay its sheet."""
-    return _from(scan, start_after(plan))
+    return _started_at(scan, start_after(plan))
 
 
-def _from(scan: Scan, start_s: float) -> Scan:
+def _started_at(scan: Scan, start_s: float) -> Scan:
     """Start a scan at a time, plus the time to lay its sheet."""
     delay_s = start_s + scan.lay_s - float(scan.plan.time_s[0])
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))

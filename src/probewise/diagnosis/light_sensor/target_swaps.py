@@ -40,10 +40,12 @@ def target_swaps(plan: Plan) -> list[Scan]:
     out = []
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
         flat = _scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
-        out.append(Scan("lay", f"scan a plain {colour} surface", _over(flat, f"plain_{colour}", Uniform(albedo))))
+        out.append(
+            Scan("lay", f"scan a plain {colour} surface", _with_pattern(flat, f"plain_{colour}", Uniform(albedo)))
+        )
     name = plan.scan_names[int(plan.scan[first[0]])]
     for part in excerpts(first, strides=(_STRIDE // 2, _STRIDE)):
-        across = _turned(_scan(plan, part.rows, f"across{part.suffix}"))
+        across = _rotated_scan(_scan(plan, part.rows, f"across{part.suffix}"))
         out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
     edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
     laid = (_laid_otherwise(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
@@ -53,7 +55,7 @@ def target_swaps(plan: Plan) -> list[Scan]:
 def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     """List scans over an edge turned by 180 or 90 degrees or moved, and over stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
-    beyond = _beyond(plan, scan, edge)
+    beyond = _distance_inside(plan, scan, edge)
     length = float(np.ptp(beyond))
     if length < _LEAST_CROSSED * math.hypot(np.ptp(plan.x_mm[scan]), np.ptp(plan.y_mm[scan])):
         return []
@@ -79,16 +81,16 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     out = []
     for label, words, whole, pattern in laid:
         rows = np.arange(len(whole))
-        seen = ndtr(_beyond(whole, rows, pattern) / (_FOOTPRINT * length))
+        seen = ndtr(_distance_inside(whole, rows, pattern) / (_FOOTPRINT * length))
         for part in excerpts(rows, strides=(_STRIDE,), level=seen):
-            taken = _over(_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
+            taken = _with_pattern(_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
         for part in excerpts(scan, strides=(_STRIDE // 2, _STRIDE)):
-            taken = _over(_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
+            taken = _with_pattern(_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     return out
 
@@ -101,7 +103,7 @@ def _scan(plan: Plan, rows: IntArray, name: str) -> Plan:
     return rescheduled(plan, rows, start_after(plan), reading_s(plan), name)
 
 
-def _over(scan: Plan, name: str, pattern: Pattern) -> Plan:
+def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:
     """Set the pattern of a scan, under a name not yet in use."""
     while name in scan.pattern_names and scan.patterns.get(name) != pattern:
         name += "_new"
@@ -110,7 +112,7 @@ def _over(scan: Plan, name: str, pattern: Pattern) -> Plan:
     return replace(scan, pattern=number, pattern_names=names, patterns={**scan.patterns, name: pattern})
 
 
-def _turned(scan: Plan) -> Plan:
+def _rotated_scan(scan: Plan) -> Plan:
     """Rotate a scan's places by 90 degrees about their middle, anticlockwise."""
     x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()
     return replace(scan, x_mm=x_mm - (scan.y_mm - y_mm), y_mm=y_mm + (scan.x_mm - x_mm))
@@ -124,9 +126,9 @@ def _both_turned(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane]:
         sign * (x_mm * math.cos(angle) + y_mm * math.sin(angle))
         for sign, angle in ((1, normal_rad), (-1, edge.normal_rad))
     )
-    return _turned(scan), replace(edge, normal_rad=normal_rad, offset_mm=float(edge.offset_mm + moved_mm))
+    return _rotated_scan(scan), replace(edge, normal_rad=normal_rad, offset_mm=float(edge.offset_mm + moved_mm))
 
 
-def _beyond(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
+def _distance_inside(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
     """Return the signed distance of places inside an edge, in mm."""
     return plan.x_mm[rows] * math.cos(edge.normal_rad) + plan.y_mm[rows] * math.sin(edge.normal_rad) - edge.offset_mm

@@ -57,20 +57,20 @@ def by_weight(
     """
     least = _LEAST_OF_IT * _ENOUGH * n_wanted
     gain = log_p(first[:n_wanted]) - log_q(first[:n_wanted])
-    share = _independent(gain, first[:n_wanted]) / len(gain)
+    share = _n_distinct_effective(gain, first[:n_wanted]) / len(gain)
     if share * len(first) < least:
         return None
     enough = min(math.ceil(_ENOUGH * n_wanted / share), len(first))
     if enough > n_wanted:
         more = first[n_wanted:enough]
         gain = np.append(gain, log_p(more) - log_q(more))
-    if _independent(gain, first[: len(gain)]) < least:
+    if _n_distinct_effective(gain, first[: len(gain)]) < least:
         return None
     rows = resampled(np.exp(gain - gain.max()), n_wanted, rng)
     return np.asarray(first[rng.permutation(rows)])
 
 
-def _independent(log_weight: FloatArray, samples: FloatArray) -> float:
+def _n_distinct_effective(log_weight: FloatArray, samples: FloatArray) -> float:
     """Return Kish's effective sample size, with duplicates counted once."""
     _, which = np.unique(samples[:, 0], return_inverse=True)
     if not np.isfinite(log_weight).any():
@@ -123,12 +123,12 @@ def anneal(
         beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
         progress("annealing samples to the posterior", note=f"beta {beta:.2f} of 1")
         for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):
-            z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng=rng)
+            z, heights, scale = _ensemble_step(z, heights, beta, scale, log_q, log_p, rng=rng)
     harvest = [z]
     while len(harvest) * n_walkers < n_wanted:
         progress("sampling the posterior", len(harvest) * n_walkers, n_wanted)
         for _ in range(n_moves):
-            z, heights, scale = _moved(z, heights, beta, scale, log_q, log_p, rng=rng)
+            z, heights, scale = _ensemble_step(z, heights, beta, scale, log_q, log_p, rng=rng)
         harvest.append(z)
     return np.asarray(rng.permutation(np.concatenate(harvest))[:n_wanted])
 
@@ -145,7 +145,7 @@ def _next_beta(gain: FloatArray, beta: float) -> float:
     return min(max(low, beta + _LEAST_STEP), 1.0)
 
 
-def _moved(
+def _ensemble_step(
     z: FloatArray,
     heights: tuple[FloatArray, FloatArray],
     beta: float,

@@ -41,7 +41,7 @@ def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.r
     counts = rng.multinomial(n, weights)
     order = rng.permutation(n)
     theta = [
-        _halved(part.theta[:count], part.n_gaussians, largest.n_gaussians)
+        _with_more_gaussians(part.theta[:count], part.n_gaussians, largest.n_gaussians)
         for part, count in zip(parts, counts, strict=True)
     ]
     noise_sd = [part.noise_sd[:count] for part, count in zip(parts, counts, strict=True)]
@@ -87,7 +87,7 @@ def over_hypotheses(
     for part, count in zip(parts, counts, strict=True):
         rows = rng.permutation(n)[:count]
         head = len(part.chain.names) - sum(part.columns(name).shape[1] for name in effects)
-        columns = [_halved(part.theta[rows, :head], part.n_gaussians, largest.n_gaussians)]
+        columns = [_with_more_gaussians(part.theta[rows, :head], part.n_gaussians, largest.n_gaussians)]
         for effect in cast(Sequence[NamedEffect[Any]], chain.effects):
             absent[effect.name].append(np.full(count, effect.name not in part.effects))
             if effect.name in part.effects:
@@ -111,7 +111,7 @@ def over_hypotheses(
     )
 
 
-def _halved(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
+def _with_more_gaussians(theta: FloatArray, n_gaussians: int, wanted: int) -> FloatArray:
     """Convert each sample's mixture to more Gaussians, by halving the heaviest."""
     blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
     rows = np.arange(len(theta))

@@ -71,7 +71,7 @@ def best_repair(
     on_noise = searched.prepared.on_noise
     if judged.verdict in ("named", "noise", "clean"):
         stated = tuple(name for name in judged.combination if name in on_noise)
-        noise = searched.posterior.noise(stated)
+        noise = searched.posterior.likeliest_noise(stated)
     on_mean = tuple(name for name in judged.combination if name not in on_noise)
     best = Best.of(searched, test, searched.best(on_mean, noise) or null, noise, rng=rng)
     if judged.verdict == "named" and ruins(best.improvement):  # a fit that fails on held-out readings is no repair

@@ -64,7 +64,7 @@ def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Cor
     columns = columns[:, norms > 0] / norms[norms > 0]
     everything = np.ones(len(found.residuals), dtype=np.bool_)
     plain = np.zeros((len(columns), 0))
-    change = found.residuals - _without(found, problem, columns, everything, everything)[0]
+    change = found.residuals - _fit_without_rows(found, problem, columns, everything, everything)[0]
 
     def gain(out: BoolArray) -> FloatArray:
         return _log_density(found, problem, columns, out) - _log_density(found, problem, plain, out)
@@ -129,7 +129,7 @@ def corrected(
     return gain, change
 
 
-def _without(
+def _fit_without_rows(
     found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray, asked: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Fit parameters and amplitudes to the `kept` rows; return residuals and variances of the mean for `asked` rows."""
@@ -152,8 +152,8 @@ def _without(
 
 
 def _log_density(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
-    miss, spread = _without(found, problem, columns, ~out, out)
-    kept_miss, _ = _without(found, problem, columns, ~out, ~out)
+    miss, spread = _fit_without_rows(found, problem, columns, ~out, out)
+    kept_miss, _ = _fit_without_rows(found, problem, columns, ~out, ~out)
     n_free = max(len(kept_miss) - found.slopes.shape[1] - columns.shape[1], 1)
     total = float(kept_miss @ kept_miss) / n_free + spread
     return np.asarray(-0.5 * np.log(2 * math.pi * total) - 0.5 * miss**2 / total)

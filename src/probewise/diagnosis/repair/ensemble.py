@@ -49,7 +49,7 @@ class Ensemble:
             log_z = np.array([c.evidence[self.noise].log_z for c in alike])
             weights = np.exp(log_z - log_z.max())
             kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
-            parts = [self._drawn(c) for c in itertools.compress(alike, kept)]
+            parts = [self._samples_of(c) for c in itertools.compress(alike, kept)]
             self._known[key] = over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
         return self._known[key]
 
@@ -90,7 +90,7 @@ class Ensemble:
             if key == names and c.found.model.sensor.exchangeable == form
         ]
 
-    def _drawn(self, candidate: WeighedFit) -> ModelSamples:
+    def _samples_of(self, candidate: WeighedFit) -> ModelSamples:
         evidence, recording = candidate.evidence[self.noise], self.searched.prepared.recording
         return sample_model(
             candidate.found, evidence, recording, weights=candidate.weights, rng=self.rng, progress=self.progress

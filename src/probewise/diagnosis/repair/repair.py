@@ -103,10 +103,10 @@ def repair_of(prepared: Prepared, test: GlobalTest, best: Best, drawn: Drawn, ch
     else:
         by_rows = np.zeros(len(prepared.recording))
         by_rows[prepared.usable] = change
-        before = Predicted(_predicted(null), prepared.spread(null.residuals))
-        after = Predicted(_predicted(fit) + by_rows, prepared.spread(fit.residuals - change))
+        before = Predicted(_best_prediction(null), prepared.spread(null.residuals))
+        after = Predicted(_best_prediction(fit) + by_rows, prepared.spread(fit.residuals - change))
     return Repair(drawn.null, drawn.model, best.improvement, before, after, by_rows=bool(np.any(change)))
 
 
-def _predicted(found: Fit) -> FloatArray:
+def _best_prediction(found: Fit) -> FloatArray:
     return np.asarray(found.model.predict(found.z[None, :])[0])

@@ -58,9 +58,13 @@ def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope
             sign[covariate.rows] = covariate.values
     along_axis = slope * np.where(sign == 0, 1.0, sign)
     ways = _Ways(np.ones(len(signal)), signal, along_axis, sign, len(starts))
-    found = [(_family(covariate, template), template) for covariate in covariates for template in _of(covariate, ways)]
+    found = [
+        (_family_name(covariate, template), template)
+        for covariate in covariates
+        for template in _bases_of(covariate, ways)
+    ]
     found += [("what was seen before", template) for template in _memories(signal, starts)]
-    found += [("ends of scans", template) for template in _ends(len(signal), starts)]
+    found += [("ends of scans", template) for template in _end_transients(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
     return Bank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 
@@ -81,13 +85,13 @@ def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
     return bases.take(np.setdiff1d(np.arange(len(bases.widths)), like))
 
 
-def _family(covariate: Covariate, template: FloatArray) -> str:
+def _family_name(covariate: Covariate, template: FloatArray) -> str:
     """Return the family of a template; smooth bases are separate from the many local ones, to keep their weight."""
     where = covariate.name if covariate.scan is None else f"{covariate.name} within scans"
     return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
 
 
-def _of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
+def _bases_of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
     if covariate.groups:
         yield from _of_groups(covariate, ways)
     elif covariate.scan is not None:
@@ -122,8 +126,8 @@ def _of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
         yield from _windows(covariate, ways.adds, (4, 8, 16))
     elif covariate.name == "slope":
         yield _smooth(covariate, ways.adds, 3)
-        yield _spread(covariate.values[:, None], covariate, len(ways.adds))
-        yield _spread(np.abs(covariate.values)[:, None], covariate, len(ways.adds))
+        yield _on_all_rows(covariate.values[:, None], covariate, len(ways.adds))
+        yield _on_all_rows(np.abs(covariate.values)[:, None], covariate, len(ways.adds))
     else:  # a logged column of the recording
         for way in (ways.adds, ways.gain):
             yield _smooth(covariate, way, 3)
@@ -134,7 +138,7 @@ def _of_groups(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
     codes = np.unique(covariate.values, return_inverse=True)[1]
     if codes.max() >= _MOST_GROUPS:
         return
-    member = _spread((codes[:, None] == np.arange(codes.max() + 1)).astype(np.float64), covariate, len(ways.adds))
+    member = _on_all_rows((codes[:, None] == np.arange(codes.max() + 1)).astype(np.float64), covariate, len(ways.adds))
     for way in (ways.adds, ways.gain, ways.shift):
         yield member * way[:, None]
     for way in (ways.adds, ways.shift):
@@ -158,7 +162,7 @@ def _memories(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
     yield held[:, -1:]
 
 
-def _ends(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
+def _end_transients(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
     """Yield decays from the start, and growths to the end, of a scan: common to all scans, and for each."""
     first = np.repeat(starts, np.diff(starts, append=n_points))
     last = np.repeat(np.append(starts[1:], n_points) - 1, np.diff(starts, append=n_points))
@@ -182,7 +186,7 @@ def _smooth(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
     if covariate.name == "level":  # most readings are at its ends, but curvature shows in between
         along = 0.5 * along + 0.5 * (values - distinct[0]) / np.ptp(distinct)
     waves = np.cos(np.pi * along[:, None] * np.arange(0 if np.ptp(way) else 1, n_terms + 1))
-    return _spread(waves * way[covariate.rows, None], covariate, len(way))
+    return _on_all_rows(waves * way[covariate.rows, None], covariate, len(way))
 
 
 def _steps(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator[FloatArray]:
@@ -192,7 +196,7 @@ def _steps(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator
     share = np.cumsum(weight[order])
     for k in range(1, n_steps + 1):
         at = values[order][min(int(np.searchsorted(share, share[-1] * k / (n_steps + 1))), len(values) - 1)]
-        yield _spread(((values > at) * way[covariate.rows])[:, None], covariate, len(way))
+        yield _on_all_rows(((values > at) * way[covariate.rows])[:, None], covariate, len(way))
 
 
 def _windows(covariate: Covariate, way: FloatArray, parts: Sequence[int]) -> Iterator[FloatArray]:
@@ -202,10 +206,10 @@ def _windows(covariate: Covariate, way: FloatArray, parts: Sequence[int]) -> Ite
         for first in range(0, n - width + 1, max(width // 2, 1)):
             window = np.zeros(n)
             window[order[first : first + width]] = 1.0
-            yield _spread((window * way[covariate.rows])[:, None], covariate, len(way))
+            yield _on_all_rows((window * way[covariate.rows])[:, None], covariate, len(way))
 
 
-def _spread(columns: FloatArray, covariate: Covariate, n_points: int) -> FloatArray:
+def _on_all_rows(columns: FloatArray, covariate: Covariate, n_points: int) -> FloatArray:
     out = np.zeros((n_points, columns.shape[1]))
     out[covariate.rows] = columns
     return out

@@ -197,7 +197,7 @@ def places(
         scan = covariate.scan
         if covariate.name in _RUNS:
             scan, start, end = scan_names[int(kept[best][0])], None, None
-        curve = _curve(covariate, residuals, problem.sd)
+        curve = _mean_curve(covariate, residuals, problem.sd)
         out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), **curve))
     return sorted(out, key=lambda place: (place.p_value, -place.z))
 
@@ -238,9 +238,9 @@ def places_of_effect(
     name = covariate.name
     if name == "run":
         strongest = plan.scan_names[int(plan.scan[np.argmax(np.abs(change))])]
-        return [Place(name, strongest, None, None, p_value, size, **_curve(covariate, residuals, sd))]
+        return [Place(name, strongest, None, None, p_value, size, **_mean_curve(covariate, residuals, sd))]
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
-        curve = _curve(scans, residuals, sd)
+        curve = _mean_curve(scans, residuals, sd)
         return [
             Place("scan", scan, None, None, p_value, size, **curve)
             for scan in _significant_scans(effect.scans, change, plan)
@@ -249,7 +249,7 @@ def places_of_effect(
     # An effect with a threshold in level begins where it is first significant.
     significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
     values = covariate.values[significant]
-    curve = _curve(covariate, residuals, sd)
+    curve = _mean_curve(covariate, residuals, sd)
     start, end = float(values.min()), float(values.max())
     return [Place(name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
 
@@ -262,7 +262,7 @@ def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> 
     return sorted(significant, key=lambda scan: -strength[scan])
 
 
-def _curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
+def _mean_curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
     """Return the covariate at each reading, and the curve of mean residuals."""
     values, mine = covariate.values, residuals[covariate.rows]
     if covariate.groups:

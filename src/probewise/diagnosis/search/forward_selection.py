@@ -52,9 +52,9 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
         for parent in parents:
             proposals = proposals_for(state, parent, proposals)
         if size == 2:
-            proposals = _together(state, proposals)
+            proposals = _with_scores_about_null(state, proposals)
         if size == 1:
-            chosen = _alone(state, null, proposals)
+            chosen = _refitted_alone(state, null, proposals)
         else:
             chosen = promising(state, proposals, width=beam, behind=STEERING)
         asked = [proposals[names] for names in chosen]
@@ -129,7 +129,7 @@ def promising(state: SearchState, proposals: Mapping[Names, Proposal], *, width:
     ]
 
 
-def _alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Names]:
+def _refitted_alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Names]:
     """Choose the effects that are refitted alone: the leader, what is not far behind, and what screening cannot judge.
 
     A user's own effect was named to be tried, however far it leads from where screening is linear; and screening says
@@ -164,7 +164,7 @@ def _plainly(state: SearchState, null: WeighedFit) -> list[Proposal]:
     return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_mean(())]
 
 
-def _together(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
+def _with_scores_about_null(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
     """Let pairs promise what they do about the null, where neither effect leads alone."""
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
-from probewise.diagnosis.evidence.templates import subsets
+from probewise.diagnosis.evidence.templates import combinations_of
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, least_sd, rough_sd
@@ -51,7 +51,7 @@ class Noises:
         self.certain = tuple(sorted(self._known))
         self._hidden = hides_the_noise(self._step, self.recording)
         others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
-        single = [tuple(sorted({*names, *self.certain})) for names in subsets(others, 1)]
+        single = [tuple(sorted({*names, *self.certain})) for names in combinations_of(others, 1)]
         self.models = {names: self._model(names) for names in single}
 
     def _model(self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None) -> NoiseModel:
@@ -62,7 +62,7 @@ class Noises:
 
     def log_prior(self, names: Names) -> float:
         """Log prior of a noise model."""
-        return self.prior.log_noise(self._uncertain(names))
+        return self.prior.log_noise(self._without_certain(names))
 
     def over_all(self, log_z: Mapping[Names, float]) -> float:
         """Return the log evidence averaged over noise models; minus infinity for none."""
@@ -86,16 +86,16 @@ class Noises:
         """
         known, singles = dict(evidence), list(evidence)
         for size in range(1, MOST_FAULTS):
-            of_size = {names: e for names, e in known.items() if len(self._uncertain(names)) == size}
+            of_size = {names: e for names, e in known.items() if len(self._without_certain(names)) == size}
             first = max(of_size, key=lambda names: of_size[names].log_z, default=self.certain)
             parts = [n for n in known if set(n) < set(first)]
             if not parts or known[first].log_z < max(known[n].log_z for n in parts) + NOISE_PAIR_WITHIN:
                 return size > 1
-            likely = {name: known[first].likely_nodes(name) for name in self._uncertain(first)}
+            likely = {name: known[first].likely_nodes(name) for name in self._without_certain(first)}
             best = max(e.log_z + self.log_prior(names) for names, e in known.items())
             for other in singles:
                 both = tuple(sorted({*first, *other}))
-                if len(self._uncertain(both)) != size + 1 or set(both) >= _TWO_MEMORIES:
+                if len(self._without_certain(both)) != size + 1 or set(both) >= _TWO_MEMORIES:
                     continue
                 model = self._model(both, likely | self.models[other].every_third())
                 own = weigh(found, model)
@@ -103,5 +103,5 @@ class Noises:
                     self.models[both], known[both] = model, own
         return True
 
-    def _uncertain(self, names: Names) -> Names:
+    def _without_certain(self, names: Names) -> Names:
         return tuple(n for n in names if n not in self.certain)

@@ -38,7 +38,7 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
     progress("weighing formulas")
     every = {**prepared.effects, **proposals}
     prior = prepared.apparatus.prior_odds(every)
-    score = _scores(searched, proposals)
+    score = _log_evidences(searched, proposals)
     odds = {name: value + prior.log_mean((name,)) - prior.log_mean(()) for name, value in score.items()}
     best = max(fit.log_z + searched.prior.log_mean(names) for (_, names), fit in searched.evidences.fits.items())
     ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
@@ -56,7 +56,7 @@ def _may_explain(searched: Searched) -> bool:
     return by_mean.get(("unknown",), 0.0) > _UNKNOWN_FROM or several > _SEVERAL_FROM
 
 
-def _scores(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
+def _log_evidences(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
     """Return the largest log evidence of each formula with its prior, beside the null or the best single name."""
     usable, null = searched.prepared.usable, searched.null
     singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]

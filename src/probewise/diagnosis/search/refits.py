@@ -161,7 +161,7 @@ class Refits:
         weights = templates.weights(scores)
         # Under heavy-tailed noise, a few readings changed by an effect count as outliers; so start from white noise
         # too.
-        plain = self._plainly(parent, problem)
+        plain = self._under_simplest_noise(parent, problem)
         seen = [(problem, scores), *((about, scores_about(about)) for about in plain)]
         likeliest = (int(np.argmax(templates.weights(own_scores))) for _, own_scores in seen[1:])
         tried = list(dict.fromkeys([*_worth_trying(templates, weights), *likeliest]))
@@ -209,7 +209,7 @@ class Refits:
             # one.
             for taken in (amount,) if effect.amplitudes else (amount, np.ones_like(amount)):
                 z = parent.found.z + about.absorbed(parent.found, columns @ taken)
-                start = np.concatenate([z, model.scores_of(setting[None, :])[0]])
+                start = np.concatenate([z, model.coordinates_of_last_effect(setting[None, :])[0]])
                 if all(np.abs(start - other).max() > _SAME_START for other in starts):
                     starts.append(start)
         if self.sensor is not None and len(self.sensor.starts) > 1:
@@ -224,7 +224,7 @@ class Refits:
                     fitted.append(self.weighed(model, np.stack(starts), about.law, beyond=parent))
         return max(fitted, key=lambda candidate: self.noises.over_all(_log_z_by_noise(candidate)))
 
-    def _plainly(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
+    def _under_simplest_noise(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
         """Linearise a fit under the simplest noise distribution too, if it is a different one."""
         plain = parent.evidence[self.noises.certain].law
         return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]

@@ -70,7 +70,7 @@ class Evidences:
 
         Several names together were chosen from too many combinations for their evidence alone to say so.
         """
-        plain = self._plain
+        plain = self._simplest_noise
         nameless = [v for (_, names, noise), v in self.unknown.items() if not names and noise == plain]
         alone: dict[bool, list[float]] = {True: [], False: nameless}
         for (_, names), fit in self.fits.items():
@@ -80,7 +80,7 @@ class Evidences:
         return max(alone[True], default=-math.inf) > max(alone[False], default=math.inf)
 
     @property
-    def _plain(self) -> Names:
+    def _simplest_noise(self) -> Names:
         """The plainest noise: that which the readings show without doubt."""
         return min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
 
@@ -110,7 +110,7 @@ class Posterior:
             out[mean] = out.get(mean, 0.0) + p
         return out
 
-    def noise(self, stated: Names | None = None) -> Names:
+    def likeliest_noise(self, stated: Names | None = None) -> Names:
         """Return the most probable noise model, of all or of those that contain the `stated` effects."""
         marginal: dict[Names, float] = {}
         for (_, noise), p in self.probabilities.items():

@@ -79,8 +79,8 @@ def weigh_thoroughly(
     """
     require_rng(rng)
     weighings: dict[tuple[int, Names], Weighing] = {}
-    leaders = _leaders(searched)
-    bar = _Bar(progress, len(leaders), _minutes(leaders, searched, n_live, rng=np.random.default_rng(0)))
+    leaders = _leading_hypotheses(searched)
+    bar = _Bar(progress, len(leaders), _estimated_minutes(leaders, searched, n_live, rng=np.random.default_rng(0)))
     for k, ((candidate, noise), own) in enumerate(zip(leaders, rng.spawn(len(leaders)), strict=True)):
         key = candidate.n_gaussians, candidate.names
         weighings[key] = _weigh(candidate, noise, searched, rng=own, n_live=n_live, rounds=partial(bar.told, k))
@@ -93,7 +93,7 @@ def weigh_thoroughly(
     ), told
 
 
-def _leaders(searched: Searched) -> list[tuple[WeighedFit, Names]]:
+def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
     """List the leading refitted hypotheses on the mean, each under its best noise, and the null.
 
     Each has its SSF order of largest evidence; the null has that of the first.
@@ -126,7 +126,7 @@ def _weigh(
     *,
     rng: np.random.Generator,
     n_live: int,
-    rounds: Callable[[str, nested.State], None],
+    rounds: Callable[[str, nested.RoundSummary], None],
 ) -> Weighing:
     evidence = candidate.evidence[noise]
     effects = tuple(sorted((*candidate.names, *in_vocabulary(noise))))
@@ -147,7 +147,7 @@ def _weigh(
         explored = run(once)
 
         def about(theta: FloatArray) -> Weighing:
-            found = _about(theta, once, run, rng)
+            found = _evidence_near_posterior(theta, once, run, rng)
             log_z = found.log_z + candidate.log_factor
             return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
 
@@ -166,7 +166,7 @@ def _problem(candidate: WeighedFit, noise: Names, searched: Searched) -> JointPr
     return JointProblem(candidate.found.model, searched.prepared.recording, candidate.evidence[noise])
 
 
-def _minutes(
+def _estimated_minutes(
     leaders: Sequence[tuple[WeighedFit, Names]], searched: Searched, n_live: int, *, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Estimate the minutes that the runs take, lower and upper: evaluations times measured seconds each."""
@@ -191,7 +191,7 @@ class _Bar:
         self._stage = f"weighing {n} hypotheses again, about {_in_words(minutes)}"
         progress(self._stage, 0, n * _STEPS)
 
-    def told(self, k: int, label: str, state: nested.State) -> None:
+    def told(self, k: int, label: str, state: nested.RoundSummary) -> None:
         """Update with a round of a run of hypothesis number `k`."""
         depth = -state.log_volume
         if k != self._at or depth < self._depth:  # a new run starts from the whole prior
@@ -210,7 +210,9 @@ def _in_words(minutes: tuple[float, float]) -> str:
     return f"{max(least, 1):.0f} to {math.ceil(most):.0f} minutes"
 
 
-def _about(theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator) -> _Evidence:
+def _evidence_near_posterior(
+    theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator
+) -> _Evidence:
     """Estimate the evidence by runs from priors near the posterior: near the samples, then near the previous run."""
     runs: list[nested.NestedResult] = []
     while True:

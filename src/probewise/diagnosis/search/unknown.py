@@ -90,24 +90,24 @@ class Unknown:
 
     def _explained(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
         """Return whether a candidate explains as much as an unknown effect beside `known`."""
-        most = max((self._beside(c) for c in candidates if c.names == known), default=-np.inf)
-        believed = {c: self._believed(c, len(known)) for c in rivals}
+        most = max((self._log_evidence_over_noises(c) for c in candidates if c.names == known), default=-np.inf)
+        believed = {c: self._log_evidence_with_prior(c, len(known)) for c in rivals}
         for candidate in sorted(believed, key=lambda c: -believed[c]):
             if believed[candidate] < most - ALIASED_NATS:
                 return False
-            if self._beside(candidate) == -np.inf:
+            if self._log_evidence_over_noises(candidate) == -np.inf:
                 self.weigh([candidate])
-            if self._beside(candidate) - self._evidence(candidate) < ALIASED_NATS:
+            if self._log_evidence_over_noises(candidate) - self._evidence(candidate) < ALIASED_NATS:
                 return True
         return False
 
-    def _believed(self, candidate: WeighedFit, n_known: int) -> float:
+    def _log_evidence_with_prior(self, candidate: WeighedFit, n_known: int) -> float:
         several = len(candidate.names) - n_known > 1
         return self._evidence(candidate) - (self.n_choices(candidate.names) if several else 0.0)
 
     def _evidence(self, candidate: WeighedFit) -> float:
         return self.noises.over_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
 
-    def _beside(self, candidate: WeighedFit) -> float:
+    def _log_evidence_over_noises(self, candidate: WeighedFit) -> float:
         own = candidate.n_gaussians, candidate.names
         return self.noises.over_all({key[2]: value for key, value in self.log_z.items() if key[:2] == own})

@@ -48,7 +48,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     table = table_for(simulator, table)
     own = cast(RunTable, as_recording(simulator, _without_readings(simulator, table)).plan)
     system = System.of(simulator, own)
-    z, predicted, where = _middle(system, own)
+    z, predicted, where = _typical_point(system, own)
     sd, noise = _noise(simulator, own, predicted)
     system = system.standing_still(own, z[None, :], tolerance=_STANDS_STILL * sd)
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
@@ -70,14 +70,14 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     effects = tuple(_with_rows(effect, reasons) for effect in found)
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words
-    return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _classes(effects))
+    return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _alias_classes(effects))
 
 
 def _without_readings(simulator: Simulator, table: RunTable) -> RunTable:
     return replace(table, columns={name: v for name, v in table.columns.items() if name != simulator.reading})
 
 
-def _middle(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
+def _typical_point(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
     """Return a point of the prior at which readings vary, its middle if possible; the readings there; its name."""
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
@@ -138,7 +138,7 @@ def _with_rows(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
     return replace(effect, rows=math.ceil((LAMBDA / effect.share) ** 2))
 
 
-def _classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:
+def _alias_classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:
     """Group aliased effects, directly or through others in the class."""
     group = {effect.name: {effect.name} for effect in effects}
     for effect in effects:

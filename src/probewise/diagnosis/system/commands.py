@@ -56,14 +56,14 @@ def run_commands(table: RunTable, reading: str, controls: Sequence[str], time_un
     """
     out: list[RunCommand] = []
     settable = [name for name in controls if name in table.covariates]
-    ends = {name: _ends(table.covariates[name]) for name in settable}
-    for rows in _distinct(table, settable):
+    ends = {name: _least_and_greatest(table.covariates[name]) for name in settable}
+    for rows in _distinct_runs(table, settable):
         name = table.scan_names[int(table.scan[rows[0]])]
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
         of = f"run {name}" if table.run is not None else "the rows"
-        for kind, words, columns, slower in _changes(table, kept, ends, of):
+        for kind, words, columns, slower in _changed_runs(table, kept, ends, of):
             made = _run(table, kept, columns, reading, f"{name} {kind}", name, slower)
-            out.append(RunCommand(kind, words, made, _minutes(made, time_unit)))
+            out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
     return out
 
 
@@ -71,13 +71,20 @@ Change = tuple[str, str, Mapping[str, FloatArray], float]
 """Kind, words, the columns that are set, and how many times as long the run takes."""
 
 
-def _changes(table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], of: str) -> Iterator[Change]:
+def _changed_runs(
+    table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], of: str
+) -> Iterator[Change]:
     own = {name: table.covariates[name][rows] for name in ends}
     yield "again", f"take {of} again", {}, 1.0
     if not ends:
         return
     if any(np.ptp(values) > 0 for values in own.values()):
-        yield "reversed", f"take {of} with {_and(ends)} in reverse order", {k: v[::-1] for k, v in own.items()}, 1.0
+        yield (
+            "reversed",
+            f"take {of} with {_list_in_words(ends)} in reverse order",
+            {k: v[::-1] for k, v in own.items()},
+            1.0,
+        )
     if table.has_time:
         yield "slow", f"take {of} again, twice as slowly", {}, 2.0
     n = len(rows)
@@ -115,14 +122,14 @@ def _run(
         changed[reading] = np.full(len(rows), np.nan)
     if table.time is not None:
         time = table.time_s[rows]
-        begin = time[0] if table.time_begins_anew else _begin(table)
+        begin = time[0] if table.time_begins_anew else _next_start(table)
         changed[table.time] = begin + slower * (time - time[0])
     run = table.run or unused_name(_RUN, table.columns)
     changed[run] = np.full(len(rows), name)
     return replace(taken, columns={**taken.columns, **changed}, run=run, like={name: table.like.get(like, like)})
 
 
-def _begin(table: RunTable) -> float:
+def _next_start(table: RunTable) -> float:
     """Return the start of a run after a table: after the usual gap between runs, or ten rows if there is one run."""
     by_run = [table.time_s[rows] for rows in table.rows_by_scan()]
     between = [later[0] - earlier[-1] for earlier, later in itertools.pairwise(by_run)]
@@ -145,13 +152,13 @@ def in_turn(commands: Sequence[RunCommand], after: Plan) -> Plan:
     for command in commands:
         table = command.table
         if table.time is not None and not recorded.time_begins_anew and out:
-            later = float(out[-1].time_s[-1]) + _begin(recorded) - float(recorded.time_s.max())
+            later = float(out[-1].time_s[-1]) + _next_start(recorded) - float(recorded.time_s.max())
             table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
         out.append(table)
     return cast(Plan, behind(out[0], out[1:]))
 
 
-def _distinct(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
+def _distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
     """Return the row numbers of the first runs that differ in their controls."""
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in table.rows_by_scan():
@@ -161,16 +168,16 @@ def _distinct(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
     return list(seen.values())[:_MOST_RUNS]
 
 
-def _ends(values: FloatArray) -> tuple[float, float]:
+def _least_and_greatest(values: FloatArray) -> tuple[float, float]:
     return float(np.nanmin(values)), float(np.nanmax(values))
 
 
-def _minutes(table: RunTable, time_unit: str) -> float:
+def _minutes_of_runs(table: RunTable, time_unit: str) -> float:
     if table.time is None or time_unit not in _MINUTES:
         return _BREAK + len(table) * _A_READING
     return _BREAK + float(np.ptp(table.time_s)) * _MINUTES[time_unit]
 
 
-def _and(names: Mapping[str, object]) -> str:
+def _list_in_words(names: Mapping[str, object]) -> str:
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last

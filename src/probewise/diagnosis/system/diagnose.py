@@ -21,7 +21,7 @@ from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.calls import Tally
+from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import About
 from probewise.systems.forms.readings import since_start_of_run
 from probewise.systems.forms.stop import MeterStop, stop_of
@@ -73,7 +73,7 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
-    told = _counting(progress, cast(SimulatorApparatus, prepared.apparatus).system)
+    told = _with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
     return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
 
 
@@ -91,7 +91,7 @@ def prepare_system(
     system = System.of(simulator, table)
     recording = without_lost_rows(system, recording)
     recording, stop = without_stop(simulator, table, recording)
-    told = _counting(progress, system)
+    told = _with_call_count(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
     apparatus = SimulatorApparatus(About(system, table, found.z, sd), stop)
@@ -101,7 +101,7 @@ def prepare_system(
     return Prepared(recording, effects, begun, apparatus, recording)
 
 
-def _counting(progress: Progress, system: System) -> Progress:
+def _with_call_count(progress: Progress, system: System) -> Progress:
     """Add the number of calls of `simulate`, if there is one, to the progress."""
     return progress if system.caller is None else CountedCalls(progress, system.caller)
 
@@ -171,7 +171,7 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _notes_on_law(tally: Tally) -> Iterator[str]:
+def _notes_on_law(tally: IntegrationTally) -> Iterator[str]:
     if tally.cut_short:
         yield (
             f"integrating the law takes long: in {STEPS_OF_A_SEARCH:,} steps not every combination of effects that "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,10 +12,10 @@ from probewise._arrays import FloatArray, floats
 from probewise._display import ShowsItself
 from probewise._kinds import did_you_mean, require_callable, require_finite_number, require_rng, require_whole
 from probewise.errors import ParameterError, ShapeError
-from probewise.inquiry.any_settings.belief import Model, Readings, prior_samples, updated
+from probewise.inquiry.any_settings.acquisition import Predictive
 from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
+from probewise.inquiry.any_settings.posterior import Model, Readings, prior_samples, updated
 from probewise.inquiry.any_settings.settings import Settings
-from probewise.inquiry.any_settings.worth import Predictive
 from probewise.inquiry.choice import choose
 from probewise.nested import Weighted, pose
 from probewise.nested.pose import AnyPrior
@@ -56,7 +57,7 @@ class Inquiry(ShowsItself):
         turns True. Without it, readings are chosen for the information about all parameters.
     cost_s
         Seconds that a reading takes at each setting, (n_settings,); or a function of the last setting (None at first)
-        that returns them. `worth` is then per second.
+        that returns them. `utility` is then per second.
     n_samples
         Posterior samples.
     n_live
@@ -97,7 +98,7 @@ class Inquiry(ShowsItself):
         self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)
         self._taken: list[tuple[Any, float]] = []
         self._readings: Readings | None = None
-        self._worth: FloatArray | None = None
+        self._utility: FloatArray | None = None
         self._next: Any = None
         self._costs()
 
@@ -117,22 +118,34 @@ class Inquiry(ShowsItself):
         return tuple(self._taken)
 
     @property
-    def worth(self) -> FloatArray:
+    def utility(self) -> FloatArray:
         """Acquisition function of each setting, (n_settings,), per second if the costs in seconds are given.
 
         It is the expected information until every sd that the goal names is within three times its goal; from then on
         the expected decrease of the sum of ln(sd / goal); and once the goal is reached, information again.
         """
-        if self._worth is None:
-            self._worth = self._valued(self._posterior.weight) / self._costs()
-            self._worth.flags.writeable = False
-        return self._worth
+        if self._utility is None:
+            self._utility = self._utility_under(self._posterior.weight) / self._costs()
+            self._utility.flags.writeable = False
+        return self._utility
 
     @property
-    def worth_label(self) -> str:
+    def utility_label(self) -> str:
         """Axis label of the acquisition function, with its unit."""
         per_second = "" if self._cost_s is None else " per second"
         return f"{_NEARER if self._near else _BITS}{per_second}"
+
+    @property
+    def worth(self) -> FloatArray:
+        """The old name of `utility`."""
+        warnings.warn("Inquiry.worth is Inquiry.utility now", DeprecationWarning, stacklevel=2)
+        return self.utility
+
+    @property
+    def worth_label(self) -> str:
+        """The old name of `utility_label`."""
+        warnings.warn("Inquiry.worth_label is Inquiry.utility_label now", DeprecationWarning, stacklevel=2)
+        return self.utility_label
 
     @property
     def settled(self) -> bool:
@@ -160,7 +173,7 @@ class Inquiry(ShowsItself):
     def next(self) -> Any:
         """Return the setting with the largest acquisition function, in the form of `settings`; ties break at random."""
         if self._next is None:
-            row = choose(self.worth, np.ones(len(self._settings), dtype=np.bool_), rng=self._rng)
+            row = choose(self.utility, np.ones(len(self._settings), dtype=np.bool_), rng=self._rng)
             self._next = self._settings[row]
         return self._next
 
@@ -189,7 +202,7 @@ class Inquiry(ShowsItself):
         self._posterior = updated(self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng)
         self._readings = readings
         self._taken.append((at[0], value))
-        self._worth, self._next = None, None
+        self._utility, self._next = None, None
 
     def several(self, n: int) -> list[Any]:
         """Choose the settings of several readings to be taken before any of them is known; best first.
@@ -199,7 +212,7 @@ class Inquiry(ShowsItself):
         """
         require_whole("n", n)
         everywhere = np.ones(len(self._settings), dtype=np.bool_)
-        rows = [choose(self.worth, everywhere, rng=self._rng)]
+        rows = [choose(self.utility, everywhere, rng=self._rng)]
         theta, noise = self._posterior.theta, self._model.noise
         weights = [self._posterior.weight] * _N_IMAGINED
         while len(rows) < n:
@@ -210,8 +223,8 @@ class Inquiry(ShowsItself):
                 imagined = noise.draw(predicted[truth], scale[truth], rng=self._rng)
                 log_density = noise.log_density(imagined, predicted, scale)[:, 0]
                 weights[k] = weight * np.exp(log_density - log_density[weight > 0].max())
-            worth = np.mean([self._valued(weight) for weight in weights], axis=0) / self._costs()
-            rows.append(choose(worth, everywhere, rng=self._rng))
+            utility = np.mean([self._utility_under(weight) for weight in weights], axis=0) / self._costs()
+            rows.append(choose(utility, everywhere, rng=self._rng))
         return [self._settings[row] for row in rows]
 
     def summary(self) -> str:
@@ -239,7 +252,7 @@ class Inquiry(ShowsItself):
     def _near(self) -> bool:
         return bool(self._goal) and 1.0 < self._times_goal < _NEAR_GOAL
 
-    def _valued(self, weight: FloatArray) -> FloatArray:
+    def _utility_under(self, weight: FloatArray) -> FloatArray:
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
         theta = self._posterior.theta[resampled(weight, n, self._rng)]
         theta = theta[self._rng.permutation(n)]  # copies of one sample apart

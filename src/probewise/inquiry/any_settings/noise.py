@@ -111,7 +111,7 @@ class ReadingNoise:
         core = ndtr(z) if math.isinf(self.dof) else stdtr(self.dof, z)
         if not self.outliers:
             return np.asarray(core)
-        low, high = self._ends
+        low, high = self._outlier_range
         return np.asarray((1 - self.outliers) * core + self.outliers * np.clip((readings - low) / (high - low), 0, 1))
 
     def draw(self, predicted: FloatArray, scale: FloatArray, *, rng: np.random.Generator) -> FloatArray:
@@ -120,7 +120,9 @@ class ReadingNoise:
         core = predicted + scale * z
         if not self.outliers:
             return np.asarray(core)
-        return np.where(rng.random(predicted.shape) < self.outliers, rng.uniform(*self._ends, predicted.shape), core)
+        return np.where(
+            rng.random(predicted.shape) < self.outliers, rng.uniform(*self._outlier_range, predicted.shape), core
+        )
 
     @cached_property
     def nodes(self) -> tuple[FloatArray, FloatArray]:
@@ -135,11 +137,11 @@ class ReadingNoise:
         """Evenly spread outliers, (n,); none if there are no outliers."""
         if not self.outliers:
             return np.empty(0)
-        low, high = self._ends
+        low, high = self._outlier_range
         return np.asarray(low + (high - low) * (np.arange(n) + 0.5) / n)
 
     @property
-    def _ends(self) -> tuple[float, float]:
+    def _outlier_range(self) -> tuple[float, float]:
         assert self.between is not None
         return self.between
 
@@ -151,7 +153,7 @@ class ReadingNoise:
         return np.asarray(constant - 0.5 * (nu + 1) * np.log1p(z * z / nu))
 
     def _log_outlier(self, readings: FloatArray) -> FloatArray:
-        low, high = self._ends
+        low, high = self._outlier_range
         inside = (readings >= low) & (readings <= high)
         return np.where(inside, math.log(self.outliers / (high - low)), -np.inf)
 

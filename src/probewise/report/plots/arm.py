@@ -43,7 +43,7 @@ def reach_map(
     """
     ax = axes_or_new(ax, size_in=(8.2, 5.0))
     dx, dy = (x_mm[1] - x_mm[0]) / 2, (y_mm[1] - y_mm[0]) / 2
-    degrees = _unwrapped(np.degrees(orientation_rad))
+    degrees = _unwrapped_degrees(np.degrees(orientation_rad))
     image = ax.imshow(
         np.ma.masked_invalid(degrees),
         origin="lower",
@@ -74,7 +74,7 @@ def reach_map(
     return tidy(ax, x="x (mm)", y="y (mm)", title=title)
 
 
-def _unwrapped(degrees: FloatArray) -> FloatArray:
+def _unwrapped_degrees(degrees: FloatArray) -> FloatArray:
     """Unwrap angles about their mean direction, so that 179 and -179 degrees are neighbours on the colour scale."""
     known = np.radians(degrees[np.isfinite(degrees)])
     middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0

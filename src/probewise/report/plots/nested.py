@@ -81,7 +81,7 @@ def trace_plot(
         gridspec_kw={"width_ratios": (4.0, 1.0), "height_ratios": (1.2 if n <= _FEW else 1.6, *[1.0] * n)},
     )
     depth, mass = -result.log_volume, _mass_per_nat(result)
-    shown = _thinned(result.n_dead)
+    shown = _thinned_rows(result.n_dead)
     shown = shown[np.argsort(mass[shown], kind="stable")]
     top, key = axes[0]
     top.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
@@ -337,7 +337,7 @@ def _mass_per_nat(result: NestedResult) -> FloatArray:
     return result.weight * result.n_at_death
 
 
-def _thinned(n: int) -> IntArray:
+def _thinned_rows(n: int) -> IntArray:
     return np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).astype(np.int64))
 
 

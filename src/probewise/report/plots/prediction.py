@@ -50,7 +50,7 @@ def predicted_against_recorded(
     """
     require_recording(recording)
     found, alone = tracks(recording.plan)
-    shown = [found[i] for i in _spread(len(found), MAX_PANELS - bool(alone.size))]
+    shown = [found[i] for i in _evenly_spaced(len(found), MAX_PANELS - bool(alone.size))]
     n_panels = max(len(shown) + bool(alone.size), 1)
     n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
     n_rows = -(-n_panels // n_columns)
@@ -78,7 +78,7 @@ def predicted_against_recorded(
     return axes
 
 
-def _spread(n: int, most: int) -> IntArray:
+def _evenly_spaced(n: int, most: int) -> IntArray:
     """Choose at most `most` of n indices, evenly spaced."""
     return np.unique(np.linspace(0, max(n - 1, 0), min(n, most)).round().astype(np.int64))[:n]
 

@@ -48,7 +48,7 @@ def tracks(plan: Plan) -> tuple[list[Track], IntArray]:
         for code in np.unique(plan.pattern[scan_rows]):
             rows = scan_rows[plan.pattern[scan_rows] == code]
             pattern = plan.patterns.get(plan.pattern_names[code])
-            along = _along(plan, rows, pattern)
+            along = _along_path(plan, rows, pattern)
             if np.unique(np.round(along, 6)).size < 3:
                 single.append(rows)
                 continue
@@ -62,7 +62,7 @@ def tracks(plan: Plan) -> tuple[list[Track], IntArray]:
     return found, np.concatenate(single) if single else np.empty(0, dtype=np.int64)
 
 
-def _along(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
+def _along_path(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
     x, y = plan.x_mm[rows], plan.y_mm[rows]
     if isinstance(pattern, HalfPlane):
         return np.asarray(x * np.cos(pattern.normal_rad) + y * np.sin(pattern.normal_rad) - pattern.offset_mm)

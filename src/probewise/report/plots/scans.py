@@ -105,7 +105,7 @@ def before_and_after(
         above.plot(along[ok], recording.readings[at][ok], ".", color=BLACK, markersize=4, label="" if k else "recorded")
         for predicted, colour, said in ((before, VERMILLION, _BEFORE), (after, BLUE, _AFTER)):
             above.plot(along, predicted[at], color=colour, linewidth=1.5, label="" if k else said)
-    low, high = _telling(found, rows, np.abs(after - before))
+    low, high = _interval_to_show(found, rows, np.abs(after - before))
     for predicted, colour in ((before, VERMILLION), (after, BLUE)):
         sides = [_residuals(recording, Track("", rows[t.rows], t.along_mm, t.from_edge), predicted) for t in found]
         along, residual = (np.concatenate(parts) for parts in zip(*sides, strict=True))
@@ -122,7 +122,7 @@ def before_and_after(
     return axes
 
 
-def _telling(found: Sequence[Track], rows: IntArray, change: FloatArray) -> tuple[float, float]:
+def _interval_to_show(found: Sequence[Track], rows: IntArray, change: FloatArray) -> tuple[float, float]:
     """Return the ends of the interval in which two models differ, widened by its length on either side."""
     along = np.concatenate([track.along_mm for track in found])
     by_place = np.concatenate([change[rows[track.rows]] for track in found])

@@ -251,10 +251,10 @@ def _areas(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray
         case Uniform(albedo):
             return [(whole, albedo)]
         case HalfPlane(normal, offset, inside, outside):
-            return [(whole, outside), (_beyond(whole, normal, offset), inside)]
+            return [(whole, outside), (_clipped(whole, normal, offset), inside)]
         case Quadrant((x, y), (dx, dy), inside, outside):
-            across = _beyond(whole, 0.0 if dx > 0 else np.pi, x * dx)
-            return [(whole, outside), (_beyond(across, dy * np.pi / 2, y * dy), inside)]
+            across = _clipped(whole, 0.0 if dx > 0 else np.pi, x * dx)
+            return [(whole, outside), (_clipped(across, dy * np.pi / 2, y * dy), inside)]
         case Disc(center, radius, inside, outside):
             circle = np.array(center) + radius * np.stack([np.cos(_ROUND), np.sin(_ROUND)], axis=-1)
             return [(whole, outside), (circle, inside)]
@@ -265,14 +265,14 @@ def _areas(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray
             first, last = int(np.floor(along.min() / period)), int(np.ceil(along.max() / period))
             painted = [(whole, outside)]
             for k in range(first, last + 1):
-                begin = _beyond(whole, normal, phase + k * period)
-                painted.append((_beyond(begin, normal + np.pi, -(phase + (k + duty) * period)), inside))
+                begin = _clipped(whole, normal, phase + k * period)
+                painted.append((_clipped(begin, normal + np.pi, -(phase + (k + duty) * period)), inside))
             return [(corners, albedo) for corners, albedo in painted if len(corners)]
         case _:
             return []
 
 
-def _beyond(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> FloatArray:
+def _clipped(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> FloatArray:
     """Clip a convex outline, (n, 2), to the half-plane beyond a line."""
     if not len(corners_mm):
         return corners_mm

@@ -93,7 +93,7 @@ def forms_again(
     system = System(simulator, known.table.scan_names)
     about = _AsRecorded(system, known.table, np.zeros(system.n_params), 1.0, known)
     found = forms_of(about)
-    longer = _longer(known.table, list(more_runs))
+    longer = _with_more_runs(known.table, list(more_runs))
     if longer is not known.table:
         system = System(simulator, longer.scan_names)
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
@@ -113,7 +113,7 @@ def own_of_runs(name: str) -> bool:
     return name.partition(":")[0] in _OWN_OF_RUNS
 
 
-def _longer(table: RunTable, more_runs: list[str]) -> RunTable:
+def _with_more_runs(table: RunTable, more_runs: list[str]) -> RunTable:
     """Repeat the last row in each of further runs."""
     if not more_runs or table.run is None:
         return table

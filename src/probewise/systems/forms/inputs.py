@@ -40,7 +40,7 @@ def driving_columns(about: About) -> list[str]:
         spread = float(np.nanstd(values))
         if name == own.reading or name == own.noise.sd or spread == 0:
             continue
-        rms = about.rms(Stage.INPUT, _on(name, _raised), np.array([[_NUDGE * spread]]))
+        rms = about.rms(Stage.INPUT, _on(name, _with_offset), np.array([[_NUDGE * spread]]))
         wave = about.rms(Stage.INPUT, _on(name, _scaled), np.array([[_NUDGE]]))
         if max(float(rms[0]), float(wave[0])) > 0:
             out.append(name)
@@ -55,22 +55,24 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
         values = table.covariates[name]
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
         says = partial(_said, f"the true {name} is the recorded {name} plus {{}}")
-        yield from _linear(about, f"input_offset:{name}", _on(name, _raised), 1e-4 * spread, name, says, name)
+        yield from _linear(about, f"input_offset:{name}", _on(name, _with_offset), 1e-4 * spread, name, says, name)
         says = partial(_said, f"the true {name} is the recorded {name} times (1 + a), a = {{}}")
         yield from _linear(about, f"input_gain:{name}", _on(name, _scaled), 1e-4, "1", says, name)
         yield from _cut_off(about, name, low, high)
         says = partial(_said, f"{name} has no effect within {{}} of 0")
         if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # if larger, it is an offset
-            yield from _sized(about, f"dead_zone:{name}", "width", _on(name, _dead), high - low, name, says, name)
+            yield from _form_with_sizes(
+                about, f"dead_zone:{name}", "width", _on(name, _dead_zone), high - low, name, says, name
+            )
         if _turns_back(values, table):
             says = partial(_said, f"{name} has {{}} of play")
-            yield from _sized(
+            yield from _form_with_sizes(
                 about, f"backlash:{name}", "width", _on(name, play), high - low, name, says, "previous", name
             )
         yield from _wave(about, name)
         if table.has_time:
             says = partial(_said, f"{name} acts with a delay of {{}} {about.time_unit}")
-            yield from _sized(
+            yield from _form_with_sizes(
                 about,
                 f"input_delay:{name}",
                 "tau_s",
@@ -90,7 +92,7 @@ def _said(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
     return sentence.format(with_unit(mean[0], sd[0], ""))
 
 
-def _raised(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+def _with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(c + theta[:, :1])
 
 
@@ -118,7 +120,7 @@ def _linear(about: About, name: str, act: Act, guess: float, unit: str, says: Sa
         )
 
 
-def _sized(
+def _form_with_sizes(
     about: About, name: str, parameter: str, act: Act, most: float, unit: str, says: Say, *covariates: str
 ) -> Iterator[Form]:
     prior = about.log_uniform(Stage.INPUT, act, most * np.geomspace(1e-7, 0.5, 40))
@@ -196,7 +198,7 @@ def _wave(about: About, name: str) -> Iterator[Form]:
     )
 
 
-def _dead(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+def _dead_zone(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
 
 

@@ -199,7 +199,7 @@ class _Trip:
 
         edges, begun = self.breaks(k), s
         again = np.zeros(s.shape[1:], dtype=bool)
-        for low, high in _apart(edges):
+        for low, high in _intervals_between(edges):
             # Slightly inside: a discontinuity at an end belongs to the other side.
             hair = 1e-8 if len(edges) > 2 else 0.0
             begin, end = low + hair, high - hair
@@ -238,7 +238,7 @@ class _Trip:
                 own = y.reshape(s.shape)
                 rates = free(x, own)
                 for (form, size), mode in zip(hard, modes, strict=True):
-                    again |= _ended(form, size, mode, own[names.index(form.target)], rates[form.target])
+                    again |= _mode_ended(form, size, mode, own[names.index(form.target)], rates[form.target])
             s = solved.y[:, -1].reshape(s.shape)
         for i, j in np.argwhere(again):
             s[:, i, j] = self._only(int(i)).one_gap(begun[:, i, j], k, int(j), names)
@@ -294,7 +294,7 @@ class _Trip:
             return {name: float(np.ravel(v)[0]) for name, v in found.items()}
 
         edges = self.breaks(k)
-        for low, high in _apart(edges):
+        for low, high in _intervals_between(edges):
             share, forced = low, dict[int, int]()
             for _ in range(_MOST_EVENTS):
                 rates = free(share, s)
@@ -335,7 +335,7 @@ class _Trip:
         return s
 
 
-def _apart(edges: Sequence[float]) -> Iterator[tuple[float, float]]:
+def _intervals_between(edges: Sequence[float]) -> Iterator[tuple[float, float]]:
     """Yield successive pairs of edges, except those that are too close."""
     return ((low, high) for low, high in pairwise(edges) if high - low > _CLOSE)
 
@@ -347,7 +347,7 @@ def _mode(form: Form, size: Any, value: Any, rate: Any) -> Any:
     return np.where((value >= size) & (rate > 0), 0, 1)
 
 
-def _ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
+def _mode_ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
     """Return whether a mode has ended."""
     if form.sticks:
         return np.where(mode == 0, np.abs(rate) > size, value * mode < 0)

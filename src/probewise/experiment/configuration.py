@@ -18,7 +18,7 @@ from probewise.errors import ParameterError
 from probewise.experiment.digest import value_digest
 from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.journal import recording_of
-from probewise.experiment.kinds import Kind, kinds_of
+from probewise.experiment.kinds import HypothesisKind, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.pace import Pace
 from probewise.experiment.rivals import Rival, rivals_of
@@ -263,7 +263,7 @@ class Experiment:
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
     @cached_property
-    def kinds(self) -> tuple[Kind, ...]:
+    def kinds(self) -> tuple[HypothesisKind, ...]:
         """The competing kinds of hypotheses."""
         rivals: tuple[Rival, ...] = ()
         if self.trust < 1:

@@ -84,7 +84,7 @@ def test_settings_are_valued_alike_in_blocks_and_alone(monkeypatch):
     slopes = np.linspace(0.1, 2.0, 7)
     x, together = linear(slopes)
     whole = together.information(), together.distance(x[:, None], np.array([0.1]))
-    monkeypatch.setattr("probewise.inquiry.any_settings.worth._BLOCK", 1)
+    monkeypatch.setattr("probewise.inquiry.any_settings.acquisition._BLOCK", 1)
     _, alone = linear(slopes)
     np.testing.assert_allclose(alone.information(), whole[0], rtol=1e-12)
     np.testing.assert_allclose(alone.distance(x[:, None], np.array([0.1])), whole[1], rtol=1e-12)

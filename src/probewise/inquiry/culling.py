@@ -16,7 +16,7 @@ from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.commanded import is_commanded
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["Sight"]
+__all__ = ["CullingBounds"]
 
 _REACH = 6.0  # sds of the footprint beyond which it is negligible: 1e-9 of the levels' difference
 _TILE_MM = 110.0
@@ -24,12 +24,12 @@ _FAR_MM = 1e5
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """Bounding boxes of the hypotheses, `low_mm` and `high_mm`, (n_samples, 2); outside, the reading is `beside`."""
+class CullingBounds:
+    """Bounding boxes of the hypotheses, `low_mm` and `high_mm`, (n_samples, 2); beyond, the reading is `outside`."""
 
     low_mm: FloatArray
     high_mm: FloatArray
-    beside: float
+    outside: float
 
     @classmethod
     def of(cls, model: SensorModel, theta: FloatArray, plan: Plan) -> Self | None:
@@ -52,8 +52,8 @@ class Sight:
         reach = float((np.linalg.norm(model.ssf.means_mm, axis=1) + _REACH * sds).max())
         low, high = (np.array([f(edge, axis=0) for edge in edges]) for f in (np.nanmin, np.nanmax))
         one = plan.take(np.array([0]))
-        beside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
-        return cls(frozen(low - reach), frozen(high + reach), float(beside))
+        outside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
+        return cls(frozen(low - reach), frozen(high + reach), float(outside))
 
     def parts(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
         """Yield tiles of the field: rows of the plan, and the hypotheses visible there."""

@@ -15,23 +15,23 @@ from probewise.inquiry.designs import Designs
 from probewise.inquiry.discs import DiscTable, is_alike_everywhere
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
-    AskedForecast,
+    DirectForecast,
     Forecast,
-    Outlook,
+    PredictiveDistributions,
     by_combination,
     predicted,
     spread_levels,
 )
 from probewise.inquiry.grid import Grid
-from probewise.inquiry.silhouettes import Silhouettes
-from probewise.inquiry.tabled_effects import TabledChain
+from probewise.inquiry.tabulated_effects import TabulatedChain
+from probewise.inquiry.tabulated_shapes import TabulatedShapes
 from probewise.recordings.plan import Instrumentation, Plan
 from probewise.scene import HypothesisScene, Shape, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["DiscForecast", "SilhouetteForecast", "forecast_of"]
+__all__ = ["DiscForecast", "TabulatedForecast", "forecast_of"]
 
 _PER_SD = 2.0  # levels per noise sd: rounding adds 2 % to its variance, which thousands of hypotheses average out
 _N_CHECKED = 64  # shapes drawn from the prior, checked at 16 places each
@@ -53,17 +53,17 @@ class DiscForecast:
         """See `Forecast.predict`."""
         return predicted(self.model, theta, plan)
 
-    def outlook(
+    def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
-    ) -> Outlook:
-        """See `Forecast.outlook`."""
+    ) -> PredictiveDistributions:
+        """See `Forecast.predictive`."""
         levels = spread_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
         turns = plan.orientation_rad.reshape(-1, designs.grid.n_places)
-        return _DiscOutlook(self.table, theta, designs.grid, turns, rows, levels)
+        return _DiscPredictive(self.table, theta, designs.grid, turns, rows, levels)
 
 
 @dataclass(frozen=True, eq=False)
-class _DiscOutlook:
+class _DiscPredictive:
     table: DiscTable
     theta: FloatArray
     grid: Grid
@@ -72,7 +72,7 @@ class _DiscOutlook:
     levels: FloatArray
 
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `Outlook.maps`: one map per orientation of the sensor; the table has no other setting."""
+        """See `PredictiveDistributions.maps`: one map per orientation of the sensor; the table has no other setting."""
         some = weight > 0
         stood, mass = None, np.empty(0)
         for number, at, places in by_combination(self.rows, self.grid.n_places):
@@ -83,7 +83,7 @@ class _DiscOutlook:
 
 
 @dataclass(frozen=True, eq=False)
-class SilhouetteForecast:
+class TabulatedForecast:
     """A forecast for ellipses and convex polygons, by tables of the unit Gaussian's response.
 
     Its rms error is at most 0.5 % of the difference between dark and bright, which is checked against the sensor model
@@ -122,43 +122,43 @@ class SilhouetteForecast:
         out = np.empty((len(theta), len(plan)))
         for number, way in enumerate(ways.T.tolist()):
             rows = np.flatnonzero(which.ravel() == number)
-            silhouettes = self._silhouettes(theta, *way)
-            if silhouettes is None or ways.shape[1] > _MOST_WAYS:
+            shapes = self._shapes(theta, *way)
+            if shapes is None or ways.shape[1] > _MOST_WAYS:
                 return predicted(self.model, theta, plan)
-            dark, bright = self._ends(way[1])
-            out[:, rows] = dark + (bright - dark) * silhouettes.seen(plan.x_mm[rows], plan.y_mm[rows])
+            dark, bright = self._levels_at(way[1])
+            out[:, rows] = dark + (bright - dark) * shapes.seen(plan.x_mm[rows], plan.y_mm[rows])
         return out
 
-    def outlook(
+    def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
-    ) -> Outlook:
-        """See `Forecast.outlook`; by direct predictions if the orientation changes from place to place."""
+    ) -> PredictiveDistributions:
+        """See `Forecast.predictive`; by direct predictions if the orientation changes from place to place."""
         turns, heights = (a.reshape(-1, designs.grid.n_places) for a in (plan.orientation_rad, _heights(plan)))
-        asked = partial(AskedForecast(self.model).outlook, theta, weight, designs, plan, rows, noise_sd)
+        asked = partial(DirectForecast(self.model).predictive, theta, weight, designs, plan, rows, noise_sd)
         if (turns != turns[:, :1]).any() or set(plan.covariates) - {"height_mm"}:
             return asked()
         ways = list(zip(turns[:, 0].tolist(), heights[:, 0].tolist(), strict=True))
-        sights = {}
+        shapes_at = {}
         for turn, height in dict.fromkeys(ways):
-            silhouettes = self._silhouettes(theta, turn, height)
-            if silhouettes is None:
+            shapes = self._shapes(theta, turn, height)
+            if shapes is None:
                 return asked()
-            sights[turn, height] = _Sight(silhouettes, *self._ends(height))
-        low = min(min(sight.dark, sight.bright) for sight in sights.values())
-        high = max(max(sight.dark, sight.bright) for sight in sights.values())
+            shapes_at[turn, height] = _ShapesAt(shapes, *self._levels_at(height))
+        low = min(min(each.dark, each.bright) for each in shapes_at.values())
+        high = max(max(each.dark, each.bright) for each in shapes_at.values())
         levels = spread_levels(low, high, noise_sd / _PER_SD, most=MOST_LEVELS)
-        return _SilhouetteOutlook(sights, ways, designs.grid, rows, levels)
+        return _TabulatedPredictive(shapes_at, ways, designs.grid, rows, levels)
 
-    def _silhouettes(self, theta: FloatArray, turn_rad: float, height: float) -> Silhouettes | None:
+    def _shapes(self, theta: FloatArray, turn_rad: float, height: float) -> TabulatedShapes | None:
         """Return the shapes under the sensor at an orientation, and at `height` times that of its calibration."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         stands = height * np.array([[cosine, -sine], [sine, cosine]])
         seen = FixedMixture(
             self.mixture.weights, self.mixture.means_mm @ stands.T, stands @ self.mixture.covs_mm2 @ stands.T
         )
-        return Silhouettes.of(self.shape.region(theta), seen)
+        return TabulatedShapes.of(self.shape.region(theta), seen)
 
-    def _ends(self, height: float) -> tuple[float, float]:
+    def _levels_at(self, height: float) -> tuple[float, float]:
         """Return the readings outside and deep inside a shape; light falls with the square of the height."""
         return self.levels.i_min, self.levels.i_min + (self.levels.i_max - self.levels.i_min) / height**2
 
@@ -166,45 +166,45 @@ class SilhouetteForecast:
         """Return whether tables and model agree, at places about the edges of some shapes from the prior."""
         prior, rng = self.shape.prior, np.random.default_rng(0)
         theta = prior.from_unit_cube(rng.random((_N_CHECKED, len(prior.names))))
-        silhouettes = self._silhouettes(theta, 0.0, highest)
-        dark, bright = self._ends(highest)
-        if silhouettes is None or dark == bright:
+        shapes = self._shapes(theta, 0.0, highest)
+        dark, bright = self._levels_at(highest)
+        if shapes is None or dark == bright:
             return False
         reach = _REACH * highest * float(np.sqrt(np.linalg.eigvalsh(self.mixture.covs_mm2).max()))
         quick, asked = [], []
         for row, outline in enumerate(outlines(self.shape.region(theta))):
             place = outline[rng.integers(len(outline), size=_PLACES)] + rng.uniform(-reach, reach, (_PLACES, 2))
             plan = _plan_at(place, highest)
-            quick.append(silhouettes.seen(plan.x_mm, plan.y_mm)[row])
+            quick.append(shapes.seen(plan.x_mm, plan.y_mm)[row])
             asked.append(self.model.predict(theta[[row]], plan)[0])
         off = np.array(quick) - (np.array(asked) - dark) / (bright - dark)
         return bool(np.sqrt((off**2).mean()) < _MOST_OFF)
 
 
-class _Sight(NamedTuple):
+class _ShapesAt(NamedTuple):
     """All shapes under a sensor of one orientation and height, and its readings outside and deep inside them."""
 
-    silhouettes: Silhouettes
+    shapes: TabulatedShapes
     dark: float
     bright: float
 
 
 @dataclass(frozen=True, eq=False)
-class _SilhouetteOutlook:
-    sights: dict[tuple[float, float], _Sight]
+class _TabulatedPredictive:
+    shapes_at: dict[tuple[float, float], _ShapesAt]
     ways: list[tuple[float, float]]
     grid: Grid
     rows: IntArray
     levels: FloatArray
 
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `Outlook.maps`: one map per orientation and height, for all numbers of repeats."""
+        """See `PredictiveDistributions.maps`: one map per orientation and height, for all numbers of repeats."""
         stood, mass = None, np.empty(0)
         for number, at, places in by_combination(self.rows, self.grid.n_places):
             if stood != self.ways[number]:
                 stood = self.ways[number]
-                silhouettes, dark, bright = self.sights[stood]
-                mass = silhouettes.mass(weight, self.grid, dark, bright, self.levels)
+                shapes, dark, bright = self.shapes_at[stood]
+                mass = shapes.mass(weight, self.grid, dark, bright, self.levels)
             yield at, mass if len(places) == len(mass) else mass[places]
 
 
@@ -219,22 +219,22 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
     if table is not None:
         return DiscForecast(table if table.margin_mm else model, table)
     if highest is None and isinstance(model, Chain) and model.effects:
-        return AskedForecast(_tabled(model) or model)
-    return SilhouetteForecast.of(model, highest=highest or 1.0) or AskedForecast(model)
+        return DirectForecast(_tabulated_chain(model) or model)
+    return TabulatedForecast.of(model, highest=highest or 1.0) or DirectForecast(model)
 
 
-def _tabled(model: Chain) -> TabledChain | None:
+def _tabulated_chain(model: Chain) -> TabulatedChain | None:
     """Evaluate a chain with effects by the table of the same chain without the effects that no table can hold."""
     table = DiscTable.of(replace(model, effects=tuple(filter(is_alike_everywhere, model.effects))))
-    return None if table is None else TabledChain.of(model, table)
+    return None if table is None else TabulatedChain.of(model, table)
 
 
 def _over_cards(model: SensorModel, highest: float | None) -> Forecast:
     """Use tables for the shape alone, if possible, with cards on top."""
     if not isinstance(model, Chain) or model.effects or highest is not None:
-        return AskedForecast(model)
+        return DirectForecast(model)
     base = forecast_of(replace(model, scene=HypothesisScene(model.scene.shape)))  # type: ignore[attr-defined]
-    return AskedForecast(model) if isinstance(base, AskedForecast) else CardedForecast(base, model)
+    return DirectForecast(model) if isinstance(base, DirectForecast) else CardedForecast(base, model)
 
 
 def _heights(plan: Plan) -> FloatArray:

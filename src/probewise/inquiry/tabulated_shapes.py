@@ -13,12 +13,12 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.ellipses import Ellipses
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.polygons import Polygons
-from probewise.inquiry.spans import ROWS, Interval, Spans, single, whole
+from probewise.inquiry.scanlines import ROWS, Interval, Spans, single, whole
 from probewise.inquiry.unit_gaussian import REACH
 from probewise.scene import EllipseRegion, MixtureOfRegions, PolygonRegion, Region
 from probewise.sensor import FixedMixture
 
-__all__ = ["Silhouettes"]
+__all__ = ["TabulatedShapes"]
 
 
 class _Crossed(Protocol):
@@ -33,7 +33,7 @@ class _Crossed(Protocol):
         ...
 
 
-class _Kind(Protocol):
+class _SameShapes(Protocol):
     """Shapes of one kind under a footprint."""
 
     @property
@@ -47,14 +47,14 @@ class _Kind(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Silhouettes:
+class TabulatedShapes:
     """Shapes under a footprint in the lab frame, by kind: indices of the hypotheses, and their geometry.
 
     `footprint_mm` is the largest offset of a Gaussian from the sensor, and its largest sd.
     """
 
     n_shapes: int
-    parts: tuple[tuple[IntArray, _Kind], ...]
+    parts: tuple[tuple[IntArray, _SameShapes], ...]
     footprint_mm: tuple[float, float]
 
     @classmethod
@@ -129,7 +129,7 @@ def _by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
         yield np.arange(region.n_regions), region
 
 
-def _kind_of(region: Region, footprint: FixedMixture) -> _Kind | None:
+def _kind_of(region: Region, footprint: FixedMixture) -> _SameShapes | None:
     if not isinstance(region, (EllipseRegion, PolygonRegion)) or (region.outside, region.inside) != (0.0, 1.0):
         return None
     return Ellipses.of(region, footprint) if isinstance(region, EllipseRegion) else Polygons.of(region, footprint)

@@ -5,8 +5,8 @@ import pytest
 
 from probewise.effects import GainDrift
 from probewise.inquiry import Grid
+from probewise.inquiry.culling import CullingBounds
 from probewise.inquiry.forecast import predicted
-from probewise.inquiry.sight import Sight
 from probewise.scene import AnyOf, Circle, Ellipse, Field, HypothesisScene, Rectangle, RegularPolygon
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels
 
@@ -41,7 +41,7 @@ def test_what_is_not_asked_is_what_would_be_answered(shape):
 
 def test_most_hypotheses_are_not_asked_about_most_places():
     shape = SHAPES[2]
-    sight = Sight.of(chain(shape), hypotheses(shape), PLAN)
+    sight = CullingBounds.of(chain(shape), hypotheses(shape), PLAN)
     parts = list(sight.parts(PLAN))
     assert np.sort(np.concatenate([rows for rows, _ in parts])).tolist() == list(range(len(PLAN)))
     assert sum(rows.size * shown.size for rows, shown in parts) < 0.6 * 40 * len(PLAN)
@@ -52,4 +52,4 @@ def test_most_hypotheses_are_not_asked_about_most_places():
 )
 def test_readings_that_depend_on_more_than_the_shape_are_asked_everywhere(model):
     theta = np.full((2, len(model.names)), 50.0)
-    assert Sight.of(model, theta, PLAN) is None
+    assert CullingBounds.of(model, theta, PLAN) is None

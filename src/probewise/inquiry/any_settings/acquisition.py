@@ -46,9 +46,9 @@ class Predictive:
         self._centre = grouped.mean(axis=1)
         self._scale = np.sqrt((scales.reshape(*self._shape, -1) ** 2).mean(axis=1))
         self._width = np.sqrt(self._scale**2 + grouped.var(axis=1))
-        self._read = self._sampled(grouped, noise.nodes[1])
+        self._read = self._sample_of_node(grouped, noise.nodes[1])
 
-    def _sampled(self, grouped: FloatArray, weight: FloatArray) -> FloatArray:
+    def _sample_of_node(self, grouped: FloatArray, weight: FloatArray) -> FloatArray:
         """Choose the sample of each group to which each noise node is added, (n_groups, n_nodes, n_settings).
 
         A group may hold samples far apart, with no sample near its mean. So each pair of nodes, above and below, is
@@ -94,7 +94,7 @@ class Predictive:
         """
         n = self._order.shape[0]
         centred = values[:n] - values[:n].mean(axis=0)
-        lines = [self._regressed(value) for value in centred.T]
+        lines = [self._regression(value) for value in centred.T]
         least = _LEAST_SHARE * (centred**2).mean(axis=0)
         out = np.zeros(self._order.shape[1])
         for rows, at, density, each in self._blocks():
@@ -108,7 +108,7 @@ class Predictive:
                 out[rows] += self._over_nodes(np.maximum(far, 0.0))
         return out
 
-    def _regressed(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _regression(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Regress a value on the reading within each group: level, slope, residual variance, (n_groups, n_settings).
 
         Within a group, value and reading are assumed jointly Gaussian.

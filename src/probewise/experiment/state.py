@@ -12,23 +12,23 @@ from probewise._arrays import FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind
 from probewise.arm.instrument import Pose, Reading
+from probewise.experiment.configuration import Experiment, widest_mm
 from probewise.experiment.hidden import Hidden
 from probewise.experiment.journal import recording_of
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.setting import Experiment, widest_mm
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Instrumentation, Recording
 
-__all__ = ["PAPER_BITS", "ArmError", "Exploration", "State", "Step"]
+__all__ = ["PAPER_BITS", "ArmError", "Exploration", "ExplorationState", "Step"]
 
 PAPER_BITS = 25.0
 """Bits in the paper's count for a circle known to 4 mm: one per reading of the naive model."""
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class ExplorationState:
     """The current state of a run.
 
     `readings` so far, the `posterior` given them, the next pose, and the poses `planned` after it in a batch.

@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.experiment.setting import Experiment, widest_mm
+from probewise.experiment.configuration import Experiment, widest_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
@@ -100,7 +100,7 @@ def stop_reason(
     sd: FloatArray,
     known: bool,
     p_value: float,
-    outlook: UtilityMap,
+    utilities: UtilityMap,
     n_readings: int,
     max_readings: int | None,
     arm_sd: FloatArray | None = None,
@@ -126,14 +126,14 @@ def stop_reason(
             f"leaves {widest_mm(names, arm_sd):.1f} mm, which no reading lowers: `probewise arm fit-geometry` does, "
             "with more marks or with marks met more closely"
         )
-    if outlook.flat:
+    if utilities.flat:
         promise = (
             "every reading within reach promises the same"
-            if np.count_nonzero(outlook.reachable) > 1
+            if np.count_nonzero(utilities.reachable) > 1
             else "the only reading within reach promises nothing more"
         )
         return (
-            f"{promise}, {outlook.highest:.2g}: none would tell the hypotheses apart that are left; "
+            f"{promise}, {utilities.highest:.2g}: none would tell the hypotheses apart that are left; "
             f"the widest length is known to {widest:.1f} mm{included}"
         )
     if max_readings is not None and n_readings >= max_readings:

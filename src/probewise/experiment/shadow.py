@@ -7,17 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise.experiment.asking import Field
+from probewise.experiment.acquisition import ArmOverGrid
+from probewise.experiment.configuration import Experiment
 from probewise.experiment.loop import begin, step
-from probewise.experiment.setting import Experiment
-from probewise.experiment.values import Step
+from probewise.experiment.state import Step
 from probewise.inquiry import prior_entropy
 
-__all__ = ["beside"]
+__all__ = ["shadow_run"]
 
 
-def beside(
-    steps: Iterable[Step], other: Experiment, field: Field, *, rng: np.random.Generator
+def shadow_run(
+    steps: Iterable[Step], other: Experiment, field: ArmOverGrid, *, rng: np.random.Generator
 ) -> Iterator[tuple[Step, Step]]:
     """Yield each step of a run together with the other experiment's step from the same reading.
 

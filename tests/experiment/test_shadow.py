@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.experiment import Field, beside, explore
+from probewise.experiment import ArmOverGrid, explore, shadow_run
 from probewise.inquiry import Grid
 
 COARSE = Grid(400.0, 300.0, 17, 13)
@@ -14,8 +14,8 @@ def steps_of(small, **options):
 
 
 def watched(small, other):
-    field = Field.under(small.arm(), COARSE)
-    return list(beside(steps_of(small), other, field, rng=np.random.default_rng(2)))
+    field = ArmOverGrid.under(small.arm(), COARSE)
+    return list(shadow_run(steps_of(small), other, field, rng=np.random.default_rng(2)))
 
 
 @pytest.mark.slow

@@ -9,15 +9,15 @@ import pytest
 
 from probewise.effects import GainDrift
 from probewise.inquiry import (
-    AskedForecast,
     Designs,
+    DirectForecast,
     Finishing,
     Goal,
     Grid,
     InformationGain,
     Prospect,
     Readout,
-    SilhouetteForecast,
+    TabulatedForecast,
     forecast_of,
     utility_map,
 )
@@ -42,7 +42,7 @@ SHAPES = {
     "circle": Circle(FIELD),
     "any of two": AnyOf({"circle": Circle(FIELD), "rectangle": Rectangle(FIELD)}),
 }
-RMS = 0.005  # of the span: what `SilhouetteForecast` promises
+RMS = 0.005  # of the span: what `TabulatedForecast` promises
 
 
 def chain(shape, mixture=ONE, effects=()):
@@ -72,7 +72,7 @@ def test_predictions_near_the_edges_are_those_of_the_closed_form(name, mixture):
     """Places of a fine grid about one edge at a time: where nothing is seen nothing can be wrong."""
     shape = SHAPES[name]
     model, theta = chain(shape, mixture), hypotheses(shape, 60)
-    forecast = SilhouetteForecast.of(model)
+    forecast = TabulatedForecast.of(model)
     rng = np.random.default_rng(4)
     plan = Designs(Grid(), (0.0, 0.9)).plan("field").take(rng.integers(2 * 8515, size=900))
     exact, quick = model.predict(theta, plan), forecast.predict(theta, plan)
@@ -93,14 +93,14 @@ def test_the_weights_of_levels_are_those_of_asking_every_hypothesis(name):
     weight = np.random.default_rng(5).dirichlet(np.ones(300))
     weight[:40] = 0.0
     plan, rows = designs.plan("field"), np.random.default_rng(6).integers(grid.n_places, size=200)
-    outlook = SilhouetteForecast.of(model).outlook(theta, weight, designs, plan, np.arange(len(plan)), 1.0)
-    ((_, mass),) = outlook.maps(weight)
+    predictive = TabulatedForecast.of(model).predictive(theta, weight, designs, plan, np.arange(len(plan)), 1.0)
+    ((_, mass),) = predictive.maps(weight)
     np.testing.assert_allclose(mass.sum(axis=1), weight.sum(), atol=1e-12)
     exact = model.predict(theta, plan.take(rows))
-    width = outlook.levels[1] - outlook.levels[0]
+    width = predictive.levels[1] - predictive.levels[0]
     below = np.cumsum(mass[rows], axis=1)
     for away, side in ((0.5 * width + 0.01 * SPAN, -1), (0.5 * width + 0.01 * SPAN, 1)):
-        bound = (weight[:, None, None] * (exact[:, :, None] <= outlook.levels + side * away)).sum(axis=0)
+        bound = (weight[:, None, None] * (exact[:, :, None] <= predictive.levels + side * away)).sum(axis=0)
         assert (side * (bound - below) > -1e-9).all()
 
 
@@ -120,8 +120,8 @@ def test_the_map_is_that_of_asking_within_what_the_tables_and_the_levels_hide(na
     for believed in (theta, centre + 0.04 * (theta - centre)):
         if name == "any of two":
             believed[:, 0] = theta[:, 0]
-        quick = prospect_of(SilhouetteForecast.of(chain(shape)), believed, designs)
-        slow = replace(quick, forecast=AskedForecast(chain(shape)))
+        quick = prospect_of(TabulatedForecast.of(chain(shape)), believed, designs)
+        slow = replace(quick, forecast=DirectForecast(chain(shape)))
         bits, exact = InformationGain()(quick), InformationGain()(slow)
         assert exact.max() > 0.3
         assert np.abs(bits - exact).max() < tolerance
@@ -135,10 +135,10 @@ def test_heights_orientations_and_repeats_have_maps_of_their_own():
     theta = theta[:1] + 0.05 * (theta - theta[:1])
     designs = Designs(Grid(n_x=27, n_y=14), (0.0, 1.2), (1, 4), (("height_mm", (8.0, 12.0)),))
     calibrated = Instrumentation(height_mm=10.0)
-    forecast = SilhouetteForecast.of(chain(shape), highest=1.2)
+    forecast = TabulatedForecast.of(chain(shape), highest=1.2)
     quick = prospect_of(forecast, theta, designs, instrumentation=calibrated)
     bits = InformationGain()(quick).reshape(8, -1)
-    exact = InformationGain()(replace(quick, forecast=AskedForecast(chain(shape)))).reshape(8, -1)
+    exact = InformationGain()(replace(quick, forecast=DirectForecast(chain(shape)))).reshape(8, -1)
     assert np.abs(bits - exact).max() < 0.5 * math.log2(1.0 + 4 * (1 / 48 + (RMS * SPAN * 1.25**2) ** 2))
     assert np.ptp(bits.max(axis=1)) > 0.1
 
@@ -148,8 +148,8 @@ def test_near_the_end_the_tables_serve_too():
     theta = hypotheses(shape, 300)
     theta = theta[:1] + np.array([4.0, 4.0, 12.0, 5.0, 0.02]) * np.random.default_rng(1).standard_normal((300, 5))
     goal = Goal((0, 1, 2, 3), 4.0)
-    quick = prospect_of(SilhouetteForecast.of(chain(shape)), theta, Designs(Grid(n_x=66, n_y=33)), goal=goal)
-    slow = replace(quick, forecast=AskedForecast(chain(shape)))
+    quick = prospect_of(TabulatedForecast.of(chain(shape)), theta, Designs(Grid(n_x=66, n_y=33)), goal=goal)
+    slow = replace(quick, forecast=DirectForecast(chain(shape)))
     assert Finishing(least=1e-6)(quick).max() == pytest.approx(Finishing(least=1e-6)(slow).max(), abs=0.05)
 
 
@@ -177,14 +177,14 @@ class Arrow:
     ids=["a dent", "an effect", "a wide footprint on an ellipse", "a wide footprint on a rectangle"],
 )
 def test_what_the_tables_do_not_hold_is_asked(model):
-    assert isinstance(forecast_of(model), AskedForecast)
+    assert isinstance(forecast_of(model), DirectForecast)
 
 
 def test_an_arm_that_turns_its_sensor_is_asked():
     model, theta = chain(SHAPES["rectangle"]), hypotheses(SHAPES["rectangle"], 50)
     designs = Designs(Grid(n_x=9, n_y=5))
     turned = prospect_of(forecast_of(model), theta, designs, turn_rad=np.linspace(-1, 1, 45))
-    expected = InformationGain()(replace(turned, forecast=AskedForecast(model)))
+    expected = InformationGain()(replace(turned, forecast=DirectForecast(model)))
     np.testing.assert_array_equal(InformationGain()(turned), expected)
 
 

@@ -11,18 +11,18 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
+from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
-from probewise.experiment.setting import Experiment
 from probewise.inquiry import Goal, Grid, Prospect, UtilityMap, choose, choose_several, reachable_rows, utility_map
 from probewise.inquiry.forecast import thinned
 from probewise.nested.importance import Weighted
 
-__all__ = ["Field", "inquire", "next_poses"]
+__all__ = ["ArmOverGrid", "inquire", "next_poses"]
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
-    """Reach of the arm, orientations of its sensor, and seconds from a pose to places, including the reading.
+class ArmOverGrid:
+    """The arm over a grid: places it reaches, the sensor's orientation there, seconds from a pose to a reading there.
 
     `reachable` and `orientation_rad` have shape (n_places,); a design's own orientation is added to the latter.
     """
@@ -45,7 +45,7 @@ def inquire(
     experiment: Experiment,
     posterior: Weighted,
     drawn: FloatArray,
-    field: Field,
+    field: ArmOverGrid,
     *,
     at: Reading | None,
     goal: Goal | None = None,
@@ -100,13 +100,13 @@ def inquire(
 
 
 def next_poses(
-    experiment: Experiment, prospect: Prospect, outlook: UtilityMap, *, rng: np.random.Generator
+    experiment: Experiment, prospect: Prospect, utilities: UtilityMap, *, rng: np.random.Generator
 ) -> tuple[Pose, ...]:
     """Choose the next pose, or a batch of poses, each repeated as its design says."""
     if experiment.batch > 1:
         rows = choose_several(prospect, experiment.batch, rng=rng)
     else:
-        rows = (choose(outlook.values, outlook.reachable, rng=rng),)
+        rows = (choose(utilities.values, utilities.reachable, rng=rng),)
     orientation_rad = prospect.plan.orientation_rad  # the orientation that the sensor will have there
     designs = [(experiment.designs[row], float(orientation_rad[row])) for row in rows]
     return tuple(

@@ -83,10 +83,10 @@ class Model:
         samples = {name: theta[:, [k]] for k, name in enumerate(names)}
         out = self.caller(samples, settings.columns, strict=True)
         if not np.isfinite(out).all():
-            self._blame(theta, settings, out)
+            self._raise_own_error(theta, settings, out)
         return out
 
-    def _blame(self, theta: FloatArray, settings: Settings, out: FloatArray) -> None:
+    def _raise_own_error(self, theta: FloatArray, settings: Settings, out: FloatArray) -> None:
         """Raise the function's own error at the first sample without a finite prediction, or name that sample."""
         sample, row = (int(k) for k in np.argwhere(~np.isfinite(out))[0])
         own = {name: theta[[sample], k : k + 1] for k, name in enumerate(self.own_prior.names)}

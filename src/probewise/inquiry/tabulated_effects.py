@@ -15,11 +15,11 @@ from probewise.scene.cards import laid_over
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel, Stage, View
 
-__all__ = ["TabledChain"]
+__all__ = ["TabulatedChain"]
 
 
 @dataclass(frozen=True, eq=False)
-class TabledChain:
+class TabulatedChain:
     """A chain over one disc whose effects change neither the disc nor, but for what the table holds, the footprint."""
 
     chain: Chain
@@ -29,7 +29,7 @@ class TabledChain:
     @classmethod
     def of(cls, chain: Chain, plain: SensorModel) -> Self | None:
         """Evaluate `chain` by the table of `plain`, the same chain with fewer effects; None if that is impossible."""
-        if isinstance(plain, TabledChain):
+        if isinstance(plain, TabulatedChain):
             plain = plain.table if plain.cards is None else plain.cards
         cards = plain if isinstance(plain, CardedModel) else None
         table = plain if cards is None else cards.plain

@@ -196,8 +196,9 @@ class Evaluator:
     def _numbers(self, answer: object, theta: FloatArray) -> FloatArray:
         if isinstance(answer, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(answer).sum())):
             raise NotConvergedError(
-                f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: plain "
-                f"numbers; return answer.filled(-np.inf) if masked means impossible; {self._first_in_words(theta)}"
+                f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: "
+                "plain numbers; return answer.filled(-np.inf) if masked means impossible; "
+                f"{self._first_in_words(theta)}"
             )
         if np.asarray(answer).dtype.kind == "c":
             raise NotConvergedError(

@@ -72,10 +72,11 @@ class Refits:
     ) -> WeighedFit:
         """Fit under one noise distribution, compute the evidence under all, and refit if another is more probable.
 
-        A fit that gains nothing `beyond` another one is given the evidence of that: nobody asks for its own.
+        A fit that gains nothing `beyond` another one is given the evidence of that: nobody asks for its own. Under
+        noise with memory it may gain under white noise alone, and is weighed.
         """
         found = self._fit(model, starts, law, max_steps)
-        if beyond is not None and not _gains(found, beyond.found, law):
+        if beyond is not None and not law.remembers and not _gains(found, beyond.found, law):
             return WeighedFit.of(found, law, beyond.evidence, 0.0)
         for _ in range(2):
             evidence = self.noises.weigh(found)

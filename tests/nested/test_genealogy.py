@@ -42,7 +42,8 @@ def corner() -> Known:
 
 def runs(kept: float, n: int, **options: int) -> list[NestedResult]:
     return [
-        run(corner(), rng=np.random.default_rng(seed), n_live=100, move=Forgetful(kept), **options) for seed in range(n)
+        run(corner(), rng=np.random.default_rng(seed), n_live=100, move=Forgetful(kept), max_cost=1.0, **options)
+        for seed in range(n)
     ]
 
 

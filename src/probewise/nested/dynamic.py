@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import warnings
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -23,10 +23,10 @@ from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.nested.checkpoint import Live, Origin
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integrate
-from probewise.nested.merging import alive_at_death, combined_p_value
-from probewise.nested.moves import Move, PriorRejection, SliceMove
+from probewise.nested.merging import alive_at_death, combined_p_value, seeds_of
+from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, versions
-from probewise.nested.sampler import PRIOR_VOLUME, least_live, plain_state, step
+from probewise.nested.sampler import least_live, move_at, plain_state, step
 
 __all__ = ["Goal", "intensified"]
 
@@ -97,10 +97,23 @@ def intensified(
     _require_same(result, evaluate)
     seed_state = plain_state(rng.bit_generator.state)
     first, last = _span(result, goal)
-    thread, parent, rank, n_ranked = _thread(
-        result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng
-    )
-    return _joined(result, thread, parent, rank, n_ranked, seed_state, evaluate.n_calls, rng)
+    thread = _thread(result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng)
+    return _joined(result, thread, seed_state, evaluate.n_calls, rng)
+
+
+@dataclass(frozen=True, eq=False)
+class _Thread:
+    """New points with their origins, in order of death.
+
+    `started`: the row of the run's point at which each one's chain began, -1 where that is another new point, (n,).
+    `rank` among the `n_ranked` points alive at each insertion.
+    """
+
+    points: Points
+    origin: Origin
+    started: IntArray
+    rank: IntArray
+    n_ranked: IntArray
 
 
 def _require_same(result: NestedResult, evaluate: Evaluator) -> None:
@@ -144,25 +157,21 @@ def _thread(
     n_live: int,
     max_calls: int | None,
     rng: np.random.Generator,
-) -> tuple[tuple[Points, Origin], IntArray, IntArray, IntArray]:
-    """Draw new points above the level of row `first` and let them die up to that of row `last`.
-
-    Returns the new points with their origins, in order of death; the row of the run's point at which each began, -1
-    where that is another new point; insertion ranks; and the numbers of points ranked.
-    """
+) -> _Thread:
+    """Draw new points above the level of row `first` and let them die up to that of row `last`."""
     end = (float(result.log_likelihood[last]), float(result.label[last]))
     bound = Bound(float(result.log_likelihood[first]), float(result.label[first]))
     above = _alive(result, first)
     known = _points(result, evaluate, above)
     log_volume = float(result.log_volume[first])
     begin = np.concatenate([rng.permutation(len(above)) for _ in range(math.ceil(n_live / len(above)))])[:n_live]
-    drawn, tally = _move_at(move, log_volume).draw(known.take(begin), bound, known.u, evaluate, rng)
-    chained = math.exp(log_volume) <= PRIOR_VOLUME
-    started = np.where(chained, above[begin], -1)
+    now = move_at(move, log_volume)
+    drawn, tally = now.draw(known.take(begin), bound, known.u, evaluate, rng)
+    started = np.where(now is move, above[begin], -1)
     origin = Origin(
         np.full(n_live, bound.log_likelihood), np.full(n_live, bound.label), np.arange(n_live), np.full(n_live, -1)
     )
-    live, moving = Live(drawn, origin, log_volume), move.adapted(tally) if chained else move
+    live, moving = Live(drawn, origin, log_volume), move.adapted(tally) if now is move else move
     dead, ranks, counts = list[tuple[Points, Origin]](), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     n_replaced, cost = n_live // 2, tally.n_evaluated
     while True:
@@ -170,23 +179,18 @@ def _thread(
         reached = (float(live.points.log_likelihood[worst]), float(live.points.label[worst])) >= end
         if reached or (max_calls is not None and evaluate.n_calls + 2 * cost > max_calls):
             break
-        live, gone, tally = step(live, _move_at(moving, live.log_volume), evaluate, n_replaced=n_replaced, rng=rng)
+        now = move_at(moving, live.log_volume)
+        live, gone, tally = step(live, now, evaluate, n_replaced=n_replaced, rng=rng)
         cost = tally.n_evaluated
-        moving = moving.adapted(tally) if math.exp(live.log_volume) <= PRIOR_VOLUME else moving
+        moving = moving.adapted(tally) if now is moving else moving
         dead.append((gone.points, gone.origin))
         ranks.append(gone.rank)
         counts.append(gone.n_ranked)
     order = live.points.order()
     dead.append((live.points.take(order), live.origin.take(order)))
-    joined = Points.join(*(points for points, _ in dead)), Origin.join(*(origins for _, origins in dead))
-    parent = np.where(joined[1].ident < n_live, started[np.minimum(joined[1].ident, n_live - 1)], -1)
-    return joined, parent, np.concatenate(ranks), np.concatenate(counts)
-
-
-def _move_at(move: Move, log_volume: float) -> Move:
-    """Return the move for a volume: the prior itself while a draw from it costs less than a chain."""
-    volume = math.exp(log_volume)
-    return move if volume <= PRIOR_VOLUME else PriorRejection(volume)
+    points, origin = Points.join(*(points for points, _ in dead)), Origin.join(*(origins for _, origins in dead))
+    began = np.where(origin.ident < n_live, started[np.minimum(origin.ident, n_live - 1)], -1)
+    return _Thread(points, origin, began, np.concatenate(ranks), np.concatenate(counts))
 
 
 def _alive(result: NestedResult, row: int) -> IntArray:
@@ -205,20 +209,17 @@ def _points(result: NestedResult, evaluate: Evaluator, rows: IntArray) -> Points
 
 def _joined(
     result: NestedResult,
-    thread: tuple[Points, Origin],
-    parent: IntArray,
-    rank: IntArray,
-    n_ranked: IntArray,
+    thread: _Thread,
     seed_state: object,
     n_calls: int,
     rng: np.random.Generator,
 ) -> NestedResult:
     """Join a run and new points into one run, in order of death."""
-    points, origin = thread
+    points, origin = thread.points, thread.origin
     n_old = result.n_dead
     row_of = np.empty(len(points), dtype=np.int64)
     row_of[origin.ident] = n_old + np.arange(len(points))
-    parents = np.where(origin.parent >= 0, row_of[origin.parent], parent)
+    parents = np.where(origin.parent >= 0, row_of[origin.parent], thread.started)
     log_likelihood = np.concatenate([result.log_likelihood, points.log_likelihood])
     label = np.concatenate([result.label, points.label])
     order = np.lexsort((label, log_likelihood))
@@ -236,13 +237,12 @@ def _joined(
     if check is not None:
         apart = (evidence.log_z - check.log_z) / max(math.hypot(error, check.log_z_error), 1e-12)
         check = replace(check, distance=apart)
-    own = insertion_p_value(rank, n_ranked, rng=rng)
+    own = insertion_p_value(thread.rank, thread.n_ranked, rng=rng)
     notes = result.warnings
     if own < DOUBTFUL_P_VALUE:
         doubt = f"insertion ranks of the added points are not uniform (p = {own:.1g}); use a greater steps_per_param"
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=3)
         notes = (*notes, doubt)
-    seeds = json.loads(result.seed_state)
     return replace(
         result,
         theta=np.concatenate([result.theta, points.theta])[order],
@@ -258,10 +258,10 @@ def _joined(
         information=evidence.information,
         n_eff=evidence.n_eff,
         n_calls=result.n_calls + n_calls,
-        insertion_rank=np.concatenate([result.insertion_rank, rank]),
-        insertion_n_ranked=np.concatenate([result.insertion_n_ranked, n_ranked]),
+        insertion_rank=np.concatenate([result.insertion_rank, thread.rank]),
+        insertion_n_ranked=np.concatenate([result.insertion_n_ranked, thread.n_ranked]),
         insertion_p_value=combined_p_value([result.insertion_p_value, own]),
-        seed_state=json.dumps([*(seeds if isinstance(seeds, list) else [seeds]), seed_state]),
+        seed_state=json.dumps([*seeds_of(result), seed_state]),
         versions=versions(),
         warnings=notes,
         check=check,

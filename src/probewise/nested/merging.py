@@ -16,7 +16,7 @@ from probewise.nested.check import DISAGREE, weighted_mean
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
 from probewise.nested.result import Agreement, Check, NestedResult, versions
 
-__all__ = ["agreement_of", "alive_at_death", "combined_p_value", "merge"]
+__all__ = ["agreement_of", "alive_at_death", "combined_p_value", "merge", "seeds_of"]
 
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
@@ -198,8 +198,7 @@ def _check(parts: Sequence[NestedResult]) -> list[object]:
                 "not what births and deaths give",
                 "complete runs of nested sampling, in the order of log likelihood and label",
             )
-        state = json.loads(result.seed_state)
-        for one in state if isinstance(state, list) else [state]:
+        for one in seeds_of(result):
             if one in seeds:
                 raise ParameterError(
                     f"seed_state of run {number}",
@@ -208,6 +207,12 @@ def _check(parts: Sequence[NestedResult]) -> list[object]:
                 )
             seeds.append(one)
     return seeds
+
+
+def seeds_of(result: NestedResult) -> list[object]:
+    """Return the states of all generators that a result began with."""
+    state = json.loads(result.seed_state)
+    return state if isinstance(state, list) else [state]
 
 
 def _possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:

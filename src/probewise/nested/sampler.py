@@ -32,14 +32,13 @@ from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import NestedResult, few_lineages, few_possible, versions
 from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
-__all__ = ["LIVE_PER_PARAM", "PRIOR_VOLUME", "Dead", "Live", "least_live", "plain_state", "search", "step"]
+__all__ = ["LIVE_PER_PARAM", "Dead", "Live", "least_live", "move_at", "plain_state", "search", "step"]
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
 
-PRIOR_VOLUME = 0.05
-"""Share of the prior above which points are drawn from the whole prior: they cost fewer evaluations than chains."""
-
+# Draw from the whole prior while a point costs fewer evaluations than a chain would.
+_PRIOR_VOLUME = 0.05
 _FEW_EFFECTIVE = 30.0
 _STUCK_SHARE = 0.02
 
@@ -47,6 +46,12 @@ _STUCK_SHARE = 0.02
 def least_live(n_params: int) -> int:
     """Least number of live points for a problem."""
     return max(LIVE_PER_PARAM * n_params, 10)
+
+
+def move_at(move: Move, log_volume: float) -> Move:
+    """Return the move for what is left of the prior: the move itself, or while that is much, draws from the prior."""
+    volume = math.exp(log_volume)
+    return move if volume <= _PRIOR_VOLUME else PriorRejection(volume)
 
 
 def step(
@@ -234,11 +239,9 @@ def _require_options(
 def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, RoundSummary]:
     """Replace points once and add the dead ones to the evidence; returns new values and changes none."""
     live, moving = now.live, now.moving
-    whole = math.exp(live.log_volume)
-    chains = whole <= PRIOR_VOLUME
-    fresh, gone, tally = step(
-        live, moving if chains else PriorRejection(whole), evaluate, n_replaced=n_replaced, rng=rng
-    )
+    move = move_at(moving, live.log_volume)
+    chains = move is moving
+    fresh, gone, tally = step(live, move, evaluate, n_replaced=n_replaced, rng=rng)
     edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
     # Relative to the best likelihood: volumes would vanish in the rounding of a log likelihood such as -1e100.
     best = float(fresh.points.log_likelihood.max())

@@ -121,7 +121,7 @@ def test_about_a_curve_two_runs_that_agree_outvote_a_second_pass_below_both(
     longer_by: float, clusters_by: float, cured: bool
 ) -> None:
     """Stand-ins: a longer run, `longer_by` errors above the first; a pass whose mean log likelihood is off."""
-    known = problems.problem("Gaussian 4-D")
+    known = problems.problem("two far peaks 4-D")  # of several clusters
     sound = quiet(known, max_cost=1.0)
     passes = list[object]()
 

@@ -217,6 +217,8 @@ def _second_routes(
         theta = first.samples(_N_SAMPLES, rng=rng)
         # Clusters describe a posterior that they cover. A curved ridge they may not, and then mislead the live points.
         clustered = _repartitioned_near(problem, theta, clustered=True)
+        if clustered is not None and len(clustered.prior.parts) == 1:
+            clustered = None  # the single prior below
         if clustered is not None and (nats := _nats(first, clustered)) < _FEW_NATS < _GAIN * first.information:
             yield from_near(clustered, nats, most_calls=_MOST_COST * first.n_calls, expected=nats + first.log_z)
         single = _repartitioned_near(problem, theta, clustered=False)

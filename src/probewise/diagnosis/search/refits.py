@@ -170,6 +170,11 @@ class Refits:
         # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
+        # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
+        # a change point is far better known.
+        law = self.law_of(refitted[best])
+        if not law.alike(problem.law):
+            weights = templates.weights(scores_about(Linearised.of(parent.found, law)))
         if np.isfinite(log_z[best]):  # otherwise no variant could be fitted, and weights are unchanged
             weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
             weights[tried] = np.exp(log_z - log_z[best])

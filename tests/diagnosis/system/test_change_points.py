@@ -16,7 +16,7 @@ def flow():
 
 
 def in_closed_form(readings):
-    """Mean and sd of the change point: flat priors of both levels, log-uniform of the sd; marginal likelihood of each gap.
+    """Mean and sd of the change point: flat priors of both levels, log-uniform of the sd; marginal likelihood by gap.
 
     Each half has n levels about its own mean: (n1 n2)^(-1/2) S^(-(n - 2) / 2), S the sum of squares about both.
     """

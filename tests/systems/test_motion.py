@@ -101,7 +101,7 @@ def test_the_step_is_halved_until_readings_stand_still():
     )
     table = _table(np.linspace(0, 10, 30))
     system = System.of(simulator, table)
-    still = system.standing_still(table, system.starts[:1], tolerance=1e-5)
+    still = system.standing_still(table, system.theta(system.starts[:1]), tolerance=1e-5)
     finer = System(simulator, system.runs, still.max_step / 16)
     theta = system.theta(system.starts[:1])
     far = np.abs(still.chain(table, ()).predict(theta, table) - finer.chain(table, ()).predict(theta, table))

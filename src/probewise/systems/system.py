@@ -235,16 +235,17 @@ class System:
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
     def standing_still(
-        self, table: RunTable, z: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float
+        self, table: RunTable, theta: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float
     ) -> System:
-        """Halve the integration step until predictions at coordinates z change by less than a tolerance (rms).
+        """Halve the integration step until predictions change by less than a tolerance (rms).
 
         Parameters
         ----------
         table
             The rows.
-        z
-            Coordinates (n_samples, n_params); samples without finite predictions do not count.
+        theta
+            Parameters of the system and of the effects, (n_samples, n_params); samples without finite predictions do
+            not count.
         effects
             Effects added to the law.
         tolerance
@@ -257,7 +258,7 @@ class System:
         """
         if self.simulator.law is None:
             return self
-        places, theta, now = RowsInRuns(table), self.theta(z), self
+        places, now = RowsInRuns(table), self
         coarse = now.chain(table, effects).predict(theta, table)
         while True:
             finer = replace(now, max_step=now.max_step / 2)

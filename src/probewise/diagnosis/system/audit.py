@@ -50,7 +50,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     system = System.of(simulator, own)
     z, predicted, where = _typical_point(system, own)
     sd, noise = _noise(simulator, own, predicted)
-    system = system.standing_still(own, z[None, :], tolerance=_STANDS_STILL * sd)
+    system = system.standing_still(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]

@@ -17,6 +17,7 @@ from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, STEPS_OF_A_SEARCH, SimulatorApparatus
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
+from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
@@ -29,6 +30,7 @@ from probewise.systems.forms.stop import MeterStop, stop_of
 __all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
 
 _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
+_N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
 _MOST_COMPARED = 2400
 _STEPS_TRIED = 8  # of the fit of the simulator, from each start
 _BEST_STARTS = 3  # of which it goes on
@@ -74,7 +76,34 @@ def diagnose_system(
     require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
     told = _with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
-    return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
+    diagnosis = diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
+    step = _step_of_the_repair(diagnosis)
+    if step is None:
+        return diagnosis
+    assert simulator.law is not None
+    progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
+    finer = replace(simulator, law=replace(simulator.law, max_step_s=step))
+    prepared = prepare_system(finer, table, source=source, notes=notes, progress=progress)
+    return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)
+
+
+def _step_of_the_repair(diagnosis: Diagnosis) -> float | None:
+    """Return the integration step that the repaired law needs; None if it is that of the diagnosis, or out of reach.
+
+    A law that lacks an effect is integrated as precisely as its own large residuals ask for. The repair may leave so
+    little that the integration's error is what remains.
+    """
+    system = cast(SimulatorApparatus, diagnosis.apparatus).system
+    model, table = diagnosis.repaired, cast(RunTable, diagnosis.recording.plan)
+    effects = cast(Sequence[NamedEffect[Any]], model.chain.effects)
+    if system.simulator.law is None or not effects:
+        return None
+    tolerance = _STANDS_STILL * float(np.median(model.noise_sd))
+    try:
+        still = system.standing_still(table, model.theta[:_N_HALVED], effects, tolerance=tolerance)
+    except ParameterError:  # a friction or a bound that no step meets exactly
+        return None
+    return still.max_step if still.max_step < system.max_step else None
 
 
 def prepare_system(
@@ -230,7 +259,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     found = _from_best_start(system, recording, law)
     sd = _sd(system.simulator, table, recording, found)
     for _ in range(4):
-        finer = system.standing_still(table, found.z[None, :], tolerance=_STANDS_STILL * sd)
+        finer = system.standing_still(table, system.theta(found.z[None, :]), tolerance=_STANDS_STILL * sd)
         if finer is system:
             break
         system = finer

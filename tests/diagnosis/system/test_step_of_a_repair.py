@@ -39,9 +39,11 @@ def test_a_law_that_needs_finer_steps_once_it_is_repaired_gets_them(swings):
         time="t_s",
     )
     stages = []
-    found = diagnose_system(
-        spring, {"t_s": TIMES, "x_m": swings}, rng=np.random.default_rng(1), progress=lambda *a, **k: stages.append(a[0])
-    )
+
+    def told(stage, *numbers, **note):
+        stages.append(stage)
+
+    found = diagnose_system(spring, {"t_s": TIMES, "x_m": swings}, rng=np.random.default_rng(1), progress=told)
     assert any("once more" in stage for stage in stages)
     assert found.verdict == "named"
     assert found.combination == ("cubic:v:x",)

@@ -21,10 +21,12 @@ from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, in_vocabulary, out_of_vocabulary
-from probewise.effects import is_out_of_vocabulary
+from probewise.effects import PROPOSAL, is_out_of_vocabulary
 from probewise.sensor import Stage
 
 __all__ = ["Evidences", "Posterior", "Screening", "Searched", "posterior_of"]
+
+_NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, as a smaller misfit beside it would
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +60,20 @@ class Evidences:
         return named - self.fits[order, ()].evidence[noise].log_z > self.unknown[order, names, noise] - named
 
     def known_as(self, mean: Names) -> Names:
-        """Return a combination's reported name: unknown if out of vocabulary, unless its named part explains more."""
+        """Return a combination's reported name: unknown if out of vocabulary, unless names explain more.
+
+        These are its named part, or the one effect that explains nearly all that a formula alone does.
+        """
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
             return mean
-        log_z = {names: self._log_z(names) for names in (mean, named, ())}
-        return named if named and log_z[named] - log_z[()] > log_z[mean] - log_z[named] else ("unknown",)
+        share = 0.5
+        if not named and mean[0].startswith(PROPOSAL):
+            single = (names for _, names in self.fits if len(names) == 1 and not out_of_vocabulary(names))
+            named, share = max(single, key=self._log_z, default=()), _NEARLY_ALL
+        nothing = self._log_z(())
+        gain = self._log_z(named) - nothing
+        return named if named and gain > share * (self._log_z(mean) - nothing) else ("unknown",)
 
     def one_name_explains_more(self) -> bool:
         """Tell whether one effect, on the mean or on the noise, explains more than what has no name does by itself.

@@ -1,0 +1,37 @@
+"""Under which name a combination counts that holds a formula, which is a proposal and no name."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from probewise.diagnosis.search.searched import Evidences
+
+FORMULA = "formula:reading:temp_c:a while |(t / period + phase) mod 1| < share / 2"
+
+
+def of(log_z):
+    """Evidences of fits by their names, of which nothing has 0."""
+    return Evidences({(0, names): SimpleNamespace(log_z=value) for names, value in {(): 0.0, **log_z}.items()})
+
+
+@pytest.mark.parametrize(
+    ("wave", "known"),
+    [(91.0, ("interference",)), (89.0, ("unknown",))],
+    ids=["nine tenths of its gain", "less than nine tenths"],
+)
+def test_a_formula_counts_as_the_one_effect_that_explains_nearly_as_much(wave, known):
+    evidences = of({("interference",): wave, ("offset_drift",): 3.0, (FORMULA,): 100.0})
+    assert evidences.known_as((FORMULA,)) == known
+
+
+@pytest.mark.parametrize(("named", "known"), [(51.0, ("offset_drift",)), (49.0, ("unknown",))])
+def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named, known):
+    evidences = of({("offset_drift",): named, (FORMULA, "offset_drift"): 100.0})
+    assert evidences.known_as((FORMULA, "offset_drift")) == known
+
+
+def test_names_stay_and_the_unknown_stays():
+    evidences = of({("interference",): 5.0})
+    assert evidences.known_as(("interference",)) == ("interference",)
+    assert evidences.known_as(("unknown",)) == ("unknown",)
+    assert evidences.known_as(()) == ()

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.patches import ALONG_X, PatchPrior, ScanLine, bell, patch_bank, scanned_lines
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.patches import PatchEffect, bell, scanned_lines
+from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 from probewise.scene.regions import edge_distance
@@ -36,11 +35,12 @@ class AlbedoGradient(LinearEffect[SceneView]):
 
     typical_per_mm: float = 2e-4
 
-    name: ClassVar[str] = "albedo_gradient"
-    stage: ClassVar[Stage] = Stage.SCENE
-    units: ClassVar[tuple[str, ...]] = ("1/mm", "1/mm")
-    covariates: ClassVar[tuple[str, ...]] = ("place",)
-    parameters: ClassVar[tuple[str, ...]] = ("per_mm_x", "per_mm_y")
+    name = "albedo_gradient"
+    words = "unevenly white paper"
+    stage = Stage.SCENE
+    units = ("1/mm", "1/mm")
+    covariates = ("place",)
+    parameters = ("per_mm_x", "per_mm_y")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -48,13 +48,11 @@ class AlbedoGradient(LinearEffect[SceneView]):
         return cls(typical_per_mm=0.02 / extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Multiply every pattern's albedo by the gradient."""
         return replace(
             value, regions={name: GradedRegion(r, theta) for name, r in _regions_under_readings(value, plan).items()}
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how many percent the white fades over 100 mm."""
         return (
             f"the signal over white changes by {give_or_take(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
             f"{give_or_take(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
@@ -63,21 +61,17 @@ class AlbedoGradient(LinearEffect[SceneView]):
 
 
 @dataclass(frozen=True)
-class AlbedoPatch(NamedEffect[SceneView]):
-    """A stain or a bright patch on every pattern: S + albedo exp(-d^2 / 2 r^2), d the distance from (x, y).
-
-    `line` is the scanned line on or beside which it lies; `lines` are the candidates.
-    """
+class AlbedoPatch(PatchEffect[SceneView]):
+    """A stain or a bright patch on every pattern: S + albedo exp(-d^2 / 2 r^2), d the distance from (x, y)."""
 
     typical: float = 0.05
-    line: ScanLine = ALONG_X
-    lines: tuple[ScanLine, ...] = ()
 
-    name: ClassVar[str] = "albedo_patch"
-    stage: ClassVar[Stage] = Stage.SCENE
-    units: ClassVar[tuple[str, ...]] = ("1", "mm", "mm", "mm")
-    covariates: ClassVar[tuple[str, ...]] = ("place",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "albedo_patch"
+    words = "a stain on the paper"
+    stage = Stage.SCENE
+    size = "albedo"
+    units = ("1", "mm", "mm", "mm")
+    covariates = ("place",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -85,27 +79,12 @@ class AlbedoPatch(NamedEffect[SceneView]):
         lines = scanned_lines(extent.plan)
         return cls(line=lines[0], lines=lines) if lines else None
 
-    @cached_property
-    def prior(self) -> PatchPrior:
-        """Albedo added at the centre, its place and its radius."""
-        return PatchPrior("albedo", self.typical, self.line)
-
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Add the patch to every pattern."""
         return replace(
             value, regions={name: PatchedRegion(r, theta) for name, r in _regions_under_readings(value, plan).items()}
         )
 
-    def variants(self) -> tuple[Self, ...]:
-        """One variant for each scanned line."""
-        return tuple(replace(self, line=line) for line in self.lines)
-
-    def bank(self) -> FloatArray:
-        """Spots of three radii along the line."""
-        return patch_bank(self.typical, self.line)
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say where, how large and how much whiter."""
         kind = "whiter" if mean[0] > 0 else "darker"
         return (
             f"within {give_or_take(mean[3], sd[3])} mm of the place ({give_or_take(mean[1], sd[1])}, "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
 from probewise.effects.motion import in_scans, mountings
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import entries, give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -24,11 +24,12 @@ class OrientationError(LinearEffect[Poses]):
 
     typical_deg: float = 3.0
 
-    name: ClassVar[str] = "orientation_error"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("deg",)
-    covariates: ClassVar[tuple[str, ...]] = ("orientation",)
-    parameters: ClassVar[tuple[str, ...]] = ("deg",)
+    name = "orientation_error"
+    words = "a wrong sensor angle in all scans"
+    stage = Stage.POSE
+    units = ("deg",)
+    covariates = ("orientation",)
+    parameters = ("deg",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -36,7 +37,6 @@ class OrientationError(LinearEffect[Poses]):
         return cls()
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Add the angle to every pose."""
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta))
 
     def is_of_the_ssf(self, plan: Plan) -> bool:
@@ -44,7 +44,6 @@ class OrientationError(LinearEffect[Poses]):
         return True
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how many degrees."""
         return f"in all scans the sensor is turned {_too_far(mean[0], sd[0])}"
 
 
@@ -54,11 +53,12 @@ class ScanAngleError(OneScanEffect[Poses]):
 
     typical_deg: float = 3.0
 
-    name: ClassVar[str] = "scan_angle_error"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("deg",)
-    covariates: ClassVar[tuple[str, ...]] = ("scan", "orientation")
-    parameters: ClassVar[tuple[str, ...]] = ("deg",)
+    name = "scan_angle_error"
+    words = "a wrong sensor angle in some scans"
+    stage = Stage.POSE
+    units = ("deg",)
+    covariates = ("scan", "orientation")
+    parameters = ("deg",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -67,15 +67,12 @@ class ScanAngleError(OneScanEffect[Poses]):
         return cls(choices=choices) if choices else None
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Add the angle to the poses of the affected scans."""
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta) * in_scans(plan, self.scans))
 
     def bank(self) -> FloatArray:
-        """One small angle, and two large ones of either sign."""
-        return self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0])[:, None, None]
+        return entries(self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0]))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how many degrees, and in which scans."""
         return f"in {scans_in_words(self.scans)} the sensor is turned {_too_far(mean[0], sd[0])}"
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Self
 
@@ -10,7 +12,9 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.effects.extent import Extent
+from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.vocabulary import Gates, NamedEffect, V
+from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 
 __all__ = ["ChangePointEffect", "change_point_times"]
@@ -29,6 +33,27 @@ class ChangePointEffect(NamedEffect[V]):
 
     times_s: tuple[float, ...] = (0.0, 1e5)
     between_s: tuple[float, float] | None = None
+
+    @property
+    def sizes(self) -> Mapping[str, float]:
+        """Typical size of each amplitude, by name."""
+        raise NotImplementedError
+
+    @property
+    def amplitudes(self) -> tuple[int, ...]:
+        """All parameters but the time."""
+        return tuple(range(len(self.sizes)))
+
+    @cached_property
+    def prior(self) -> Product:
+        """Sizes of either sign, and the time: uniform over the recording, or between two chosen readings."""
+        sizes = {name: HeavyTailed(size) for name, size in self.sizes.items()}
+        return Product({**sizes, "at_s": Uniform(*self.open_s)})
+
+    def bank(self) -> FloatArray:
+        """One entry with a column for each amplitude, its time in the middle of the open interval."""
+        sizes = np.diag(list(self.sizes.values()))
+        return np.column_stack([sizes, np.full(len(sizes), sum(self.open_s) / 2)])[None, :, :]
 
     @property
     def open_s(self) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.linear import LinearEffect
 from probewise.effects.patches import bell
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.recordings.plan import Plan
@@ -34,12 +34,13 @@ class EdgeBlur(LinearEffect[Footprint]):
 
     typical_mm: float = 2.0
 
-    name: ClassVar[str] = "edge_blur"
-    stage: ClassVar[Stage] = Stage.FOOTPRINT
-    units: ClassVar[tuple[str, ...]] = ("mm",)
-    covariates: ClassVar[tuple[str, ...]] = ("edge_distance",)
-    parameters: ClassVar[tuple[str, ...]] = ("sd_mm",)
-    positive: ClassVar[bool] = True
+    name = "edge_blur"
+    words = "soft printed edges"
+    stage = Stage.FOOTPRINT
+    units = ("mm",)
+    covariates = ("edge_distance",)
+    parameters = ("sd_mm",)
+    positive = True
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -47,7 +48,6 @@ class EdgeBlur(LinearEffect[Footprint]):
         return cls(typical_mm=0.02 * extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Widen the footprint."""
         wider = theta[:, :, None] ** 2
         return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
 
@@ -61,7 +61,6 @@ class EdgeBlur(LinearEffect[Footprint]):
         return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how soft."""
         return f"the printed edges are soft: blurred by {give_or_take(mean[0], sd[0])} mm (sd)"
 
 
@@ -76,11 +75,11 @@ class Halo(NamedEffect[Footprint]):
     narrowest_mm: float = 10.0
     widest_mm: float = 100.0
 
-    name: ClassVar[str] = "halo"
-    stage: ClassVar[Stage] = Stage.FOOTPRINT
-    units: ClassVar[tuple[str, ...]] = ("1", "mm")
-    covariates: ClassVar[tuple[str, ...]] = ("edge_distance",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "halo"
+    words = "scattered light around the spot"
+    stage = Stage.FOOTPRINT
+    units = ("1", "mm")
+    covariates = ("edge_distance",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -89,13 +88,11 @@ class Halo(NamedEffect[Footprint]):
 
     @cached_property
     def prior(self) -> Product:
-        """Share and radius, log-uniform."""
         return Product(
             {"share": LogUniform(self.least_share, 0.7), "r_mm": LogUniform(self.narrowest_mm, self.widest_mm)}
         )
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Add the halo to the mixture."""
         share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
 
         def joined(own: FloatArray, skirt: FloatArray) -> FloatArray:
@@ -117,12 +114,9 @@ class Halo(NamedEffect[Footprint]):
         )
 
     def bank(self) -> FloatArray:
-        """Five entries of one column, one for each radius."""
-        radii = np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5)
-        return np.stack([np.full(5, 0.02), radii], axis=-1)[:, None, :]
+        return entries(0.02, np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how much light comes from how far."""
         return (
             f"a wide halo around the sensor's spot, of sd {give_or_take(mean[1], sd[1])} mm, contributes "
             f"{give_or_take(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
@@ -143,11 +137,11 @@ class EdgeShadow(NamedEffect[View]):
     patterns: tuple[str, ...] = ()
     choices: tuple[tuple[str, ...], ...] = ((),)
 
-    name: ClassVar[str] = "edge_shadow"
-    stage: ClassVar[Stage] = Stage.SEEN
-    units: ClassVar[tuple[str, ...]] = ("1", "mm")
-    covariates: ClassVar[tuple[str, ...]] = ("edge_distance",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "edge_shadow"
+    words = "shadows along the edges"
+    stage = Stage.SEEN
+    units = ("1", "mm")
+    covariates = ("edge_distance",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -162,11 +156,9 @@ class EdgeShadow(NamedEffect[View]):
 
     @cached_property
     def prior(self) -> Product:
-        """Depth, of either sign, and width."""
         return Product({"amp": HeavyTailed(self.typical), "w": LogUniform(self.narrowest_mm, self.widest_mm)})
 
     def apply(self, value: View, theta: FloatArray, plan: Plan) -> View:
-        """Darken the seen fraction near an edge."""
         everywhere = (1, len(plan))
         x_mm, y_mm = (
             np.broadcast_to(place, np.broadcast_shapes(place.shape, everywhere))
@@ -183,16 +175,12 @@ class EdgeShadow(NamedEffect[View]):
         return replace(value, seen=value.seen - theta[:, :1] * bell(distance**2, theta[:, 1:2]))
 
     def variants(self) -> tuple[Self, ...]:
-        """One variant for each group of patterns."""
         return tuple(replace(self, patterns=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        """Six entries of one column, one for each width."""
-        widths = np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6)
-        return np.stack([np.full(6, self.typical), widths], axis=-1)[:, None, :]
+        return entries(self.typical, np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how deep and how wide."""
         kind = "darker" if mean[0] > 0 else "brighter"
         where = f" of pattern {', '.join(self.patterns)}" if self.patterns else ""
         why = "the edge casts a shadow" if mean[0] > 0 else "the edge reflects light"

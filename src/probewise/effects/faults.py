@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -25,33 +25,24 @@ _FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
 class Outliers(NoiseEffect):
     """A heavy tail: with probability `share` a reading's noise is `size` times as wide."""
 
-    name: ClassVar[str] = "outliers"
-    stage: ClassVar[Stage] = Stage.NOISE
-    units: ClassVar[tuple[str, ...]] = ("1", "noise sd")
-    covariates: ClassVar[tuple[str, ...]] = ("level", "time")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scales: share and size are pure numbers."""
-        return cls()
+    name = "outliers"
+    words = "outlying readings"
+    stage = Stage.NOISE
+    units = ("1", "noise sd")
+    covariates = ("level", "time")
 
     @cached_property
     def prior(self) -> Product:
-        """Share and size, log-uniform."""
         return Product({"share": LogUniform(2e-3, 0.2), "size": LogUniform(2.5, 40.0)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the share and width of the outliers."""
         return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
 
     def bank(self) -> FloatArray:
-        """Equally weighted nodes of the prior, four per parameter."""
         u = (np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2) + 0.5) / 4
         return self.prior.from_unit_cube(u)[:, None, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how many readings are far off, and how far."""
         return (
             f"outliers: {give_or_take(mean[0], sd[0], factor=100)} % of the readings scatter "
             f"{give_or_take(mean[1], sd[1])} times as widely as the others"
@@ -70,11 +61,11 @@ class Dropouts(NoiseEffect):
     ends: tuple[float, ...] = ()
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "dropouts"
-    stage: ClassVar[Stage] = Stage.NOISE
-    units: ClassVar[tuple[str, ...]] = ("1", "reading")
-    covariates: ClassVar[tuple[str, ...]] = ("level", "time")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "dropouts"
+    words = "lost readings"
+    stage = Stage.NOISE
+    units = ("1", "reading")
+    covariates = ("level", "time")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -84,15 +75,12 @@ class Dropouts(NoiseEffect):
 
     @cached_property
     def prior(self) -> Product:
-        """Share, log-uniform, and value, uniform."""
         return Product({"share": LogUniform(2e-3, 0.2), "value": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the share of lost readings and their value."""
         return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
 
     def bank(self) -> FloatArray:
-        """Both ends of the range of values, at two shares."""
         ends = (self.lowest + 0.01, self.highest - 0.01)
         return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
 
@@ -109,7 +97,6 @@ class Dropouts(NoiseEffect):
         return np.stack([shares, np.full(12, value)], axis=1)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how many readings are lost, and to which value."""
         return (
             f"readings are lost: {give_or_take(mean[0], sd[0], factor=100)} % of them read "
             f"{give_or_take(mean[1], sd[1], self.unit)}, whatever the true value"

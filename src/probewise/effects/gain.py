@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -31,11 +31,11 @@ class GainDrift(NamedEffect[FloatArray]):
     shortest_s: float = 5.0
     longest_s: float = 5000.0
 
-    name: ClassVar[str] = "gain_drift"
-    stage: ClassVar[Stage] = Stage.GAIN
-    units: ClassVar[tuple[str, ...]] = ("1", "s")
-    covariates: ClassVar[tuple[str, ...]] = ("time",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "gain_drift"
+    words = "a gain that drifts"
+    stage = Stage.GAIN
+    units = ("1", "s")
+    covariates = ("time",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -44,22 +44,17 @@ class GainDrift(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        """Relative error at time 0, of either sign, and time constant."""
         return Product({"frac": HeavyTailed(self.typical), "tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal above the dark level, (n_samples, n_points)."""
         # A negative time would let the exponential overflow.
         fade = np.exp(-np.maximum(plan.time_s, 0.0) / theta[:, 1:2])
         return np.asarray(value * (1 + theta[:, :1] * fade))
 
     def bank(self) -> FloatArray:
-        """Seven entries of one column, one for each time constant."""
-        taus = np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7)
-        return np.stack([np.full(7, self.typical), taus], axis=-1)[:, None, :]
+        return entries(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how many percent the signal starts off, and how long that lasts."""
         side = "too strong" if mean[0] > 0 else "too weak"
         return (
             f"the signal starts {give_or_take(abs(mean[0]), sd[0], factor=100)} % {side} at time 0 and settles "
@@ -76,12 +71,13 @@ class BatterySag(LinearEffect[FloatArray]):
 
     typical_per_volt: float = 0.05
 
-    name: ClassVar[str] = "battery_sag"
-    stage: ClassVar[Stage] = Stage.GAIN
-    units: ClassVar[tuple[str, ...]] = ("1/V",)
-    covariates: ClassVar[tuple[str, ...]] = (_BATTERY,)
-    reads: ClassVar[tuple[str, ...]] = (_BATTERY,)
-    parameters: ClassVar[tuple[str, ...]] = ("per_volt",)
+    name = "battery_sag"
+    words = "a signal that follows the battery"
+    stage = Stage.GAIN
+    units = ("1/V",)
+    covariates = (_BATTERY,)
+    reads = (_BATTERY,)
+    parameters = ("per_volt",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -91,11 +87,9 @@ class BatterySag(LinearEffect[FloatArray]):
         return cls(typical_per_volt=0.02 / fall) if fall > 0 else None
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal above the dark level, (n_samples, n_points)."""
         return np.asarray(value * (1 + theta[:, :1] * _volts_above_reference(plan)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how many percent the signal changes per volt."""
         way = "loses" if mean[0] > 0 else "gains"
         return (
             f"the signal {way} {give_or_take(abs(mean[0]), sd[0], factor=100)} % for each volt that the battery "

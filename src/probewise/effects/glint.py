@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import ClassVar, Self
+from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.patches import ALONG_X, PatchPrior, ScanLine, bell, patch_bank, scanned_lines
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.patches import PatchEffect, bell, scanned_lines
+from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
@@ -19,22 +18,18 @@ __all__ = ["Glint"]
 
 
 @dataclass(frozen=True)
-class Glint(NamedEffect[FloatArray]):
-    """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y).
-
-    `line` is the scanned line on or beside which it lies; `lines` are the candidates.
-    """
+class Glint(PatchEffect[FloatArray]):
+    """A reflection at one place, on black too: reading + amp exp(-d^2 / 2 r^2), d the distance from (x, y)."""
 
     typical: float = 1.0
-    line: ScanLine = ALONG_X
-    lines: tuple[ScanLine, ...] = ()
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "glint"
-    stage: ClassVar[Stage] = Stage.OFFSET
-    units: ClassVar[tuple[str, ...]] = ("reading", "mm", "mm", "mm")
-    covariates: ClassVar[tuple[str, ...]] = ("place",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "glint"
+    words = "a glint at one place"
+    stage = Stage.OFFSET
+    size = "amp"
+    units = ("reading", "mm", "mm", "mm")
+    covariates = ("place",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -42,26 +37,11 @@ class Glint(NamedEffect[FloatArray]):
         lines = scanned_lines(extent.plan)
         return cls(0.02 * extent.span, lines[0], lines, unit=extent.unit) if lines else None
 
-    @cached_property
-    def prior(self) -> PatchPrior:
-        """Height, place and radius."""
-        return PatchPrior("amp", self.typical, self.line)
-
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Add the reflection to the readings, (n_samples, n_points)."""
         amp, x, y, r = (theta[:, k : k + 1] for k in range(4))
         return np.asarray(value + amp * bell((plan.x_mm - x) ** 2 + (plan.y_mm - y) ** 2, r))
 
-    def variants(self) -> tuple[Self, ...]:
-        """One variant for each scanned line."""
-        return tuple(replace(self, line=line) for line in self.lines)
-
-    def bank(self) -> FloatArray:
-        """Spots of three radii along the line."""
-        return patch_bank(self.typical, self.line)
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say where, how large and how bright."""
         return (
             f"within {give_or_take(mean[3], sd[3])} mm of the place ({give_or_take(mean[1], sd[1])}, "
             f"{give_or_take(mean[2], sd[2])}) mm the readings are {give_or_take(abs(mean[0]), sd[0], self.unit)} too "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import Self
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
@@ -28,11 +28,12 @@ class HeightGradient(LinearEffect[Footprint]):
 
     typical: float = 0.001
 
-    name: ClassVar[str] = "height_gradient"
-    stage: ClassVar[Stage] = Stage.FOOTPRINT
-    units: ClassVar[tuple[str, ...]] = ("mm/mm",)
-    covariates: ClassVar[tuple[str, ...]] = ("place",)
-    parameters: ClassVar[tuple[str, ...]] = ("mm_per_mm",)
+    name = "height_gradient"
+    words = "a sloping table"
+    stage = Stage.FOOTPRINT
+    units = ("mm/mm",)
+    covariates = ("place",)
+    parameters = ("mm_per_mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -40,11 +41,9 @@ class HeightGradient(LinearEffect[Footprint]):
         return cls(typical=0.01 * _height_mm(extent.plan) / extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Scale and dim the footprint by the height at each X."""
         return raised(value, 1 + theta[:, :1] * plan.x_mm / _height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far the sensor rises over 100 mm."""
         way = "grows" if mean[0] > 0 else "shrinks"
         return (
             f"the sensor's height above the surface {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} mm per "
@@ -58,11 +57,12 @@ class HeightOffset(OneScanEffect[Footprint]):
 
     typical_mm: float = 0.15
 
-    name: ClassVar[str] = "height_offset"
-    stage: ClassVar[Stage] = Stage.FOOTPRINT
-    units: ClassVar[tuple[str, ...]] = ("mm",)
-    covariates: ClassVar[tuple[str, ...]] = ("scan",)
-    parameters: ClassVar[tuple[str, ...]] = ("mm",)
+    name = "height_offset"
+    words = "another sensor height in some scans"
+    stage = Stage.FOOTPRINT
+    units = ("mm",)
+    covariates = ("scan",)
+    parameters = ("mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -71,11 +71,9 @@ class HeightOffset(OneScanEffect[Footprint]):
         return cls(choices=choices, typical_mm=0.01 * _height_mm(extent.plan)) if choices else None
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Widen and dim the footprint in the affected scans."""
         return raised(value, 1 + theta * in_scans(plan, self.scans) / _height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how much higher, and in which scans."""
         way = "higher" if mean[0] > 0 else "lower"
         much = give_or_take(abs(mean[0]), sd[0])
         return f"in {scans_in_words(self.scans)} the sensor hangs {much} mm {way} than in the others"

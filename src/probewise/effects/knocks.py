@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -11,9 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.vocabulary import give_or_take
-from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -27,11 +25,11 @@ class ArmKnock(ChangePointEffect[Poses]):
     typical_mm: float = 0.3
     typical_deg: ClassVar[float] = 2.0
 
-    name: ClassVar[str] = "arm_knock"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "deg", "s")
-    covariates: ClassVar[tuple[str, ...]] = ("time", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0, 1, 2)
+    name = "arm_knock"
+    words = "an arm or sheet that was pushed"
+    stage = Stage.POSE
+    units = ("mm", "mm", "deg", "s")
+    covariates = ("time", "slope")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -39,14 +37,11 @@ class ArmKnock(ChangePointEffect[Poses]):
         times = change_point_times(extent)
         return None if times is None else cls(times, typical_mm=0.005 * extent.length_mm)
 
-    @cached_property
-    def prior(self) -> Product:
-        """Shift along X and along Y, turn, and time of the knock."""
-        shift, turn = HeavyTailed(self.typical_mm), HeavyTailed(self.typical_deg)
-        return Product({"dx_mm": shift, "dy_mm": shift, "turn_deg": turn, "at_s": Uniform(*self.open_s)})
+    @property
+    def sizes(self) -> Mapping[str, float]:
+        return {"dx_mm": self.typical_mm, "dy_mm": self.typical_mm, "turn_deg": self.typical_deg}
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift and turn the poses of the readings taken after the knock."""
         since = self.since(theta, plan)
         return replace(
             value,
@@ -55,13 +50,7 @@ class ArmKnock(ChangePointEffect[Poses]):
             orientation_rad=value.orientation_rad + np.deg2rad(theta[:, 2:3]) * since,
         )
 
-    def bank(self) -> FloatArray:
-        """One entry of three columns, its time in the middle of the open interval."""
-        sizes = np.diag([self.typical_mm, self.typical_mm, self.typical_deg])
-        return np.concatenate([sizes, np.full((3, 1), sum(self.open_s) / 2)], axis=1)[None, :, :]
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say when, and how far."""
         return (
             f"from {give_or_take(mean[3], sd[3])} s on, all positions are off by {give_or_take(mean[0], sd[0])} mm "
             f"along X and {give_or_take(mean[1], sd[1])} mm along Y, and the sensor is turned by "
@@ -75,11 +64,11 @@ class GainStep(ChangePointEffect[FloatArray]):
 
     typical: float = 0.02
 
-    name: ClassVar[str] = "gain_jump"
-    stage: ClassVar[Stage] = Stage.GAIN
-    units: ClassVar[tuple[str, ...]] = ("1", "s")
-    covariates: ClassVar[tuple[str, ...]] = ("time", "level")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "gain_jump"
+    words = "a sudden change of the signal's strength"
+    stage = Stage.GAIN
+    units = ("1", "s")
+    covariates = ("time", "level")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -87,21 +76,14 @@ class GainStep(ChangePointEffect[FloatArray]):
         times = change_point_times(extent)
         return None if times is None else cls(times)
 
-    @cached_property
-    def prior(self) -> Product:
-        """Relative change, of either sign, and its time."""
-        return Product({"frac": HeavyTailed(self.typical), "at_s": Uniform(*self.open_s)})
+    @property
+    def sizes(self) -> Mapping[str, float]:
+        return {"frac": self.typical}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Scale the signal of the readings taken after the step, (n_samples, n_points)."""
         return np.asarray(value * (1 + theta[:, :1] * self.since(theta, plan)))
 
-    def bank(self) -> FloatArray:
-        """One entry, its time in the middle of the open interval."""
-        return np.array([[[self.typical, sum(self.open_s) / 2]]])
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say when, and by how many percent."""
         way = "stronger" if mean[0] > 0 else "weaker"
         return (
             f"from {give_or_take(mean[1], sd[1])} s on, the signal is {give_or_take(abs(mean[0]), sd[0], factor=100)} "

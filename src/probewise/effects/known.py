@@ -35,7 +35,6 @@ class Known(Wrapped[V]):
 
     @property
     def prior(self) -> Empty:
-        """The empty prior: no free parameters."""
         return Empty()
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
@@ -52,7 +51,6 @@ class Informed(Wrapped[V]):
 
     @property
     def prior(self) -> Prior:
-        """That prior."""
         return self.own
 
 

@@ -31,12 +31,12 @@ class Quantisation(NoiseEffect):
     largest: float = 20.0
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "quantisation"
-    stage: ClassVar[Stage] = Stage.NOISE
-    units: ClassVar[tuple[str, ...]] = ("reading",)
-    covariates: ClassVar[tuple[str, ...]] = ("lattice",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
-    n_nodes: ClassVar[int] = 16
+    name = "quantisation"
+    words = "rounded readings"
+    stage = Stage.NOISE
+    units = ("reading",)
+    covariates = ("lattice",)
+    n_nodes = 16
     seen_above: ClassVar[float] = 0.3
     """Smallest step, in noise sds, that counts: a finer lattice is only the printing of digits."""
 
@@ -49,11 +49,9 @@ class Quantisation(NoiseEffect):
 
     @cached_property
     def prior(self) -> Product:
-        """The step, log-uniform."""
         return Product({"step": LogUniform(self.smallest, self.largest)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the rounding step."""
         return replace(value, step=theta[:, :1])
 
     def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
@@ -62,7 +60,6 @@ class Quantisation(NoiseEffect):
         return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how coarse the readings are."""
         return (
             f"the readings are rounded to steps of {give_or_take(mean[0], sd[0], self.unit)}, which were not declared"
         )

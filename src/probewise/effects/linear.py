@@ -24,7 +24,7 @@ class LinearEffect(NamedEffect[V]):
 
     parameters: ClassVar[tuple[str, ...]]
     """Names of the parameters."""
-    positive: ClassVar[bool] = False
+    positive = False
     """Whether the parameters are never negative."""
 
     @cached_property
@@ -59,7 +59,6 @@ class OneScanEffect(LinearEffect[V]):
     choices: tuple[tuple[str, ...], ...] = ()
 
     def variants(self) -> tuple[Self, ...]:
-        """One variant for each candidate group."""
         return tuple(replace(self, scans=choice) for choice in self.choices)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -25,11 +25,12 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
     typical_mm: float = 0.3
 
-    name: ClassVar[str] = "edge_misplacement"
-    stage: ClassVar[Stage] = Stage.SCENE
-    units: ClassVar[tuple[str, ...]] = ("mm",)
-    covariates: ClassVar[tuple[str, ...]] = ("slope",)
-    parameters: ClassVar[tuple[str, ...]] = ("offset_mm",)
+    name = "edge_misplacement"
+    words = "misplaced edges"
+    stage = Stage.SCENE
+    units = ("mm",)
+    covariates = ("slope",)
+    parameters = ("offset_mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -37,11 +38,9 @@ class EdgeMisplacement(LinearEffect[SceneView]):
         return cls(typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Shift the patterns."""
         return _shifted_patterns(value, theta * np.ones(len(plan)), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far off the pattern lies."""
         return f"the printed edges lie {give_or_take(mean[0], sd[0])} mm from their described place, in all scans"
 
 
@@ -51,11 +50,12 @@ class ScanMisplacement(OneScanEffect[SceneView]):
 
     typical_mm: float = 0.3
 
-    name: ClassVar[str] = "scan_misplacement"
-    stage: ClassVar[Stage] = Stage.SCENE
-    units: ClassVar[tuple[str, ...]] = ("mm",)
-    covariates: ClassVar[tuple[str, ...]] = ("scan", "slope")
-    parameters: ClassVar[tuple[str, ...]] = ("offset_mm",)
+    name = "scan_misplacement"
+    words = "a misplaced pattern in one scan"
+    stage = Stage.SCENE
+    units = ("mm",)
+    covariates = ("scan", "slope")
+    parameters = ("offset_mm",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -66,11 +66,9 @@ class ScanMisplacement(OneScanEffect[SceneView]):
         return cls(choices=tuple((name,) for name in names), typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        """Shift the pattern under that scan."""
         return _shifted_patterns(value, theta * in_scans(plan, self.scans), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far off the pattern lies, and in which scan."""
         return (
             f"in {scans_in_words(self.scans)} the pattern lies {give_or_take(mean[0], sd[0])} mm from where it lies "
             "in the others"

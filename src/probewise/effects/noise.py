@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -27,21 +27,15 @@ class CorrelatedNoise(NoiseEffect):
     lowest: float = -0.5
     highest: float = 0.95
 
-    name: ClassVar[str] = "correlated_noise"
-    stage: ClassVar[Stage] = Stage.NOISE
-    units: ClassVar[tuple[str, ...]] = ("1",)
-    covariates: ClassVar[tuple[str, ...]] = ("scan",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
-    n_nodes: ClassVar[int] = 28  # dense enough to integrate the posterior of a thousand readings
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scale: a correlation is a pure number."""
-        return cls()
+    name = "correlated_noise"
+    words = "noise that neighbouring readings share"
+    stage = Stage.NOISE
+    units = ("1",)
+    covariates = ("scan",)
+    n_nodes = 28  # dense enough to integrate the posterior of a thousand readings
 
     @cached_property
     def prior(self) -> Product:
-        """The correlation of neighbouring readings, uniform over its range."""
         return Product({"rho": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
@@ -49,7 +43,6 @@ class CorrelatedNoise(NoiseEffect):
         return replace(value, rho=theta[:, :1])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how strongly neighbouring readings correlate."""
         return (
             f"the noise of successive readings has correlation {give_or_take(mean[0], sd[0])}: "
             "part of each error returns in the next reading"
@@ -63,28 +56,20 @@ class SignalDependentNoise(NoiseEffect):
     least: float = 0.05
     most: float = 50.0
 
-    name: ClassVar[str] = "signal_dependent_noise"
-    stage: ClassVar[Stage] = Stage.NOISE
-    units: ClassVar[tuple[str, ...]] = ("1",)
-    covariates: ClassVar[tuple[str, ...]] = ("level",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scale: a ratio is a pure number."""
-        return cls()
+    name = "signal_dependent_noise"
+    words = "noise that grows with the signal"
+    stage = Stage.NOISE
+    units = ("1",)
+    covariates = ("level",)
 
     @cached_property
     def prior(self) -> Product:
-        """Relative increase of the variance on white, log-uniform."""
         return Product({"ratio": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Scale the noise sd of each reading by its seen fraction."""
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how much larger the variance is at the highest level than at the lowest."""
         return (
             f"the noise grows with the reading: its variance at the highest level is "
             f"{give_or_take(1 + mean[0], sd[0])} times that at the lowest"
@@ -101,29 +86,21 @@ class DriftingNoise(NoiseEffect):
     least: float = 0.2
     most: float = 5.0
 
-    name: ClassVar[str] = "drifting_noise"
-    stage: ClassVar[Stage] = Stage.NOISE
-    units: ClassVar[tuple[str, ...]] = ("1",)
-    covariates: ClassVar[tuple[str, ...]] = ("time",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scale: a growth factor is a pure number."""
-        return cls()
+    name = "drifting_noise"
+    words = "noise that changes in time"
+    stage = Stage.NOISE
+    units = ("1",)
+    covariates = ("time",)
 
     @cached_property
     def prior(self) -> Product:
-        """The sd at the end over that at the start, log-uniform."""
         return Product({"growth": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Scale the noise of each reading by its time."""
         elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
         return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how the noise has changed."""
         return f"the sd of the noise at the end is {give_or_take(mean[0], sd[0])} times that at the start"
 
 
@@ -138,17 +115,11 @@ class RandomWalk(NoiseEffect):
     least: float = 5e-3
     most: float = 3.0
 
-    name: ClassVar[str] = "random_walk"
-    stage: ClassVar[Stage] = Stage.NOISE
-    units: ClassVar[tuple[str, ...]] = ("noise sd",)
-    covariates: ClassVar[tuple[str, ...]] = ("time", "row", "run")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
-    n_nodes: ClassVar[int] = 16
-
-    @classmethod
-    def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scale: the step is in units of the noise sd."""
-        return cls()
+    name = "random_walk"
+    stage = Stage.NOISE
+    units = ("noise sd",)
+    covariates = ("time", "row", "run")
+    n_nodes = 16
 
     @cached_property
     def prior(self) -> Product:
@@ -162,7 +133,6 @@ class RandomWalk(NoiseEffect):
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how large the steps are."""
         return f"the offset is a random walk with steps of sd {give_or_take(mean[0], sd[0])} noise sds from row to row"
 
 
@@ -185,9 +155,9 @@ class NoisePerRun(NoiseEffect):
     runs: tuple[str, ...] = ()
     n_rows: tuple[int, ...] = ()
 
-    name: ClassVar[str] = "noise_per_run"
-    stage: ClassVar[Stage] = Stage.NOISE
-    covariates: ClassVar[tuple[str, ...]] = ("run",)
+    name = "noise_per_run"
+    stage = Stage.NOISE
+    covariates = ("run",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.linear import LinearEffect
 from probewise.effects.vocabulary import give_or_take
-from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
@@ -28,11 +26,12 @@ class AmbientGradient(LinearEffect[FloatArray]):
     typical_per_mm: float = 0.005
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "ambient_gradient"
-    stage: ClassVar[Stage] = Stage.OFFSET
-    units: ClassVar[tuple[str, ...]] = ("reading/mm", "reading/mm")
-    covariates: ClassVar[tuple[str, ...]] = ("place",)
-    parameters: ClassVar[tuple[str, ...]] = ("per_mm_x", "per_mm_y")
+    name = "ambient_gradient"
+    words = "stray light from one side"
+    stage = Stage.OFFSET
+    units = ("reading/mm", "reading/mm")
+    covariates = ("place",)
+    parameters = ("per_mm_x", "per_mm_y")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -42,11 +41,9 @@ class AmbientGradient(LinearEffect[FloatArray]):
         return cls(typical_per_mm=0.01 * extent.span / extent.length_mm, unit=extent.unit)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Add the plane to the readings, (n_samples, n_points)."""
         return np.asarray(value + theta[:, :1] * plan.x_mm + theta[:, 1:2] * plan.y_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how much the reading rises over 100 mm along each axis."""
         return (
             f"the reading changes by {give_or_take(mean[0], sd[0], self.unit, factor=100)} per 100 mm along X and by "
             f"{give_or_take(mean[1], sd[1], self.unit, factor=100)} per 100 mm along Y, over black and white alike: "
@@ -61,11 +58,12 @@ class OffsetDrift(LinearEffect[FloatArray]):
     typical_per_hour: float = 1.0
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "offset_drift"
-    stage: ClassVar[Stage] = Stage.OFFSET
-    units: ClassVar[tuple[str, ...]] = ("reading/h",)
-    covariates: ClassVar[tuple[str, ...]] = ("time",)
-    parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
+    name = "offset_drift"
+    words = "a slow drift of all readings"
+    stage = Stage.OFFSET
+    units = ("reading/h",)
+    covariates = ("time",)
+    parameters = ("per_hour",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -73,11 +71,9 @@ class OffsetDrift(LinearEffect[FloatArray]):
         return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600), unit=extent.unit)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Add the drift to the readings, (n_samples, n_points)."""
         return np.asarray(value + theta[:, :1] * (plan.time_s / 3600))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how much the reading drifts in an hour."""
         way = "rises" if mean[0] > 0 else "falls"
         return (
             f"the reading {way} by {give_or_take(abs(mean[0]), sd[0], self.unit)} per hour, over black and white "
@@ -92,11 +88,11 @@ class AmbientStep(ChangePointEffect[FloatArray]):
     typical: float = 0.5
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "ambient_step"
-    stage: ClassVar[Stage] = Stage.OFFSET
-    units: ClassVar[tuple[str, ...]] = ("reading", "s")
-    covariates: ClassVar[tuple[str, ...]] = ("time",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "ambient_step"
+    words = "a sudden change of the room light"
+    stage = Stage.OFFSET
+    units = ("reading", "s")
+    covariates = ("time",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -104,25 +100,18 @@ class AmbientStep(ChangePointEffect[FloatArray]):
         times = change_point_times(extent)
         return None if times is None else cls(times, typical=0.01 * extent.span, unit=extent.unit)
 
-    @cached_property
-    def prior(self) -> Product:
-        """Size, of either sign, and time: uniform over the recording, or between two chosen readings."""
-        return Product({"amp": HeavyTailed(self.typical), "at_s": Uniform(*self.open_s)})
+    @property
+    def sizes(self) -> Mapping[str, float]:
+        return {"amp": self.typical}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Add the step to the readings taken after it, (n_samples, n_points)."""
         return np.asarray(value + theta[:, :1] * self.since(theta, plan))
-
-    def bank(self) -> FloatArray:
-        """One entry, its time in the middle of the open interval."""
-        return np.array([[[self.typical, sum(self.open_s) / 2]]])
 
     def coarse(self) -> Self:
         """Keep all intervals: the time of the step is what identifies it."""
         return self
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say when the reading jumped, and how far."""
         way = "jumps up" if mean[0] > 0 else "drops"
         return (
             f"the reading {way} by {give_or_take(abs(mean[0]), sd[0], self.unit)} at {give_or_take(mean[1], sd[1])} s "

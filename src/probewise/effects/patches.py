@@ -7,18 +7,19 @@ The patch's own height follows from the height on the line and the distance in r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.vocabulary import NamedEffect, V, entries
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.plan import Plan
 
-__all__ = ["ALONG_X", "PatchPrior", "ScanLine", "bell", "patch_bank", "scanned_lines"]
+__all__ = ["ALONG_X", "PatchEffect", "PatchPrior", "ScanLine", "bell", "scanned_lines"]
 
 _RADII = (0.04, 0.1, 0.25)  # of the line's length, for the bank; the prior reaches twice as far either way
 _MARGIN = 0.1  # of the line's length: a patch may lie beyond its ends
@@ -137,12 +138,32 @@ class PatchPrior:
         return np.stack([height * np.exp(-0.5 * beside**2), along, beside, r], axis=-1)
 
 
-def patch_bank(typical: float, line: ScanLine) -> FloatArray:
-    """List patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
-    patches = []
-    for share in _RADII:
-        r = share * line.length_mm
-        along = np.arange(line.low_mm, line.high_mm + r / 2, r)
-        x, y = line.place(along, np.zeros_like(along))
-        patches.append(np.stack([np.full_like(along, typical), x, y, np.full_like(along, r)], axis=-1))
-    return np.concatenate(patches)[:, None, :]
+@dataclass(frozen=True)
+class PatchEffect(NamedEffect[V]):
+    """Base of effects that are a patch on or beside a scanned line, `line`; `lines` are the candidates."""
+
+    typical: float
+    line: ScanLine = ALONG_X
+    lines: tuple[ScanLine, ...] = ()
+
+    size: ClassVar[str]
+    """Name of the patch's height."""
+
+    @cached_property
+    def prior(self) -> PatchPrior:
+        """Height, place and radius."""
+        return PatchPrior(self.size, self.typical, self.line)
+
+    def variants(self) -> tuple[Self, ...]:
+        """One variant for each scanned line."""
+        return tuple(replace(self, line=line) for line in self.lines)
+
+    def bank(self) -> FloatArray:
+        """List patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
+        patches = []
+        for share in _RADII:
+            r = share * self.line.length_mm
+            along = np.arange(self.line.low_mm, self.line.high_mm + r / 2, r)
+            x, y = self.line.place(along, np.zeros_like(along))
+            patches.append(entries(self.typical, x, y, r))
+        return np.concatenate(patches)

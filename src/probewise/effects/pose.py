@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -26,12 +26,13 @@ class Backlash(LinearEffect[Poses]):
 
     typical_mm: float = 0.5
 
-    name: ClassVar[str] = "backlash"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm",)
-    covariates: ClassVar[tuple[str, ...]] = ("slope", "direction")
-    parameters: ClassVar[tuple[str, ...]] = ("width_mm",)
-    positive: ClassVar[bool] = True
+    name = "backlash"
+    words = "backlash (play) of the arm"
+    stage = Stage.POSE
+    units = ("mm",)
+    covariates = ("slope", "direction")
+    parameters = ("width_mm",)
+    positive = True
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -48,7 +49,6 @@ class Backlash(LinearEffect[Poses]):
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far short of its goal the arm comes to rest."""
         return (
             f"the arm comes to rest {give_or_take(mean[0], sd[0], factor=0.5)} mm short of where it was sent, "
             f"on the side it came from: gear play of {give_or_take(mean[0], sd[0])} mm"
@@ -64,11 +64,12 @@ class PositionScale(LinearEffect[Poses]):
 
     typical: float = 0.01
 
-    name: ClassVar[str] = "position_scale"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("1", "1")
-    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
-    parameters: ClassVar[tuple[str, ...]] = ("x", "y")
+    name = "position_scale"
+    words = "a wrong scale of the positions"
+    stage = Stage.POSE
+    units = ("1", "1")
+    covariates = ("place", "slope")
+    parameters = ("x", "y")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -76,7 +77,6 @@ class PositionScale(LinearEffect[Poses]):
         return cls()
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Stretch the positions about the origin of the lab frame."""
         return replace(value, x_mm=value.x_mm * (1 + theta[:, :1]), y_mm=value.y_mm * (1 + theta[:, 1:2]))
 
     def bank(self) -> FloatArray:
@@ -84,7 +84,6 @@ class PositionScale(LinearEffect[Poses]):
         return np.array([self.typical, *_LARGE_SCALES])[:, None, None] * np.eye(2)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how many percent the arm moves too far."""
         return (
             f"the arm moves {give_or_take(mean[0], sd[0], factor=100)} % too far along X and "
             f"{give_or_take(mean[1], sd[1], factor=100)} % along Y: the scale of its positions is wrong"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -30,11 +30,12 @@ class BentRails(LinearEffect[Poses]):
 
     typical_mm: float = 0.1
 
-    name: ClassVar[str] = "bent_rails"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "mm", "mm")
-    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
-    parameters: ClassVar[tuple[str, ...]] = ("x2_mm", "x3_mm", "y2_mm", "y3_mm")
+    name = "bent_rails"
+    words = "bent rails"
+    stage = Stage.POSE
+    units = ("mm", "mm", "mm", "mm")
+    covariates = ("place", "slope")
+    parameters = ("x2_mm", "x3_mm", "y2_mm", "y3_mm")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -42,7 +43,6 @@ class BentRails(LinearEffect[Poses]):
         return cls(typical_mm=0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Add the position errors to both axes."""
         x, y = plan.x_mm / _UNIT_MM, plan.y_mm / _UNIT_MM
         return replace(
             value,
@@ -51,7 +51,6 @@ class BentRails(LinearEffect[Poses]):
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how large the position errors are at 10 mm."""
         of_x, of_y = (give_or_take(mean[k] + mean[k + 1], float(np.hypot(sd[k], sd[k + 1]))) for k in (0, 2))
         return f"the rails are bent: 10 mm from the origin the arm is off by {of_x} mm along X and {of_y} mm along Y"
 
@@ -69,11 +68,11 @@ class MissingTooth(NamedEffect[Poses]):
     along: int = 0
     between_mm: tuple[float, float] = (-100.0, 100.0)
 
-    name: ClassVar[str] = "missing_tooth"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "1")
-    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "missing_tooth"
+    words = "a jump of the arm's position"
+    stage = Stage.POSE
+    units = ("mm", "mm", "1")
+    covariates = ("place", "slope")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -88,24 +87,20 @@ class MissingTooth(NamedEffect[Poses]):
         return Product({"amp_mm": HeavyTailed(self.typical_mm), "at_mm": Uniform(*self.between_mm), "axis": axis})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the positions beyond the jump."""
         along_y = theta[:, 2:3] > 0.5
         beyond = np.where(along_y, plan.y_mm, plan.x_mm) > theta[:, 1:2]
         jump = theta[:, :1] * beyond
         return replace(value, x_mm=value.x_mm + jump * ~along_y, y_mm=value.y_mm + jump * along_y)
 
     def variants(self) -> tuple[Self, ...]:
-        """One variant for each axis and pair of neighbouring positions."""
         return tuple(
             replace(self, along=axis, between_mm=pair) for axis in (0, 1) for pair in pairwise(self.places_mm[axis])
         )
 
     def bank(self) -> FloatArray:
-        """One entry, half way between the two positions."""
         return np.array([[[self.typical_mm, sum(self.between_mm) / 2, float(self.along)]]])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say where, and how far."""
         axis = "Y" if mean[2] > 0.5 else "X"
         return (
             f"beyond {axis} = {give_or_take(mean[1], sd[1])} mm the arm is {give_or_take(mean[0], sd[0])} mm off "

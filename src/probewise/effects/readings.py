@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.motion import direction_varies, sign_of_motion
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -28,11 +28,12 @@ class Hysteresis(LinearEffect[FloatArray]):
     typical: float = 0.5
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "hysteresis"
-    stage: ClassVar[Stage] = Stage.OFFSET
-    units: ClassVar[tuple[str, ...]] = ("reading",)
-    covariates: ClassVar[tuple[str, ...]] = ("direction",)
-    parameters: ClassVar[tuple[str, ...]] = ("amp",)
+    name = "hysteresis"
+    words = "an offset between both directions of motion"
+    stage = Stage.OFFSET
+    units = ("reading",)
+    covariates = ("direction",)
+    parameters = ("amp",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -40,11 +41,9 @@ class Hysteresis(LinearEffect[FloatArray]):
         return cls(typical=0.01 * extent.span, unit=extent.unit) if direction_varies(extent.plan) else None
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Add the hysteresis to the readings, (n_samples, n_points)."""
         return np.asarray(value + theta[:, :1] * sign_of_motion(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say by how much the two directions differ."""
         way = "higher" if mean[0] > 0 else "lower"
         return (
             f"readings of forward motion are {give_or_take(abs(mean[0]), sd[0], self.unit, factor=2)} {way} than those "
@@ -62,15 +61,15 @@ class Lag(NamedEffect[FloatArray]):
     shortest_s: float = 0.2
     longest_s: float = 20.0
 
-    name: ClassVar[str] = "lag"
-    stage: ClassVar[Stage] = Stage.LAG
-    units: ClassVar[tuple[str, ...]] = ("s",)
-    covariates: ClassVar[tuple[str, ...]] = ("slope", "direction")
-    amplitudes: ClassVar[tuple[int, ...]] = ()
+    name = "lag"
+    words = "a sensor that follows slowly"
+    stage = Stage.LAG
+    units = ("s",)
+    covariates = ("slope", "direction")
+    amplitudes = ()
 
     @property
     def nothing(self) -> Mapping[int, float]:
-        """A time constant of 0."""
         return {0: 0.0}
 
     @classmethod
@@ -80,7 +79,6 @@ class Lag(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        """The time constant, log-uniform."""
         return Product({"tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -102,11 +100,9 @@ class Lag(NamedEffect[FloatArray]):
         return held
 
     def bank(self) -> FloatArray:
-        """Seven entries of one column, one for each time constant."""
-        return np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7)[:, None, None]
+        return entries(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how slow the sensor is."""
         return (
             f"each reading keeps part of the previous one, with a time constant of {give_or_take(mean[0], sd[0])} s: "
             "the electronics lag"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint, Stage
@@ -29,11 +29,11 @@ class Reflection(NamedEffect[Footprint]):
     typical: float = 0.02
     farthest_mm: float = 20.0
 
-    name: ClassVar[str] = "reflection"
-    stage: ClassVar[Stage] = Stage.FOOTPRINT
-    units: ClassVar[tuple[str, ...]] = ("1", "mm", "mm")
-    covariates: ClassVar[tuple[str, ...]] = ("place", "edge_distance")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "reflection"
+    words = "a reflection beside the spot"
+    stage = Stage.FOOTPRINT
+    units = ("1", "mm", "mm")
+    covariates = ("place", "edge_distance")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -42,12 +42,10 @@ class Reflection(NamedEffect[Footprint]):
 
     @cached_property
     def prior(self) -> Product:
-        """Share, and displacement along X and Y."""
         reach = Uniform(-self.farthest_mm, self.farthest_mm)
         return Product({"share": HeavyTailed(self.typical, positive=True), "dx_mm": reach, "dy_mm": reach})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Add a fainter, displaced copy of each Gaussian."""
         share = np.clip(theta[:, :1, None], 0.0, 1.0)
         turn = plan.orientation_rad[None, :, None]
         dx, dy = theta[:, 1:2, None], theta[:, 2:3, None]
@@ -64,14 +62,12 @@ class Reflection(NamedEffect[Footprint]):
         )
 
     def bank(self) -> FloatArray:
-        """Entries of one column: three distances in eight directions."""
         angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES
         far = self.farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
         dx, dy = (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()
-        return np.stack([np.full(dx.size, self.typical), dx, dy], axis=-1)[:, None, :]
+        return entries(self.typical, dx, dy)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how strong the second image is, and where."""
         return (
             f"a second spot, {give_or_take(mean[1], sd[1])} mm along X and {give_or_take(mean[2], sd[2])} mm along Y "
             f"from the first, contributes {give_or_take(mean[0], sd[0], factor=100)} % of the light: a reflection"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -32,11 +32,12 @@ class Saturation(NamedEffect[FloatArray]):
     softest: float = 20.0
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "saturation"
-    stage: ClassVar[Stage] = Stage.SATURATION
-    units: ClassVar[tuple[str, ...]] = ("reading", "reading")
-    covariates: ClassVar[tuple[str, ...]] = ("level",)
-    amplitudes: ClassVar[tuple[int, ...]] = ()
+    name = "saturation"
+    words = "readings cut off at a limit"
+    stage = Stage.SATURATION
+    units = ("reading", "reading")
+    covariates = ("level",)
+    amplitudes = ()
 
     @property
     def nothing(self) -> Mapping[int, float]:
@@ -62,7 +63,6 @@ class Saturation(NamedEffect[FloatArray]):
         )
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Limit the readings, (n_samples, n_points)."""
         level, softness = theta[:, :1], theta[:, 1:2]
         return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
 
@@ -75,7 +75,6 @@ class Saturation(NamedEffect[FloatArray]):
         return np.array([*sharp, *soft])[:, None, :]
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say above which reading nothing is reported, and how gently that limit sets in."""
         softness = f"{mean[1]:.2g} {self.unit}".rstrip()
         return (
             f"no reading rises above {give_or_take(mean[0], sd[0], self.unit)}: the electronics saturate, "

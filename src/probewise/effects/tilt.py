@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
@@ -21,11 +21,12 @@ class SensorTilt(LinearEffect[Poses]):
 
     typical_mm: float = 0.3
 
-    name: ClassVar[str] = "sensor_tilt"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm", "mm")
-    covariates: ClassVar[tuple[str, ...]] = ("orientation", "slope")
-    parameters: ClassVar[tuple[str, ...]] = ("dx_mm", "dy_mm")
+    name = "sensor_tilt"
+    words = "a tilted sensor"
+    stage = Stage.POSE
+    units = ("mm", "mm")
+    covariates = ("orientation", "slope")
+    parameters = ("dx_mm", "dy_mm")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -33,11 +34,9 @@ class SensorTilt(LinearEffect[Poses]):
         return cls(typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift every pose."""
         return replace(value, x_mm=value.x_mm + theta[:, :1], y_mm=value.y_mm + theta[:, 1:2])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far the sensor looks from where it should."""
         return (
             f"the sensor's spot is off by {give_or_take(mean[0], sd[0])} mm along X and "
             f"{give_or_take(mean[1], sd[1])} mm along Y, whatever the orientation: the sensor is tilted"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Protocol, Self, TypeVar, cast
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_mapping
@@ -16,7 +17,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseLevel
 
-__all__ = ["Gates", "NamedEffect", "NoiseEffect", "V", "give_or_take"]
+__all__ = ["Gates", "NamedEffect", "NoiseEffect", "V", "entries", "give_or_take"]
 
 V = TypeVar("V")
 
@@ -36,8 +37,11 @@ class Gates:
 class NamedEffect(Effect[V], Protocol[V]):
     """An effect as the diagnosis needs it: formula, prior, template bank, and a sentence for the verdict.
 
-    A new effect is one class of this kind and one line in `VOCABULARY`.
+    A new effect is one class of this kind and one line in `VOCABULARY`. What its methods return is said here.
     """
+
+    words: ClassVar[str] = ""
+    """A noun phrase that follows "the model leaves out"; without one the name itself is written."""
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -56,8 +60,11 @@ class NamedEffect(Effect[V], Protocol[V]):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """Indices of the amplitudes: the readings change in proportion to first order, and 0 means no effect."""
-        ...
+        """Indices of the amplitudes: the readings change in proportion to first order, and 0 means no effect.
+
+        By default the first parameter alone.
+        """
+        return (0,)
 
     @property
     def nothing(self) -> Mapping[int, float] | None:
@@ -72,8 +79,9 @@ class NamedEffect(Effect[V], Protocol[V]):
         """Build the effect with a prior at the recording's scales; None where the recording cannot show it.
 
         An effect of the battery needs its voltage, one of the direction of motion needs a scan that turns back.
+        By default the scales do not depend on the recording: its parameters are pure numbers.
         """
-        ...
+        return cls()
 
     def is_of_the_ssf(self, plan: Plan) -> bool:
         """Whether a free SSF absorbs the effect completely under this plan, so that it cannot be identified.
@@ -151,7 +159,7 @@ def require_effects(effects: object) -> None:
     for name, kind in effects.items():
         if not isinstance(kind, type) or not hasattr(kind, "for_extent"):
             raise ParameterError(f"effects[{name!r}]", kind, "a class that follows probewise.effects.NamedEffect")
-        lacking = [each for each in _OWN if getattr(kind, each, None) in (None, _protocol_default(kind, each))]
+        lacking = [each for each in _OWN if getattr(kind, each, None) in (None, getattr(NamedEffect, each, None))]
         if lacking:
             raise ParameterError(
                 f"effects[{name!r}]", kind, f"a class of an effect with {', '.join(_OWN)}; {lacking[0]} is missing"
@@ -161,13 +169,7 @@ def require_effects(effects: object) -> None:
             raise ParameterError("effects", name, f"{own!r}, the name of the class {kind.__name__}")
 
 
-_OWN = ("name", "stage", "units", "covariates", "amplitudes", "for_extent", "prior", "apply", "bank", "sentence")
-
-
-def _protocol_default(kind: type, name: str) -> object:
-    """Return a member as the bare protocol has it; a class method is bound to this class."""
-    found = getattr(NamedEffect, name, None)
-    return getattr(found, "__func__", found).__get__(kind) if name == "for_extent" else found  # type: ignore[union-attr]
+_OWN = ("name", "stage", "units", "covariates", "prior", "apply", "bank", "sentence")
 
 
 class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
@@ -207,6 +209,11 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
     def draws_about(self, nodes: FloatArray, *, rng: np.random.Generator) -> FloatArray | None:
         """Draw parameters about sampled nodes, both (n_samples, n_params); None where the nodes are dense enough."""
         return None
+
+
+def entries(*parameters: ArrayLike) -> FloatArray:
+    """Return bank entries of one column from the parameters' values, numbers or (n_bank,): (n_bank, 1, n_params)."""
+    return np.stack(np.broadcast_arrays(*parameters), axis=-1)[:, None, :].astype(np.float64)
 
 
 def give_or_take(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:

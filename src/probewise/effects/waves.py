@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed import HeavyTailed
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NamedEffect, V, entries, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
@@ -25,8 +25,16 @@ _ORDERS = np.arange(1, 7)  # harmonics of a sawtooth; the slip takes a sixth of 
 _SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, damped against Gibbs overshoot
 
 
+class _Wave(NamedEffect[V]):
+    """Base of effects with an amplitude, a frequency or period, and a phase; a bank entry holds sine and cosine."""
+
+    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
+        sine, cosine = amounts * entry[:, 0]
+        return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])
+
+
 @dataclass(frozen=True)
-class Flicker(NamedEffect[FloatArray]):
+class Flicker(_Wave[FloatArray]):
     """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase).
 
     The mains frequency aliased by the sampling, or a slow lamp: any frequency up to half the rate of readings.
@@ -38,11 +46,11 @@ class Flicker(NamedEffect[FloatArray]):
     n_frequencies: int = 128
     unit: str = field(default="", kw_only=True)
 
-    name: ClassVar[str] = "flicker"
-    stage: ClassVar[Stage] = Stage.OFFSET
-    units: ClassVar[tuple[str, ...]] = ("reading", "Hz", "rad")
-    covariates: ClassVar[tuple[str, ...]] = ("time",)
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "flicker"
+    words = "a flickering lamp"
+    stage = Stage.OFFSET
+    units = ("reading", "Hz", "rad")
+    covariates = ("time",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -56,26 +64,18 @@ class Flicker(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        """Amplitude, frequency and phase."""
         frequency = Uniform(self.lowest_hz, self.highest_hz)
         return Product({"amp": HeavyTailed(self.typical, positive=True), "alias_hz": frequency, "phase": _PHASE})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Add the wave to the readings, (n_samples, n_points)."""
         wave = np.sin(2 * np.pi * theta[:, 1:2] * plan.time_s + theta[:, 2:3])
         return np.asarray(value + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
-        """Entries of two columns: sine and cosine at each frequency."""
         frequencies = np.linspace(self.lowest_hz, self.highest_hz, self.n_frequencies + 2)[1:-1]
         return _sine_and_cosine(self.typical, frequencies)
 
-    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Convert the amounts of sine and cosine to amplitude and phase."""
-        return _joined(entry, amounts)
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far the reading swings, and how fast."""
         return (
             f"the reading oscillates with an amplitude of {give_or_take(mean[0], sd[0], self.unit)} at "
             f"{give_or_take(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), over black and white alike: "
@@ -84,7 +84,7 @@ class Flicker(NamedEffect[FloatArray]):
 
 
 @dataclass(frozen=True)
-class PeriodicPositionError(NamedEffect[Poses]):
+class PeriodicPositionError(_Wave[Poses]):
     """A gear or lead screw that is not round: X + amp_mm sin(2 pi X / period_mm + phase)."""
 
     typical_mm: float = 0.3
@@ -92,11 +92,11 @@ class PeriodicPositionError(NamedEffect[Poses]):
     longest_mm: float = 200.0
     n_periods: int = 48
 
-    name: ClassVar[str] = "periodic_position_error"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "rad")
-    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "periodic_position_error"
+    words = "a periodic position error of the arm"
+    stage = Stage.POSE
+    units = ("mm", "mm", "rad")
+    covariates = ("place", "slope")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -106,12 +106,10 @@ class PeriodicPositionError(NamedEffect[Poses]):
 
     @cached_property
     def prior(self) -> Product:
-        """Amplitude, period (log-uniform) and phase."""
         amp = HeavyTailed(self.typical_mm, positive=True)
         return Product({"amp_mm": amp, "period_mm": LogUniform(self.shortest_mm, self.longest_mm), "phase": _PHASE})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the poses along X, (n_samples, n_points)."""
         wave = np.sin(2 * np.pi / theta[:, 1:2] * value.x_mm + theta[:, 2:3])
         return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
 
@@ -122,12 +120,7 @@ class PeriodicPositionError(NamedEffect[Poses]):
         periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))
         return _sine_and_cosine(self.typical_mm, np.maximum(periods, self.shortest_mm * 1.001))
 
-    def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Convert the amounts of sine and cosine to amplitude and phase."""
-        return _joined(entry, amounts)
-
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how large the position error is, and its period."""
         return (
             f"the arm's position along X is off by up to {give_or_take(mean[0], sd[0])} mm, with a period of "
             f"{give_or_take(mean[1], sd[1])} mm: a gear or lead screw is not round"
@@ -144,11 +137,11 @@ class StickSlip(NamedEffect[Poses]):
     n_periods: int = 32
     n_phases: int = 6
 
-    name: ClassVar[str] = "stick_slip"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("mm", "mm", "1")
-    covariates: ClassVar[tuple[str, ...]] = ("place", "slope")
-    amplitudes: ClassVar[tuple[int, ...]] = (0,)
+    name = "stick_slip"
+    words = "a slide that sticks and jumps"
+    stage = Stage.POSE
+    units = ("mm", "mm", "1")
+    covariates = ("place", "slope")
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -163,20 +156,16 @@ class StickSlip(NamedEffect[Poses]):
         return Product({"amp_mm": HeavyTailed(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the poses along X, (n_samples, n_points)."""
         turns = 2 * np.pi * (value.x_mm / theta[:, 1:2] + theta[:, 2:3])
         saw = sum(share * np.sin(order * turns) for order, share in zip(_ORDERS, _SHARES, strict=True))
         return replace(value, x_mm=value.x_mm + theta[:, :1] * saw)
 
     def bank(self) -> FloatArray:
-        """Every phase at periods evenly spaced in wave number, (n_periods n_phases, 1, 3)."""
         waves = np.linspace(1.0 / self.longest_mm, 1.0 / self.shortest_mm, self.n_periods + 2)[1:-1]
         periods, phases = np.meshgrid(1 / waves, np.arange(self.n_phases) / self.n_phases - 0.5, indexing="ij")
-        amounts = np.full(periods.size, self.typical_mm)
-        return np.stack([amounts, periods.ravel(), phases.ravel()], axis=-1)[:, None, :]
+        return entries(self.typical_mm, periods.ravel(), phases.ravel())
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how far the slide jumps, and how often."""
         return (
             f"the slide sticks and then jumps by {give_or_take(abs(mean[0]), sd[0], factor=2)} mm, once every "
             f"{give_or_take(mean[1], sd[1])} mm along X: it lacks lubrication"
@@ -194,8 +183,3 @@ def _sine_and_cosine(amplitude: float, rates: FloatArray) -> FloatArray:
     bank = np.empty((len(rates), 2, 3))
     bank[..., 0], bank[..., 1], bank[..., 2] = amplitude, rates[:, None], (0.0, np.pi / 2)
     return bank
-
-
-def _joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
-    sine, cosine = amounts * entry[:, 0]
-    return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])

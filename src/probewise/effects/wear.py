@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
@@ -24,11 +24,12 @@ class SlowTurn(LinearEffect[Poses]):
 
     typical_deg_per_hour: float = 2.0
 
-    name: ClassVar[str] = "slow_turn"
-    stage: ClassVar[Stage] = Stage.POSE
-    units: ClassVar[tuple[str, ...]] = ("deg/h",)
-    covariates: ClassVar[tuple[str, ...]] = ("time", "orientation")
-    parameters: ClassVar[tuple[str, ...]] = ("deg_per_hour",)
+    name = "slow_turn"
+    words = "a sensor that slowly turns"
+    stage = Stage.POSE
+    units = ("deg/h",)
+    covariates = ("time", "orientation")
+    parameters = ("deg_per_hour",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -36,12 +37,10 @@ class SlowTurn(LinearEffect[Poses]):
         return cls(typical_deg_per_hour=2.0 / (extent.duration_s / 3600))
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Turn the sensor with time."""
         turn = np.deg2rad(theta[:, :1]) * (plan.time_s / 3600)
         return replace(value, orientation_rad=value.orientation_rad + turn)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how fast it turns."""
         return f"the sensor turns by {give_or_take(mean[0], sd[0])} degrees per hour: it is loose in its holder"
 
 
@@ -51,11 +50,12 @@ class SlowSinking(LinearEffect[Footprint]):
 
     typical_per_hour: float = 0.1
 
-    name: ClassVar[str] = "slow_sinking"
-    stage: ClassVar[Stage] = Stage.FOOTPRINT
-    units: ClassVar[tuple[str, ...]] = ("1/h",)
-    covariates: ClassVar[tuple[str, ...]] = ("time", "level")
-    parameters: ClassVar[tuple[str, ...]] = ("per_hour",)
+    name = "slow_sinking"
+    words = "a sensor that slowly rises or sinks"
+    stage = Stage.FOOTPRINT
+    units = ("1/h",)
+    covariates = ("time", "level")
+    parameters = ("per_hour",)
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
@@ -63,11 +63,9 @@ class SlowSinking(LinearEffect[Footprint]):
         return cls(typical_per_hour=0.01 / (extent.duration_s / 3600))
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        """Widen and dim the footprint with time."""
         return raised(value, 1 + theta[:, :1] * (plan.time_s / 3600))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say how fast it sinks or rises."""
         way = "rises" if mean[0] > 0 else "sinks"
         return (
             f"the sensor {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} % of its height per hour: "

@@ -21,12 +21,10 @@ class Wrapped(Effect[V]):
 
     @property
     def name(self) -> str:
-        """The effect's name."""
         return self.effect.name
 
     @property
     def stage(self) -> Stage:
-        """The effect's stage."""
         return self.effect.stage
 
     @property
@@ -35,5 +33,4 @@ class Wrapped(Effect[V]):
         return self.effect.prior
 
     def apply(self, value: V, theta: FloatArray, plan: Plan) -> V:
-        """Apply the effect."""
         return self.effect.apply(value, theta, plan)

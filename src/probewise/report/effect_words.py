@@ -5,54 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-from probewise.effects import PROPOSAL, public_name, spoken_name
+from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, public_name, spoken_name
 
 __all__ = ["EFFECTS_IN_WORDS", "FORMS_IN_WORDS", "effect_in_words", "hypothesis_in_words", "is_in_words", "listed"]
 
 EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
-    {
-        "ambient_gradient": "stray light from one side",
-        "ambient_step": "a sudden change of the room light",
-        "offset_drift": "a slow drift of all readings",
-        "gain_drift": "a gain that drifts",
-        "battery_sag": "a signal that follows the battery",
-        "flicker": "a flickering lamp",
-        "saturation": "readings cut off at a limit",
-        "nonlinearity": "a bent response curve",
-        "quantisation": "rounded readings",
-        "hysteresis": "an offset between both directions of motion",
-        "lag": "a sensor that follows slowly",
-        "backlash": "backlash (play) of the arm",
-        "position_scale": "a wrong scale of the positions",
-        "periodic_position_error": "a periodic position error of the arm",
-        "edge_misplacement": "misplaced edges",
-        "scan_misplacement": "a misplaced pattern in one scan",
-        "scan_angle_error": "a wrong sensor angle in some scans",
-        "orientation_error": "a wrong sensor angle in all scans",
-        "sensor_tilt": "a tilted sensor",
-        "height_gradient": "a sloping table",
-        "height_offset": "another sensor height in some scans",
-        "albedo_gradient": "unevenly white paper",
-        "albedo_patch": "a stain on the paper",
-        "edge_blur": "soft printed edges",
-        "edge_shadow": "shadows along the edges",
-        "halo": "scattered light around the spot",
-        "glint": "a glint at one place",
-        "ssf_order": "a finer sensitivity function",
-        "signal_dependent_noise": "noise that grows with the signal",
-        "correlated_noise": "noise that neighbouring readings share",
-        "outliers": "outlying readings",
-        "dropouts": "lost readings",
-        "drifting_noise": "noise that changes in time",
-        "arm_knock": "an arm or sheet that was pushed",
-        "gain_jump": "a sudden change of the signal's strength",
-        "bent_rails": "bent rails",
-        "missing_tooth": "a jump of the arm's position",
-        "stick_slip": "a slide that sticks and jumps",
-        "reflection": "a reflection beside the spot",
-        "slow_turn": "a sensor that slowly turns",
-        "slow_sinking": "a sensor that slowly rises or sinks",
-    }
+    {name: effect.words for name, effect in {**EFFECTS, **NUISANCES}.items()}
+    | {"ssf_order": "a finer sensitivity function"}
 )
 """A noun phrase for each effect, to follow "the model leaves out"."""
 

@@ -1,4 +1,4 @@
-"""Checks of the arrays that describe a batch of regions."""
+"""The arrays that describe a batch of regions: their checks, and how many regions they are."""
 
 from __future__ import annotations
 
@@ -7,7 +7,17 @@ import numpy as np
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["batch", "require_positive"]
+__all__ = ["OneRowEach", "batch", "require_positive"]
+
+
+class OneRowEach:
+    """Base of regions whose first field has one row for each hypothesis, as `batch` leaves it."""
+
+    @property
+    def n_regions(self) -> int:
+        """Number of hypotheses, or 1 where all share one region."""
+        first = next(iter(self.__dataclass_fields__))  # type: ignore[attr-defined]
+        return len(getattr(self, first))
 
 
 def batch(region: object, **shapes: tuple[int, ...]) -> None:

@@ -8,14 +8,14 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import batch, require_positive
+from probewise.scene.regions.checks import OneRowEach, batch, require_positive
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 __all__ = ["EllipseRegion", "disc_region"]
 
 
 @dataclass(frozen=True, eq=False)
-class EllipseRegion:
+class EllipseRegion(OneRowEach):
     """The inside of an ellipse; a disc has equal semi-axes (paper, eq. 1).
 
     `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis)
@@ -31,11 +31,6 @@ class EllipseRegion:
     def __post_init__(self) -> None:
         batch(self, center_mm=(2,), semi_axes_mm=(2,), angle_rad=())
         require_positive("semi_axes_mm", self.semi_axes_mm)
-
-    @property
-    def n_regions(self) -> int:
-        """Number of hypotheses, or 1 where all share one region."""
-        return len(self.angle_rad)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""

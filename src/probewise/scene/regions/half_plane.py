@@ -8,14 +8,14 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import batch
+from probewise.scene.regions.checks import OneRowEach, batch
 from probewise.scene.regions.geometry import edge_distance
 
 __all__ = ["HalfPlaneRegion"]
 
 
 @dataclass(frozen=True, eq=False)
-class HalfPlaneRegion:
+class HalfPlaneRegion(OneRowEach):
     """The half-plane x cos(normal) + y sin(normal) > offset (paper, S_BW); fields (n_regions,)."""
 
     normal_rad: FloatArray
@@ -26,13 +26,7 @@ class HalfPlaneRegion:
     def __post_init__(self) -> None:
         batch(self, normal_rad=(), offset_mm=())
 
-    @property
-    def n_regions(self) -> int:
-        """Number of hypotheses, or 1 where all share one region."""
-        return len(self.offset_mm)
-
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         return np.where(self._distance(points_mm) > 0, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:

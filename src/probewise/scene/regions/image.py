@@ -40,7 +40,6 @@ class ImageRegion:
         return 1
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (1, n_points)."""
         return self._at(points_mm[:, 0], points_mm[:, 1])[None]
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:

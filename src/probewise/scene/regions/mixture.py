@@ -9,13 +9,14 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError, ShapeError
 from probewise.scene.albedo import Region
+from probewise.scene.regions.checks import OneRowEach
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 __all__ = ["MixtureOfRegions"]
 
 
 @dataclass(frozen=True, eq=False)
-class MixtureOfRegions:
+class MixtureOfRegions(OneRowEach):
     """Regions whose kind may differ between hypotheses, as for a set of shapes.
 
     `which`, shape (n_regions,), is the index of each hypothesis' part; part k holds, in
@@ -35,25 +36,18 @@ class MixtureOfRegions:
         if which.ndim != 1 or (which.size and (which.min() < 0 or which.max() >= len(self.parts))):
             raise ParameterError("which", which.tolist(), f"0 to {len(self.parts) - 1}, one per hypothesis")
 
-    @property
-    def n_regions(self) -> int:
-        """Number of hypotheses."""
-        return len(self.which)
-
     def rows(self) -> list[tuple[IntArray, Region]]:
         """Pairs of the rows of the hypotheses of each part and their region, for the parts that occur."""
         pairs = [(np.flatnonzero(self.which == k), part) for k, part in enumerate(self.parts)]
         return [(rows, part) for rows, part in pairs if rows.size]
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         out = np.empty((self.n_regions, len(points_mm)))
         for rows, part in self.rows():
             out[rows] = part.albedo(points_mm)
         return out
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, (n_regions, n_points)."""
         out = np.empty((self.n_regions, len(centers_mm)))
         for rows, part in self.rows():
             out[rows] = part.coverage(centers_mm, pixel_mm, turn_rad)

@@ -11,14 +11,14 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.scene._pixels import share_in_edges
-from probewise.scene.regions.checks import batch
+from probewise.scene.regions.checks import OneRowEach, batch
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 __all__ = ["PolygonRegion"]
 
 
 @dataclass(frozen=True, eq=False)
-class PolygonRegion:
+class PolygonRegion(OneRowEach):
     """The inside of a polygon, given by its directed edges, with the inside on their left.
 
     `edges_mm` has shape (n_regions, n_edges, 2 ends, 2). Build it with `simple` from the vertices of
@@ -57,13 +57,7 @@ class PolygonRegion:
         edges = np.stack([vertices, np.roll(vertices, -1, axis=0)], axis=1)
         return cls(_directed_pieces(edges)[None], inside, outside)
 
-    @property
-    def n_regions(self) -> int:
-        """Number of hypotheses, or 1 where all share one region."""
-        return len(self.edges_mm)
-
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         return np.where(_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.scene.regions.checks import batch
+from probewise.scene.regions.checks import OneRowEach, batch
 from probewise.scene.regions.geometry import edge_distance
 from probewise.scene.regions.polygon import PolygonRegion
 
@@ -16,7 +16,7 @@ __all__ = ["QuadrantRegion"]
 
 
 @dataclass(frozen=True, eq=False)
-class QuadrantRegion:
+class QuadrantRegion(OneRowEach):
     """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0 (paper, S_a to S_d).
 
     `corner_mm` and `direction` (entries +1 or -1) have shape (n_regions, 2).
@@ -32,13 +32,7 @@ class QuadrantRegion:
         if not np.isin(self.direction, (-1.0, 1.0)).all():
             raise ParameterError("direction", self.direction.tolist(), "+1 or -1")
 
-    @property
-    def n_regions(self) -> int:
-        """Number of hypotheses, or 1 where all share one region."""
-        return len(self.corner_mm)
-
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         beyond = (points_mm[None] - self.corner_mm[:, None]) * self.direction[:, None] > 0
         return np.where(beyond.all(axis=-1), self.inside, self.outside)
 

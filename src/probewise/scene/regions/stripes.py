@@ -10,14 +10,14 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import batch, require_positive
+from probewise.scene.regions.checks import OneRowEach, batch, require_positive
 from probewise.scene.regions.geometry import edge_distance
 
 __all__ = ["StripesRegion"]
 
 
 @dataclass(frozen=True, eq=False)
-class StripesRegion:
+class StripesRegion(OneRowEach):
     """Stripes where frac((x . n - phase) / period) < duty; fields (n_regions,)."""
 
     normal_rad: FloatArray
@@ -33,13 +33,7 @@ class StripesRegion:
         if ((self.duty < 0) | (self.duty > 1)).any():
             raise ParameterError("duty", self.duty.tolist(), "0 to 1")
 
-    @property
-    def n_regions(self) -> int:
-        """Number of hypotheses, or 1 where all share one region."""
-        return len(self.period_mm)
-
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         share = self._along(points_mm) / self.period_mm[:, None]
         return np.where(share - np.floor(share) < self.duty[:, None], self.inside, self.outside)
 

@@ -24,7 +24,6 @@ class Backlash:
     width_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Shift places by width/2 against the direction of motion."""
         return values - rows.direction * (self.width_mm / 2)
 
 
@@ -38,7 +37,6 @@ class PositionScale:
     y: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Scale places about the origin."""
         return np.asarray(values * [1 + self.x, 1 + self.y])
 
 
@@ -53,7 +51,6 @@ class PeriodicPositionError:
     phase: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp sin(2 pi x / period + phase) to X."""
         x_mm, y_mm = values.T
         wave = self.amp_mm * np.sin(2 * math.pi * x_mm / self.period_mm + self.phase)
         return np.stack([x_mm + wave, y_mm], axis=-1)
@@ -69,7 +66,6 @@ class ScanAngleError:
     scans: tuple[str, ...]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Turn the sensor by `deg` in these scans."""
         return values + math.radians(self.deg) * rows.in_scans(self.scans)
 
 
@@ -82,5 +78,4 @@ class OrientationError:
     deg: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Turn the sensor by `deg`."""
         return values + math.radians(self.deg)

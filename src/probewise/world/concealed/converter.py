@@ -42,7 +42,6 @@ class Saturation:
     softness: float = 0.0
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Limit readings to the level."""
         if self.softness == 0:
             return np.minimum(values, self.level)
         return self.level - self.softness * np.logaddexp(0.0, (self.level - values) / self.softness)
@@ -57,5 +56,4 @@ class Quantisation:
     step: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Round to multiples of the step."""
         return np.asarray(self.step * np.round(values / self.step))

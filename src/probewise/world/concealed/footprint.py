@@ -26,7 +26,6 @@ class SensorTilt:
     dy_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Shift the footprint in the lab frame."""
         return np.asarray(values + np.array([self.dx_mm, self.dy_mm]))
 
 
@@ -39,7 +38,6 @@ class HeightGradient:
     mm_per_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Raise the sensor along X."""
         return values + self.mm_per_mm * rows.place_mm[:, 0]
 
 
@@ -53,7 +51,6 @@ class HeightOffset:
     scans: tuple[str, ...]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Raise the sensor in these scans."""
         return values + self.mm * rows.in_scans(self.scans)
 
 
@@ -66,7 +63,6 @@ class EdgeBlur:
     sd_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Blur the footprint."""
         return tuple(replace(g, spot=blurred(g.spot, self.sd_mm)) for g in glimpses)
 
 
@@ -80,7 +76,6 @@ class Halo:
     r_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Move the share from every component to the wide Gaussian."""
         middle = np.sum([g.share * g.spot.moments()[0] for g in glimpses], axis=0)
         blob = Blob(1.0, (float(middle[0]), float(middle[1])), (self.r_mm, self.r_mm))
         # Rays resolve edges within pixels; the wide Gaussian is nearly linear over a third of its sd.
@@ -100,7 +95,6 @@ class SSFOrder:
     sd_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Move the share from every component to the Gaussian."""
         blob = Blob(1.0, (self.u_mm, self.v_mm), (self.sd_mm, self.sd_mm))
         more = gaussian_spot([blob], pixel_mm=glimpses[0].spot.pixel_mm)
         return (*(replace(g, share=g.share * (1 - self.share)) for g in glimpses), Glimpse(self.share, more))

@@ -24,7 +24,6 @@ class Nonlinearity:
     gamma: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Raise the seen fraction to gamma."""
         return np.asarray(np.power(np.maximum(values, 0.0), self.gamma), dtype=np.float64)
 
 
@@ -38,7 +37,6 @@ class GainDrift:
     tau_s: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Multiply the signal by 1 + frac exp(-t/tau)."""
         return values * (1 + self.frac * np.exp(-rows.time_s / self.tau_s))
 
 
@@ -52,7 +50,6 @@ class BatterySag:
     full_v: float = 8.3
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Multiply the signal by 1 + per_volt (V - full_v)."""
         if "battery_mv" not in rows.covariates:
             raise ParameterError("covariates", ", ".join(rows.covariates) or "none", "battery_mv among them")
         return values * (1 + self.per_volt * (rows.covariates["battery_mv"] / 1000 - self.full_v))

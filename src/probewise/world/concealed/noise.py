@@ -25,7 +25,6 @@ class CorrelatedNoise:
     rho: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Mix each draw with its predecessor in the scan."""
         fresh = math.sqrt(1 - self.rho**2)
         out = values.copy()
         for k in np.flatnonzero(~rows.starts_scan()):
@@ -42,7 +41,6 @@ class SignalDependentNoise:
     ratio: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Multiply the variance by 1 + ratio u."""
         return values * np.sqrt(1 + self.ratio * seen)
 
 
@@ -56,7 +54,6 @@ class DriftingNoise:
     over_s: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Multiply the sd by a factor that rises from 1 to `factor`."""
         return values * (1 + (self.factor - 1) * np.clip(rows.time_s / self.over_s, 0.0, 1.0))
 
 
@@ -83,7 +80,6 @@ class Outliers:
     size: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Add the second noise to randomly chosen readings."""
         hit = rng.random(len(values)) < self.share
         return values + hit * self.size * rng.standard_normal(len(values))
 
@@ -98,5 +94,4 @@ class Dropouts:
     value: float
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Replace randomly chosen readings."""
         return np.where(rng.random(len(values)) < self.share, self.value, values)

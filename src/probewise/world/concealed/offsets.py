@@ -25,7 +25,6 @@ class AmbientGradient:
     per_mm_y: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add a plane over the lab frame."""
         return values + self.per_mm_x * rows.place_mm[:, 0] + self.per_mm_y * rows.place_mm[:, 1]
 
 
@@ -39,7 +38,6 @@ class AmbientStep:
     at_s: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add `amp` after `at_s`."""
         return values + self.amp * (rows.time_s > self.at_s)
 
 
@@ -52,7 +50,6 @@ class OffsetDrift:
     per_hour: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add `per_hour` for each hour."""
         return values + self.per_hour * rows.time_s / 3600
 
 
@@ -67,7 +64,6 @@ class Flicker:
     phase: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp sin(2 pi f t + phase)."""
         return values + self.amp * np.sin(2 * math.pi * self.alias_hz * rows.time_s + self.phase)
 
 
@@ -98,6 +94,5 @@ class Glint:
     r: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add the reflected light at the sensor's place."""
         squared = (rows.place_mm[:, 0] - self.x) ** 2 + (rows.place_mm[:, 1] - self.y) ** 2
         return values + self.amp * np.exp(-squared / (2 * self.r**2))

@@ -38,7 +38,6 @@ class BentRail:
     amp_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp (x / 10 mm)^2 to X."""
         return _along_x(values, self.amp_mm * (values[:, 0] / 10) ** 2)
 
 
@@ -51,7 +50,6 @@ class TwistedRail:
     amp_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp (x / 10 mm)^3 to X."""
         return _along_x(values, self.amp_mm * (values[:, 0] / 10) ** 3)
 
 
@@ -65,7 +63,6 @@ class PlaceStep:
     at_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp to X beyond the place."""
         return _along_x(values, np.where(values[:, 0] > self.at_mm, self.amp_mm, 0.0))
 
 
@@ -80,7 +77,6 @@ class StickSlip:
     phase: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add amp times a sawtooth from -1 to 1 to X."""
         turns = values[:, 0] / self.period_mm + self.phase
         return _along_x(values, self.amp_mm * (2 * (turns - np.floor(turns)) - 1))
 
@@ -95,7 +91,6 @@ class SlippedPaper:
     at_s: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Shift the pattern under all later readings."""
         return values + self.offset_mm * rows.across * (rows.time_s > self.at_s)[:, None]
 
 
@@ -110,7 +105,6 @@ class Ghost:
     dy_mm: float
 
     def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Add a displaced copy of every component."""
         first = (replace(g, share=g.share * (1 - self.share)) for g in glimpses)
         second = (
             replace(g, share=g.share * self.share, shift_mm=(g.shift_mm[0] + self.dx_mm, g.shift_mm[1] + self.dy_mm))
@@ -164,7 +158,6 @@ class DeadZone:
     share: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Set the response to zero below the share."""
         return np.where(values < self.share, 0.0, values)
 
 
@@ -177,7 +170,6 @@ class PeakMemory:
     share: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Add share times the running maximum of the scan."""
         peaks = values.copy()
         for part in np.split(np.arange(len(values)), np.flatnonzero(rows.starts_scan())[1:]):
             peaks[part] = np.maximum.accumulate(values[part])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Literal, Protocol, TypeAlias, runtime_checkable
+from typing import ClassVar, Literal, Protocol, TypeAlias, get_args, runtime_checkable
 
 import numpy as np
 
@@ -32,24 +32,7 @@ Stage: TypeAlias = Literal[
     "quantisation",
     "loss",
 ]
-STAGES: tuple[Stage, ...] = (
-    "place",
-    "turn",
-    "pattern",
-    "albedo",
-    "tilt",
-    "height",
-    "footprint",
-    "seen",
-    "response",
-    "gain",
-    "offset",
-    "lag",
-    "saturation",
-    "noise",
-    "quantisation",
-    "loss",
-)
+STAGES: tuple[Stage, ...] = get_args(Stage)
 """In order: pose, scene, footprint, u, response, gain, offsets, lag, saturation, noise, rounding."""
 
 ANSWERING = STAGES[STAGES.index("response") :]

@@ -23,7 +23,6 @@ class EdgeMisplacement:
     offset_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Shift the pattern under every reading."""
         return values + self.offset_mm * rows.across
 
 
@@ -37,7 +36,6 @@ class ScanMisplacement:
     scan: str
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Shift the pattern under the readings of this scan."""
         return values + self.offset_mm * rows.across * rows.in_scans((self.scan,))[:, None]
 
 
@@ -51,7 +49,6 @@ class AlbedoGradient:
     per_mm_y: float
 
     def retouch(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Multiply by 1 + per_mm_x X + per_mm_y Y."""
         return albedo * (1 + self.per_mm_x * x_mm + self.per_mm_y * y_mm)
 
 
@@ -67,6 +64,5 @@ class AlbedoPatch:
     r: float
 
     def retouch(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Add the stain."""
         squared = (x_mm - self.x) ** 2 + (y_mm - self.y) ** 2
         return albedo + self.albedo * np.exp(-squared / (2 * self.r**2))

@@ -62,6 +62,7 @@ def test_a_region_with_its_closed_form():
 
 def test_an_effect():
     creep = example("ArmCreep", "probewise.effects.tilt")()
+    assert creep.words == "an arm that creeps"
     plan = paper_plan()
     poses = Poses(*(np.zeros((1, len(plan))) for _ in range(3)))
     moved = creep.apply(poses, np.array([[0.8]]), plan)

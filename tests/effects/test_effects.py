@@ -78,6 +78,7 @@ def test_every_effect_keeps_the_contract(name):
     effect = EFFECTS[name].for_extent(EXTENT)
     names = effect.prior.names
     assert effect.name == name
+    assert effect.words
     assert isinstance(effect.stage, Stage)
     assert len(effect.units) == len(names)
     assert effect.covariates

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from probewise.calibration import Calibration, FittedSensor
     from probewise.diagnosis import Diagnosis, PlanAudit
     from probewise.experiment import Exploration, MethodName, Model, Step, Truth
+    from probewise.inference import Naive
     from probewise.inquiry import Utility
     from probewise.nested import NestedStop
     from probewise.progress import Progress
@@ -306,15 +307,12 @@ def explore(
     require_flag("learn_sensor", learn_sensor)
     lies = posing.shape_of(shape, field)
     streams, hidden = posing.Streams.of(rng), None
-    naive, wanted = None, method == "paper" and model == "naive"
-    if levels is not None or (wanted and arm is not None):
-        if levels is None or not wanted:
-            allowed = "a recording with readings over black and over white" if wanted else "None"
-            raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
-        naive = posing.levels_from(levels, sensor)
-    elif wanted:
-        world, scale = posing.world_like(sensor), posing.scale_of(sensor.instrumentation)
-        naive = posing.levels_in(world, scale, rng=streams.levels)
+    wanted = method == "paper" and model == "naive"
+    missing, surplus = wanted and levels is None and arm is not None, levels is not None and not wanted
+    if missing or surplus:
+        allowed = "a recording with readings over black and over white" if wanted else "None"
+        raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
+    naive = _naive_levels(sensor, levels, rng=streams.levels) if wanted else None
     asked = posing.pose_experiment(
         sensor,
         lies,
@@ -364,6 +362,15 @@ def explore(
             hidden=hidden,
             about=about,
         )
+
+
+def _naive_levels(sensor: FittedSensor, levels: Recording | None, *, rng: np.random.Generator) -> Naive:
+    """Take the levels of the paper's naive model from a recording, or from readings of a simulated sensor."""
+    from probewise import experiment as posing
+
+    if levels is not None:
+        return posing.levels_from(levels, sensor)
+    return posing.levels_in(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
 
 
 def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progress: bool | Progress = True) -> PlanAudit:

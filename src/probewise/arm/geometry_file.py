@@ -191,7 +191,7 @@ def _joint(table: _Table) -> Joint:
     home, low, high, play = (math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play"))
     stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
     try:
-        return Joint("ABC".index(port), ratio, home, low, high, play, stop)
+        return Joint("ABC".index(port), ratio, home, low, high, play_rad=play, stop_rad=stop)
     except ParameterError as error:
         raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error
 

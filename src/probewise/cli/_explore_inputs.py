@@ -104,7 +104,16 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)
     return Inputs(
-        chosen, geometry, sensor, field, cards, experiment, arguments.model, other, other_model, streams=streams
+        arm=chosen,
+        geometry=geometry,
+        sensor=sensor,
+        field=field,
+        cards=cards,
+        experiment=experiment,
+        model=arguments.model,
+        other=other,
+        other_model=other_model,
+        streams=streams,
     )
 
 

@@ -17,7 +17,11 @@ from probewise.errors import ParameterError
 if TYPE_CHECKING:
     import numpy as np
 
+    from probewise.calibration import FittedSensor
     from probewise.diagnosis import Diagnosis
+    from probewise.progress import Progress
+    from probewise.recordings import Recording
+    from probewise.scene import Shape
 
 __all__ = ["VERB", "generators", "write_results"]
 
@@ -58,37 +62,23 @@ def run(arguments: argparse.Namespace) -> int:
     from functools import partial
 
     from probewise._progress import progress_shown
-    from probewise.calibration import read_sensor
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
-    from probewise.recordings import read_recording, write_text_atomically
+    from probewise.recordings import write_text_atomically
     from probewise.report import diagnosis as report
 
     out = check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
-        journals = [path for path in arguments.recordings if is_journal(path)]
-        if arguments.sensor is None and journals:
-            arguments.sensor = journal_sensor(journals[0])
-        sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
-        recordings, shapes = [], []
-        for path in arguments.recordings:
-            if sensor is None or path not in journals:
-                recordings.append(read_recording(path, progress=progress))
-                continue
-            recording, shape = journal_recording(path, sensor)
-            recordings.append(recording)
-            shapes.append(shape)
-        if len(shapes) > 1:
-            raise ParameterError("journals", len(shapes), "one at a time: each run has its own unknown shape")
+        recordings, sensor, shape = _read(arguments, progress=progress)
         diagnosis_rng, nested_rng, files_rng = generators(arguments.seed)
         joined = join(recordings)
         null = None
-        if sensor is not None and shapes:
+        if sensor is not None and shape is not None:
             progress("searching for shapes that fit")
-            null = SensorAndShape.of(sensor, shapes[0], joined, rng=diagnosis_rng)
+            null = SensorAndShape.of(sensor, shape, joined, rng=diagnosis_rng)
         weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=progress)
         diagnosis = diagnose(
             joined,
-            sensor=None if shapes else sensor,
+            sensor=None if shape is not None else sensor,
             null=null,
             thorough=weigh_again if arguments.thorough else None,
             rng=diagnosis_rng,
@@ -109,6 +99,30 @@ def run(arguments: argparse.Namespace) -> int:
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
+
+
+def _read(
+    arguments: argparse.Namespace, *, progress: Progress
+) -> tuple[list[Recording], FittedSensor | None, Shape | None]:
+    """Read the recordings and journals, the sensor, and the shape of a journal's run, if there is one."""
+    from probewise.calibration import read_sensor
+    from probewise.recordings import read_recording
+
+    journals = [path for path in arguments.recordings if is_journal(path)]
+    if arguments.sensor is None and journals:
+        arguments.sensor = journal_sensor(journals[0])
+    if arguments.sensor is None:
+        return [read_recording(path, progress=progress) for path in arguments.recordings], None, None
+    if len(journals) > 1:
+        raise ParameterError("journals", len(journals), "one at a time: each run has its own unknown shape")
+    sensor, recordings, shape = read_sensor(arguments.sensor), [], None
+    for path in arguments.recordings:
+        if path in journals:
+            recording, shape = journal_recording(path, sensor)
+        else:
+            recording = read_recording(path, progress=progress)
+        recordings.append(recording)
+    return recordings, sensor, shape
 
 
 def generators(seed: int) -> Sequence[np.random.Generator]:

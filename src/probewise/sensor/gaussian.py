@@ -132,7 +132,7 @@ def seen(
     layers = []
     for g in range(arrays[0].shape[2]):
         x, y, var1, var2, cov = (a[:, :, g] for a in arrays)
-        gaussian = LabGaussian(x, y, zero, zero, var1, var2, cov)
+        gaussian = LabGaussian(x, y, zero, zero, var_x=var1, var_y=var2, cov_xy=cov)
         shape = np.broadcast_shapes(x.shape, (region.n_regions, 1))
         layers.append(np.broadcast_to(seen_by_one(region, gaussian, n_nodes), shape))
     return np.stack(layers, axis=-1)

@@ -22,10 +22,7 @@ from probewise.arm.nxt.telegram import (
     GetCurrentProgramName,
     GetDeviceInfo,
     GetFirmwareVersion,
-    OutputMode,
-    Regulation,
     Request,
-    RunState,
     SetOutputState,
 )
 from probewise.errors import LinkError, LowBatteryWarning
@@ -154,7 +151,7 @@ class Brick:
         First send all commands without waiting for answers, which may be missing or late; then confirm.
         """
         commands: list[Request[Done]] = [
-            SetOutputState(ALL_OUTPUTS, 0, OutputMode.IDLE, Regulation.IDLE, 0, RunState.IDLE, 0),
+            SetOutputState(ALL_OUTPUTS),
             *(light.off for light in self._lights.values()),
         ]
         failures = []

@@ -164,7 +164,7 @@ class Motor:
 
     def release(self) -> None:
         """Let it turn freely."""
-        self._link.ask(SetOutputState(self.port, 0, OutputMode.IDLE, Regulation.IDLE, 0, RunState.IDLE, 0))
+        self._link.ask(SetOutputState(self.port))
         self._arrived = None
 
     def move_to(self, goal: int, side: Side) -> int:
@@ -230,7 +230,7 @@ class Motor:
         """
         start = self._synchronise()
         power = side * self.drive.seek_power
-        gently = SetOutputState(self.port, power, BRAKED, Regulation.IDLE, 0, RunState.RUNNING, farthest)
+        gently = SetOutputState(self.port, power, BRAKED, run_state=RunState.RUNNING, limit_counts=farthest)
         while not self._start(start + side * farthest, side, gently):
             start = self._synchronise()
         trouble = self._await_idle(start, side * (farthest + self.drive.runaway_counts), start + side * farthest)
@@ -330,7 +330,7 @@ class Motor:
         def is_faint(state: OutputState) -> bool:
             return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RunState.RUNNING, 0)
 
-        faint = SetOutputState(self.port, FAINT_POWER, BRAKED, Regulation.IDLE, 0, RunState.RUNNING, 0)
+        faint = SetOutputState(self.port, FAINT_POWER, BRAKED, run_state=RunState.RUNNING)
         self._link.ask(faint)
         self._clock.sleep(self.drive.settle_s)
         state = self._state(is_faint)
@@ -384,7 +384,9 @@ class Motor:
         return self._link.ask(GetOutputState(self.port))
 
     def _command(self, power: int, limit: int) -> SetOutputState:
-        return SetOutputState(self.port, power, DRIVEN, Regulation.SPEED, 0, RunState.RUNNING, limit)
+        return SetOutputState(
+            self.port, power, DRIVEN, Regulation.SPEED, run_state=RunState.RUNNING, limit_counts=limit
+        )
 
 
 def _datum_of(state: OutputState) -> tuple[int, int]:

@@ -143,16 +143,16 @@ class Request(Fields, Generic[A_co]):
 
 @dataclass(frozen=True)
 class SetOutputState(Request[Done]):
-    """Drive a motor, or all with port 255; a limit of 0 counts means no limit."""
+    """Drive a motor, or all with port 255; a limit of 0 counts means no limit. By default they idle, free to turn."""
 
     OPCODE = 0x04
     port: int = field_of(Whole("B", 0, 2, (ALL_OUTPUTS,)))
-    power: int = field_of(_PERCENT)
-    mode: int = field_of(Whole("B", 0, 7))
-    regulation: int = field_of(Whole("B", 0, 2))
-    turn_ratio: int = field_of(_PERCENT)
-    run_state: int = field_of(Whole("B", 0, 0, (0x10, 0x20, 0x40)))
-    limit_counts: int = field_of(Whole("I", 0, 0xFFFFFFFF))
+    power: int = field_of(_PERCENT, 0)
+    mode: int = field_of(Whole("B", 0, 7), OutputMode.IDLE)
+    regulation: int = field_of(Whole("B", 0, 2), Regulation.IDLE)
+    turn_ratio: int = field_of(_PERCENT, 0)
+    run_state: int = field_of(Whole("B", 0, 0, (0x10, 0x20, 0x40)), RunState.IDLE)
+    limit_counts: int = field_of(Whole("I", 0, 0xFFFFFFFF), 0)
 
     @property
     def repeatable(self) -> bool:

@@ -34,9 +34,9 @@ class Whole:
             raise ParameterError(name, value, f"a whole number from {self.low} to {self.high}{more}")
 
 
-def field_of(kind: Whole) -> Any:
+def field_of(kind: Whole, default: Any = dataclasses.MISSING) -> Any:
     """Make a dataclass field with this byte layout."""
-    return dataclasses.field(metadata={"kind": kind})
+    return dataclasses.field(default=default, metadata={"kind": kind})
 
 
 @dataclass(frozen=True)

@@ -87,7 +87,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     sensor = draw_sensor(ssf, level, rng=rng)
     plan_names = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
     plan_name, setup, secret = _settle(
-        stratum, turn, plan_names, sensor, norm_after_refit, rng, np.random.default_rng(laying)
+        stratum, turn, plan_names, sensor, norm_after_refit, rng=rng, laying=np.random.default_rng(laying)
     )
     if any(isinstance(hidden.effect, Disturbs) for hidden in secret.hidden):
         model = "white"  # only one noise fault at a time
@@ -137,6 +137,7 @@ def _settle(
     plan_names: list[str],
     sensor: World,
     norm_after_refit: NormAfterRefit,
+    *,
     rng: np.random.Generator,
     laying: np.random.Generator,
 ) -> tuple[str, CleanSetup, _Secret]:

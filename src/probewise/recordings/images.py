@@ -66,14 +66,11 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
         raise ParameterError(
             "image file suffix", suffix, "'.npy' for an albedo that is not in steps of 1/255 from 0 to 1"
         )
-    n_rows, n_columns = grey.shape
-    lines = np.zeros((n_rows, n_columns + 1), dtype=np.uint8)  # a leading 0 on each line: no filter
-    lines[:, 1:] = grey
-    header = struct.pack(">IIBBBBB", n_columns, n_rows, 8, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b""))
-    return _SIGNATURE + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    )
+    from PIL import Image as Pillow  # imported here: most recordings have no image
+
+    out = io.BytesIO()
+    Pillow.fromarray(grey.astype(np.uint8)).save(out, "PNG")
+    return out.getvalue()
 
 
 def _from_npy(path: Path, content: bytes) -> FloatArray:

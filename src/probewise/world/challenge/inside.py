@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from probewise.world import concealed
 from probewise.world.challenge.candidates import (
     CleanSetup,
     Draw,
@@ -17,46 +18,11 @@ from probewise.world.challenge.candidates import (
     sign,
     signed,
 )
-from probewise.world.concealed import (
-    AlbedoGradient,
-    AlbedoPatch,
-    AmbientGradient,
-    AmbientStep,
-    Backlash,
-    BatterySag,
-    Concealed,
-    CorrelatedNoise,
-    Dropouts,
-    EdgeBlur,
-    EdgeMisplacement,
-    EdgeShadow,
-    Flicker,
-    GainDrift,
-    Glint,
-    Halo,
-    HeightGradient,
-    HeightOffset,
-    Hysteresis,
-    Lag,
-    Nonlinearity,
-    OffsetDrift,
-    OrientationError,
-    Outliers,
-    PeriodicPositionError,
-    PositionScale,
-    Quantisation,
-    Saturation,
-    ScanAngleError,
-    ScanMisplacement,
-    SensorTilt,
-    SignalDependentNoise,
-    SSFOrder,
-)
 
 __all__ = ["INSIDE", "NEEDS_SENSOR", "NO_PHYSICS", "PAIRABLE", "SINGLES"]
 
 
-def _sloping(make: Callable[[float, float], Concealed]) -> Draw:
+def _sloping(make: Callable[[float, float], concealed.Concealed]) -> Draw:
     """Draw a direction within 60 degrees of X, which every plan moves along."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -68,42 +34,42 @@ def _sloping(make: Callable[[float, float], Concealed]) -> Draw:
 
 def _ambient_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, at_s = sign(rng), setup.start_s + rng.uniform(0.15, 0.85) * setup.duration_s
-    return lambda a: AmbientStep(s * a, at_s)
+    return lambda a: concealed.AmbientStep(s * a, at_s)
 
 
 def _gain_drift(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, tau_s = sign(rng), log_uniform(rng, 60.0, setup.duration_s)
-    return lambda a: GainDrift(s * a, tau_s)
+    return lambda a: concealed.GainDrift(s * a, tau_s)
 
 
 def _flicker(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     alias_hz, phase = log_uniform(rng, 0.01, setup.fastest_hz), rng.uniform(0, 2 * math.pi)
-    return lambda a: Flicker(a, alias_hz, phase)
+    return lambda a: concealed.Flicker(a, alias_hz, phase)
 
 
 def _saturation(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     """Draw a ceiling below white by the amplitude, a share of the span; hard, or softened over one unit."""
     white, span = setup.world.white, setup.world.white - setup.world.black
     softness = float(rng.choice([0.0, 1.0]))
-    return lambda a: Saturation(white - a * span, softness)
+    return lambda a: concealed.Saturation(white - a * span, softness)
 
 
 def _position_scale(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, ratio = sign(rng), rng.uniform(-1, 1)
-    return lambda a: PositionScale(s * a, ratio * a)
+    return lambda a: concealed.PositionScale(s * a, ratio * a)
 
 
 def _periodic(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     period_mm, phase = log_uniform(rng, 4.0, 25.0), rng.uniform(0, 2 * math.pi)
-    return lambda a: PeriodicPositionError(a, period_mm, phase)
+    return lambda a: concealed.PeriodicPositionError(a, period_mm, phase)
 
 
 def _scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, scan = sign(rng), str(rng.choice(setup.scans))
-    return lambda a: ScanMisplacement(s * a, scan)
+    return lambda a: concealed.ScanMisplacement(s * a, scan)
 
 
-def _in_scans(make: Callable[[float, tuple[str, ...]], Concealed]) -> Draw:
+def _in_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
     """Draw one scan, or every scan of one mounting."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -121,71 +87,71 @@ def _place(rng: np.random.Generator) -> tuple[float, float, float]:
 
 def _albedo_patch(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, (x, y, r) = sign(rng), _place(rng)
-    return lambda a: AlbedoPatch(s * a, x, y, r)
+    return lambda a: concealed.AlbedoPatch(s * a, x, y, r)
 
 
 def _glint(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     x, y, r = _place(rng)
-    return lambda a: Glint(a, x, y, r)
+    return lambda a: concealed.Glint(a, x, y, r)
 
 
 def _edge_shadow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     w = log_uniform(rng, 2.0, 8.0)
-    return lambda a: EdgeShadow(a, w)
+    return lambda a: concealed.EdgeShadow(a, w)
 
 
 def _halo(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     r_mm = log_uniform(rng, 12.0, 40.0)
-    return lambda a: Halo(a, r_mm)
+    return lambda a: concealed.Halo(a, r_mm)
 
 
 def _ssf_order(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     turn, sd_mm = rng.uniform(0, 2 * math.pi), rng.uniform(1.5, 4.0)
-    return lambda a: SSFOrder(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
+    return lambda a: concealed.SSFOrder(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
 
 
 def _outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     share = log_uniform(rng, 0.01, 0.05)
-    return lambda a: Outliers(share, a)
+    return lambda a: concealed.Outliers(share, a)
 
 
 def _dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     """Draw the number of lost readings too, since a single one is obvious."""
     value, factor = float(rng.choice([0.0, 100.0])), log_uniform(rng, 0.5, 5.0)
-    return lambda a: Dropouts(factor * a, value)
+    return lambda a: concealed.Dropouts(factor * a, value)
 
 
 INSIDE: Mapping[str, EffectSampler] = {
-    "ambient_gradient": EffectSampler(("place",), _sloping(AmbientGradient), 0.01, 2.0),
+    "ambient_gradient": EffectSampler(("place",), _sloping(concealed.AmbientGradient), 0.01, 2.0),
     "ambient_step": EffectSampler(("time",), _ambient_step, 0.5, 30.0),
-    "offset_drift": EffectSampler(("time",), signed(OffsetDrift), 5.0, 500.0),
+    "offset_drift": EffectSampler(("time",), signed(concealed.OffsetDrift), 5.0, 500.0),
     "gain_drift": EffectSampler(("time",), _gain_drift, 0.03, 0.9),
-    "battery_sag": EffectSampler(("battery_mv",), signed(BatterySag), 0.5, 10.0),
+    "battery_sag": EffectSampler(("battery_mv",), signed(concealed.BatterySag), 0.5, 10.0),
     "flicker": EffectSampler(("time",), _flicker, 0.3, 20.0),
     "saturation": EffectSampler(("level",), _saturation, 0.05, 0.9),
-    "nonlinearity": EffectSampler(("level",), signed(lambda a: Nonlinearity(math.exp(a))), 0.1, 1.5),
-    "quantisation": EffectSampler(("lattice",), plain(Quantisation), 1.0, 20.0),
-    "hysteresis": EffectSampler(("direction",), signed(Hysteresis), 0.3, 20.0),
-    "lag": EffectSampler(("slope", "direction"), plain(Lag), 0.5, 20.0),
-    "backlash": EffectSampler(("slope", "direction"), plain(Backlash), 0.5, 15.0),
+    "nonlinearity": EffectSampler(("level",), signed(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5),
+    "quantisation": EffectSampler(("lattice",), plain(concealed.Quantisation), 1.0, 20.0),
+    "hysteresis": EffectSampler(("direction",), signed(concealed.Hysteresis), 0.3, 20.0),
+    "lag": EffectSampler(("slope", "direction"), plain(concealed.Lag), 0.5, 20.0),
+    "backlash": EffectSampler(("slope", "direction"), plain(concealed.Backlash), 0.5, 15.0),
     "position_scale": EffectSampler(("place",), _position_scale, 0.02, 0.4),
     "periodic_position_error": EffectSampler(("place",), _periodic, 0.3, 10.0),
-    "edge_misplacement": EffectSampler(("slope",), signed(EdgeMisplacement), 0.3, 8.0),
+    "edge_misplacement": EffectSampler(("slope",), signed(concealed.EdgeMisplacement), 0.3, 8.0),
     "scan_misplacement": EffectSampler(("slope", "scan"), _scan_misplacement, 0.3, 8.0),
-    "scan_angle_error": EffectSampler(("scan", "orientation"), _in_scans(ScanAngleError), 5.0, 45.0),
-    "orientation_error": EffectSampler(("orientation",), signed(OrientationError), 5.0, 45.0),
-    "sensor_tilt": EffectSampler(("orientation", "slope"), _sloping(SensorTilt), 0.3, 8.0),
-    "height_gradient": EffectSampler(("place",), signed(HeightGradient), 0.01, 0.12),
-    "height_offset": EffectSampler(("scan",), _in_scans(HeightOffset), 0.3, 8.0),
-    "albedo_gradient": EffectSampler(("place",), _sloping(AlbedoGradient), 5e-4, 0.012),
+    "scan_angle_error": EffectSampler(("scan", "orientation"), _in_scans(concealed.ScanAngleError), 5.0, 45.0),
+    "orientation_error": EffectSampler(("orientation",), signed(concealed.OrientationError), 5.0, 45.0),
+    "sensor_tilt": EffectSampler(("orientation", "slope"), _sloping(concealed.SensorTilt), 0.3, 8.0),
+    "height_gradient": EffectSampler(("place",), signed(concealed.HeightGradient), 0.01, 0.12),
+    "height_offset": EffectSampler(("scan",), _in_scans(concealed.HeightOffset), 0.3, 8.0),
+    "albedo_gradient": EffectSampler(("place",), _sloping(concealed.AlbedoGradient), 5e-4, 0.012),
     "albedo_patch": EffectSampler(("place",), _albedo_patch, 0.05, 1.0),
-    "edge_blur": EffectSampler(("edge_distance",), plain(EdgeBlur), 1.0, 8.0),
+    "edge_blur": EffectSampler(("edge_distance",), plain(concealed.EdgeBlur), 1.0, 8.0),
     "edge_shadow": EffectSampler(("edge_distance",), _edge_shadow, 0.02, 0.6),
     "halo": EffectSampler(("edge_distance",), _halo, 0.05, 0.6),
     "glint": EffectSampler(("place",), _glint, 1.0, 40.0),
     "ssf_order": EffectSampler(("edge_distance",), _ssf_order, 0.05, 0.5),
-    "signal_dependent_noise": EffectSampler(("level",), plain(SignalDependentNoise), 1.0, 100.0),
-    "correlated_noise": EffectSampler(("scan",), plain(CorrelatedNoise), 0.3, 0.95),
+    "signal_dependent_noise": EffectSampler(("level",), plain(concealed.SignalDependentNoise), 1.0, 100.0),
+    "correlated_noise": EffectSampler(("scan",), plain(concealed.CorrelatedNoise), 0.3, 0.95),
     "outliers": EffectSampler((), _outliers, 5.0, 30.0),
     "dropouts": EffectSampler((), _dropouts, 0.01, 0.01, sized=False),
 }

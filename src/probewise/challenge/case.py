@@ -54,7 +54,7 @@ class Investigated:
 
     def __call__(self, task: Task) -> dict[str, Any]:
         """Return the result of `run_case` and, under "rounds", each round's diagnosis and number of readings."""
-        return _run(task, partial(_investigated, rounds=self.rounds))
+        return _case_result(task, partial(_investigation_result, rounds=self.rounds))
 
 
 def run_case(task: Task) -> dict[str, Any]:
@@ -65,10 +65,10 @@ def run_case(task: Task) -> dict[str, Any]:
     A JSON object. A case that could not be drawn or whose diagnosis failed has "failed", the reason, and "at",
     "drawing" or "diagnosis"; every case has its stratum: "kind", "size" and "other_noise".
     """
-    return _run(task, _diagnosed)
+    return _case_result(task, _diagnosis_result)
 
 
-def _run(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[str, Any]:
+def _case_result(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[str, Any]:
     stratum, _ = stratum_of(task.number)
     result: dict[str, Any] = asdict(stratum)
     refit = NullRefit()
@@ -77,7 +77,7 @@ def _run(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
         try:
             case = draw_case(task.seed, task.number, norm_after_refit=refit)
-            result |= _truth(case, refit)
+            result |= _truth_result(case, refit)
             at = "diagnosis"
             result |= diagnosed(case, task)
         # A campaign of thousands survives a case that breaks the diagnosis, and reports it.
@@ -86,7 +86,7 @@ def _run(task: Task, diagnosed: Callable[[Case, Task], dict[str, Any]]) -> dict[
     return result
 
 
-def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
+def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
     truth = case.truth
     plain = replace(case.world, concealed=(), step=None)
     sizer = EffectSizer(CleanSetup(case.recording.plan, plain), refit)
@@ -105,7 +105,7 @@ def _truth(case: Case, refit: NullRefit) -> dict[str, Any]:
 
 def _concealed_effects(hidden: Sequence[Hidden], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
     """Describe the effects; for a pair also "size_beside", the size of each when the other is in the model."""
-    each = [_effect(one, sizer, refit) for one in hidden]
+    each = [_effect_result(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
         both = sizer.recording(*(one.effect for one in hidden))
         left = residual_with_one_named(refit, sizer.clean, both, [one.name for one in hidden])
@@ -114,7 +114,7 @@ def _concealed_effects(hidden: Sequence[Hidden], sizer: EffectSizer, refit: Null
     return each
 
 
-def _effect(hidden: Hidden, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
+def _effect_result(hidden: Hidden, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
     """Describe one effect; "cosines": its aliases in this plan with their cosines."""
     # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
     on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
@@ -129,7 +129,7 @@ def _effect(hidden: Hidden, sizer: EffectSizer, refit: NullRefit) -> dict[str, A
     }
 
 
-def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
+def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     blind, later, files = (
         np.random.default_rng(child)
         for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(3)
@@ -152,7 +152,7 @@ def _diagnosed(case: Case, task: Task) -> dict[str, Any]:
     }
 
 
-def _investigated(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
+def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
     thinking, reading = (
         np.random.default_rng(child)
         for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(2)

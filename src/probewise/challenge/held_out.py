@@ -44,7 +44,7 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
             scores[name] = scores["null"]
             continue
         sensor = samples.fitted_sensor(diagnosis.recording, rng=child)
-        scores[name] = {scan: _scored(sensor, recording) for scan, recording in scans.items()}
+        scores[name] = {scan: _total_log_density(sensor, recording) for scan, recording in scans.items()}
     scores["true"] = {
         scan: _true_log_density(case.world.expected(recording.plan), case.world.noise_sd, recording)
         for scan, recording in scans.items()
@@ -52,7 +52,7 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     return {scan: {name: own[scan] for name, own in scores.items()} for scan in scans}
 
 
-def _scored(sensor: FittedSensor, recording: Recording) -> float:
+def _total_log_density(sensor: FittedSensor, recording: Recording) -> float:
     return float(np.nansum(predict(sensor, recording.plan, recording.readings).log_density))
 
 

@@ -39,7 +39,7 @@ class NullRefit:
     def refit(self, clean: Recording, changed: Recording) -> Fit:
         """Refit the null to an effect's readings, as if the null fitted the clean sensor exactly."""
         null = self.null(clean)
-        return _fit(null.model, self.without_null_residuals(clean, changed), null.z)
+        return _white_noise_fit(null.model, self.without_null_residuals(clean, changed), null.z)
 
     def with_one_more(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
         """Refit the same readings with one Gaussian more than `refit`, which is not a physical effect."""
@@ -63,7 +63,7 @@ def _best_order(clean: Recording) -> Fit:
     extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)
     sensor = default_sensor(extent, 1)
     found = min(
-        (_fit(Model(sensor, (), clean.plan), clean, z) for z in starts_of_one_gaussian(sensor)),
+        (_white_noise_fit(Model(sensor, (), clean.plan), clean, z) for z in starts_of_one_gaussian(sensor)),
         key=lambda f: f.objective,
     )
     best, best_log_z = found, weigh(found, noise).log_z
@@ -81,9 +81,9 @@ def _with_one_more(found: Fit, recording: Recording, extent: Extent) -> Iterator
     """Fit with one more Gaussian, starting from every way to split the heaviest."""
     wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
     for z in start_with_more_gaussians(found.model.sensor, found.z, wanted):
-        yield _fit(Model(wanted, (), recording.plan), recording, z)
+        yield _white_noise_fit(Model(wanted, (), recording.plan), recording, z)
 
 
-def _fit(model: Model, recording: Recording, start: FloatArray) -> Fit:
+def _white_noise_fit(model: Model, recording: Recording, start: FloatArray) -> Fit:
     whitener = white(int(recording.usable.sum()), least=_NOISE_SD)
     return fit(model, recording, start, whitener, tolerance=0.02)

@@ -87,17 +87,17 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
     """Score the results of `run_case`; a case that failed counts in the last row alone."""
     done = [r for r in results if "failed" not in r]
     return (
-        *_clean(done),
-        *_detection(done),
-        *_naming(done),
-        *_probabilities(done),
-        *_places(done),
-        *_intervals(done),
+        *_clean_rows(done),
+        *_detection_rows(done),
+        *_naming_rows(done),
+        *_probability_rows(done),
+        *_place_rows(done),
+        *_interval_rows(done),
         *_held_out(done),
-        *_pairs(done),
+        *_pair_rows(done),
         *_out_of_vocabulary(done),
-        *_aliases(done),
-        *_time(done),
+        *_alias_rows(done),
+        *_time_rows(done),
         Row("cases that failed", share(["failed" in r for r in results])),
     )
 
@@ -110,7 +110,7 @@ def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[E
     return {name: (alarms(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
 
 
-def _clean(done: list[Result]) -> list[Row]:
+def _clean_rows(done: list[Result]) -> list[Row]:
     clean = [r for r in done if r["kind"] == "clean"]
     white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
     models = sorted({r["noise_model"] for r in other})
@@ -128,7 +128,7 @@ def _clean(done: list[Result]) -> list[Row]:
     ]
 
 
-def _detection(done: list[Result]) -> list[Row]:
+def _detection_rows(done: list[Result]) -> list[Row]:
     targets = {5.0: 0.8, 6.0: 0.93, 8.0: 0.995}
     rows = [
         Row(
@@ -143,7 +143,7 @@ def _detection(done: list[Result]) -> list[Row]:
     return [*rows, Row("detection, lambda 8, least of all effects", worst, 0.9)]
 
 
-def _naming(done: list[Result]) -> list[Row]:
+def _naming_rows(done: list[Result]) -> list[Row]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
     found = {size: share([leading_name_right(r) for r in singles_of(done, size)]) for size in targets}
     falls = [_difference(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
@@ -167,7 +167,7 @@ def _difference(before: Estimate, after: Estimate) -> Estimate:
     return Estimate(fall, fall - down, fall + up, before.n + after.n)
 
 
-def _probabilities(done: list[Result]) -> list[Row]:
+def _probability_rows(done: list[Result]) -> list[Row]:
     covered = [any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in done]
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
@@ -196,7 +196,7 @@ def merged_size(result: Result) -> float:
     return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
-def _places(done: list[Result]) -> list[Row]:
+def _place_rows(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.8, 20.0: 0.9}
     local = {size: [r["overlap"] for r in singles_of(done, size) if r["overlap"] is not None] for size in targets}
     shown = [r for r in singles_of(done, 8.0) if on_mean(r)]
@@ -208,7 +208,7 @@ def _places(done: list[Result]) -> list[Row]:
     ]
 
 
-def _intervals(done: list[Result]) -> list[Row]:
+def _interval_rows(done: list[Result]) -> list[Row]:
     right = [r for r in done if fits(r["combination"], answers(r, merged=False)) and not is_outside(r)]
     stated_of = [interval for r in right for own in r["parameters"].values() for interval in own.values()]
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
@@ -259,7 +259,7 @@ def _ratio(gains: FloatArray) -> float:
     return float(repaired / true)
 
 
-def _pairs(done: list[Result]) -> list[Row]:
+def _pair_rows(done: list[Result]) -> list[Row]:
     pairs = [r for r in done if r["kind"] == "pair"]
     both = [leading_name_right(r) for r in pairs]
     shown = [right for r, right in zip(pairs, both, strict=True) if _each_shows(r)]
@@ -293,7 +293,7 @@ def _out_of_vocabulary(done: list[Result]) -> list[Row]:
     ]
 
 
-def _aliases(done: list[Result]) -> list[Row]:
+def _alias_rows(done: list[Result]) -> list[Row]:
     aliased = [r for r in done if r["kind"] == "alias"]
     settled = [r | r["settled"] if r["settled"] else r for r in aliased]
     return [
@@ -308,7 +308,7 @@ def _aliases(done: list[Result]) -> list[Row]:
     ]
 
 
-def _time(done: list[Result]) -> list[Row]:
+def _time_rows(done: list[Result]) -> list[Row]:
     plans = {"paper": 5.0, "two_way": math.inf}
     return [
         Row(

@@ -29,7 +29,7 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
 def _executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
     """Yield the executor; None for this process."""
     if arguments.scheduler is not None:
-        with _cluster(arguments.scheduler) as executor:
+        with _cluster_executor(arguments.scheduler) as executor:
             yield executor
     elif arguments.workers > 1:
         from probewise.cli._workers import workers
@@ -63,7 +63,7 @@ def campaign_keeps(path: Path, noun: str, arguments: argparse.Namespace) -> str:
 
 
 @contextlib.contextmanager
-def _cluster(address: str) -> Iterator[Executor]:
+def _cluster_executor(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ImportError as error:

@@ -419,7 +419,7 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
             looks.append(look(place, lowest_mm))
             if not arguments.dry_run:
                 found = check_heights(curve, looks)
-                say(_hang(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
+                say(_height_in_words(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
     if arguments.dry_run:
         return
     say(
@@ -434,12 +434,12 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
         worst = int(np.argmax(np.abs(found.off_mm / found.sd_mm)))
         caution(
             f"the light contradicts the heights (p = {found.p_value:.1g}), most at "
-            f"{_hang(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the same everywhere? "
-            "Then bring the sensor to marks there and fit the geometry again (probewise arm fit-geometry)"
+            f"{_height_in_words(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the same "
+            "everywhere? Then bring the sensor to marks there and fit the geometry again (probewise arm fit-geometry)"
         )
 
 
-def _hang(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
+def _height_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
     side = "higher" if off_mm > 0 else "lower"
     x_mm, y_mm = place_mm
     return f"({x_mm:g}, {y_mm:g}) mm: it hangs {abs(off_mm):.1f} ± {sd_mm:.1f} mm {side} than its counters say"
@@ -498,7 +498,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     elif arguments.sensor is not None:
         plan = _simulated_sensor(asked, arguments.sensor)
     else:
-        _refuse(arguments, "the LEGO arm: it is known", "unit", "range", "step")
+        _refuse_options(arguments, "the LEGO arm: it is known", "unit", "range", "step")
         plan = read_by_lego(asked, geometry)
     width, height = (0.0, 0.0) if own else geometry.field_mm
     origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
@@ -596,12 +596,12 @@ def _instrument(
     """Open the arm for a task that every arm can do, with a simulated bench if it has one."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
     if chosen is None or chosen.kind == "nxt":
-        _refuse(arguments, "a real arm", "sensor", "scene", "seed")
+        _refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
         return _arm(arguments, geometry, start_s=start_s), None
     if arguments.dry_run:
         raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
     if chosen.kind == "file":
-        _refuse(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
+        _refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
     from probewise.cli._bench import open_arm
 
     seed = DEFAULT_SEED if arguments.seed is None else arguments.seed
@@ -635,7 +635,7 @@ def _take_care(
         in_steps(instrument)
 
 
-def _refuse(arguments: argparse.Namespace, what: str, *names: str) -> None:
+def _refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
     for name in names:
         value = getattr(arguments, name, None)
         if value is not None:

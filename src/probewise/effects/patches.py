@@ -123,15 +123,15 @@ class PatchPrior:
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Invert `from_unit_cube`."""
-        return self._by_line.to_unit_cube(self._shown(theta))
+        return self._by_line.to_unit_cube(self._seen_by_scan(theta))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples, 4) -> (n_samples,)."""
-        shown = self._shown(theta)
+        shown = self._seen_by_scan(theta)
         # d(on_line, beside) / d(height, y) = exp(-beside^2 / 2) / r
         return self._by_line.log_prob(shown) - 0.5 * shown[:, 2] ** 2 - np.log(shown[:, 3])
 
-    def _shown(self, theta: FloatArray) -> FloatArray:
+    def _seen_by_scan(self, theta: FloatArray) -> FloatArray:
         height, x, y, r = theta.T
         along, beside_mm = self.line.coordinates(x, y)
         beside = beside_mm / r

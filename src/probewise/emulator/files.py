@@ -62,27 +62,27 @@ class Files:
 
     def exists(self, name: str) -> bool:
         """Whether a file exists; names are not case-sensitive."""
-        return self._found(name) is not None
+        return self._matching_name(name) is not None
 
     def _open_read(self, name: bytes) -> bytes:
-        found = self._needed(name)
-        return bytes((self._take(_Open(found)),)) + struct.pack("<I", len(self._files[found]))
+        found = self._stored_name(name)
+        return bytes((self._handle_for(_Open(found)),)) + struct.pack("<I", len(self._files[found]))
 
     def _open_write(self, name: bytes, size: int) -> bytes:
-        text = _text(name)
+        text = _checked_name(name)
         if self.exists(text):
             raise Refused(Status.FILE_EXISTS)
         if size > self.free:
             raise Refused(Status.NO_SPACE)
-        handle = self._take(_Open(text, size=size))
+        handle = self._handle_for(_Open(text, size=size))
         self._files[text] = bytearray()
         return bytes((handle,))
 
     def _open_append(self, name: bytes) -> bytes:
-        found = self._needed(name)
+        found = self._stored_name(name)
         length = len(self._files[found])
         room = self.free
-        handle = self._take(_Open(found, at=length, size=length + room))
+        handle = self._handle_for(_Open(found, at=length, size=length + room))
         return bytes((handle,)) + struct.pack("<I", room)
 
     def _read(self, handle: int, wanted: int) -> bytes:
@@ -113,7 +113,7 @@ class Files:
         return bytes((handle,))
 
     def _delete(self, name: bytes) -> bytes:
-        found = self._found(_text(name))
+        found = self._matching_name(_checked_name(name))
         if found is None:
             raise Refused(Status.FILE_NOT_FOUND, name)
         if any(opened.name == found for opened in self._open.values()):
@@ -127,16 +127,16 @@ class Files:
         return b""
 
     def _find_first(self, pattern: bytes) -> bytes:
-        wanted = _text(pattern).lower()
+        wanted = _checked_name(pattern).lower()
         matches = tuple(name for name in sorted(self._files) if fnmatchcase(name.lower(), wanted))
         if not matches:
             raise Refused(Status.FILE_NOT_FOUND)
-        return self._tell(self._take(_Open("", matches=matches)))
+        return self._next_match(self._handle_for(_Open("", matches=matches)))
 
     def _find_next(self, handle: int) -> bytes:
-        return self._tell(handle)
+        return self._next_match(handle)
 
-    def _tell(self, handle: int) -> bytes:
+    def _next_match(self, handle: int) -> bytes:
         search = self._open_file(handle)
         matches = tuple(name for name in search.matches if name in self._files)
         if not matches:
@@ -144,7 +144,7 @@ class Files:
         name, search.matches = matches[0], matches[1:]
         return bytes((handle,)) + struct.pack("<20sI", name.encode("latin-1"), len(self._files[name]))
 
-    def _take(self, opened: _Open) -> int:
+    def _handle_for(self, opened: _Open) -> int:
         for handle in range(_N_HANDLES):
             if handle not in self._open:
                 self._open[handle] = opened
@@ -158,17 +158,17 @@ class Files:
             raise Refused(Status.HANDLE_CLOSED)
         return self._open[handle]
 
-    def _needed(self, name: bytes) -> str:
-        found = self._found(_text(name))
+    def _stored_name(self, name: bytes) -> str:
+        found = self._matching_name(_checked_name(name))
         if found is None:
             raise Refused(Status.FILE_NOT_FOUND)
         return found
 
-    def _found(self, name: str) -> str | None:
+    def _matching_name(self, name: str) -> str | None:
         return next((known for known in self._files if known.lower() == name.lower()), None)
 
 
-def _text(name: bytes) -> str:
+def _checked_name(name: bytes) -> str:
     text = name.split(b"\0")[0].decode("latin-1")
     if not 1 <= len(text) < _NAME or "." not in text:
         raise Refused(Status.ILLEGAL_FILE_NAME)

@@ -45,7 +45,7 @@ class Programs:
         return b""
 
     def _stop(self) -> bytes:
-        self._needed()
+        self._running_name()
         self._switch(None)
         return b""
 
@@ -60,7 +60,7 @@ class Programs:
             raise Refused(Status.OUT_OF_RANGE)
         if box >= _N_BOXES:
             raise Refused(Status.ILLEGAL_MAILBOX)
-        self._needed()
+        self._running_name()
         self._boxes[box + _ANSWERS if box < _ANSWERS else box].append(message)
         return b""
 
@@ -77,9 +77,9 @@ class Programs:
         return told(self._boxes[box].popleft() if remove else self._boxes[box][0])
 
     def _name(self) -> bytes:
-        return self._needed()
+        return self._running_name()
 
-    def _needed(self) -> bytes:
+    def _running_name(self) -> bytes:
         if self.running is None:
             raise Refused(Status.NO_PROGRAM)
         return self.running

@@ -61,12 +61,12 @@ class _Fields:
 
     def __init__(self, path: Path, where: str, content: object) -> None:
         if not isinstance(content, dict):
-            raise FileError(path, f"{where} is {_shown(content)}", "an object {...}")
+            raise FileError(path, f"{where} is {_shortened_json(content)}", "an object {...}")
         self.path, self.where, self.content = path, where, content
         self.used: set[str] = set()
 
     def fail(self, name: str, value: object, allowed: str) -> FileError:
-        return FileError(self.path, f"{self.where}.{name} is {_shown(value)}".lstrip("."), allowed)
+        return FileError(self.path, f"{self.where}.{name} is {_shortened_json(value)}".lstrip("."), allowed)
 
     def get(self, name: str, allowed: str) -> Any:
         self.used.add(name)
@@ -114,7 +114,7 @@ def _is_pair(value: object) -> bool:
     return isinstance(value, list) and len(value) == 2 and all(_is_number(v) for v in value)
 
 
-def _shown(value: object) -> str:
+def _shortened_json(value: object) -> str:
     return shortened(json.dumps(value, ensure_ascii=False, default=str), 60)
 
 
@@ -207,7 +207,9 @@ def read_description(path: Path) -> Description:
     listed = top.get("patterns", "at least one pattern by name")
     for name, fields_of_it in _Fields(path, "patterns", listed).content.items():
         if name != name.strip() or not name.isprintable():
-            raise FileError(path, f"patterns has a name {_shown(name)}", "a printable text without blanks around it")
+            raise FileError(
+                path, f"patterns has a name {_shortened_json(name)}", "a printable text without blanks around it"
+            )
         f = _Fields(path, f"patterns.{name}", fields_of_it)
         kind = f.text("kind", f"one of {', '.join(_KINDS)}")
         if kind not in _KINDS:

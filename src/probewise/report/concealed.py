@@ -15,7 +15,7 @@ __all__ = ["answer", "write_page"]
 
 def answer(rows: Sequence[ConcealedRow]) -> str:
     """Summarise in one sentence how many runs ended sure and wrong, with doubt and without."""
-    wrong = {doubts: _wrong([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)}
+    wrong = {doubts: _wrong_count([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)}
     return (
         f"Sure and wrong: {wrong[False]} where the robot trusts its sensor, {wrong[True]} where it doubts it, "
         "on the same circles with the same noise."
@@ -36,7 +36,7 @@ def write_page(rows: Sequence[ConcealedRow], *, command: str) -> str:
     return page("A robot with a concealed fault", answer=answer(rows), key_figure=drawn, sections=sections)
 
 
-def _wrong(rows: Sequence[ConcealedRow]) -> str:
+def _wrong_count(rows: Sequence[ConcealedRow]) -> str:
     n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in rows)
     return f"{n_wrong} of {count(sum(row.runs for row in rows), 'run')}"
 

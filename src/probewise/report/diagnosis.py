@@ -65,7 +65,7 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
             "Before and after the repair" if diagnosis.repair.changes_predictions else "The model",
             _before_and_after(diagnosis, drawn),
         ),
-        Section("Does the repaired model predict held-out readings?", _gain(diagnosis, drawn)),
+        Section("Does the repaired model predict held-out readings?", _gain_of_repair(diagnosis, drawn)),
         Section("Aliased effects, and what would separate them", _aliases(diagnosis)),
         Section("Noise", _noise(diagnosis, drawn)),
     ]
@@ -117,22 +117,29 @@ def _first_caption(diagnosis: Diagnosis) -> str:
 def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Answer in plain words: what to do next, what was found, whether it is real, whether the repair helps."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
-    facts = [("What to measure next", _next_in_words(diagnosis)), ("What was found", _sentence(_found(diagnosis)))]
+    facts = [
+        ("What to measure next", _next_in_words(diagnosis)),
+        ("What was found", _sentence(_reason_in_words(diagnosis))),
+    ]
     if diagnosis.report.formula is not None:
         facts.append(("As a formula", _formula(diagnosis.report.formula)))
     if diagnosis.report.remainder is not None:
         facts.append(("Beside that", _sentence(diagnosis.report.remainder.sentence)))
     if not diagnosis.judged.too_little:
-        facts.append(("Could it be chance?", _chance(diagnosis)))
+        facts.append(("Could it be chance?", _chance_in_words(diagnosis)))
     if gain.heldout_by_scan and diagnosis.repair.changes_predictions:
-        facts.append(("Does the repair predict?", _predicts(gain.heldout_log_density_per_reading, gain.heldout_sd)))
+        facts.append(
+            ("Does the repair predict?", _prediction_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd))
+        )
     if diagnosis.repair.changes_predictions:
         left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after"
         model = diagnosis.apparatus.words.model
         only_here = f". The unknown part is corrected in these readings only; {model} does not contain it"
         facts.append(("Residuals", f"{left}{only_here if diagnosis.repair.by_rows else ''}."))
     if diagnosis.repair.left_open:
-        facts.append(("In the repaired model", _shares(diagnosis.repair.left_open, diagnosis.apparatus.words.model)))
+        facts.append(
+            ("In the repaired model", _shares_in_words(diagnosis.repair.left_open, diagnosis.apparatus.words.model))
+        )
     return facts
 
 
@@ -157,14 +164,14 @@ def _formula(formula: Formula) -> str:
     return readable(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
 
 
-def _found(diagnosis: Diagnosis) -> str:
+def _reason_in_words(diagnosis: Diagnosis) -> str:
     """Return the reason without the plan, which the page gives elsewhere, and with names in words."""
     said = diagnosis.reason.partition(TO_SEPARATE)[0]
     names = "|".join(EFFECTS_IN_WORDS)
     return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
 
 
-def _predicts(nats: float, sd: float) -> str:
+def _prediction_in_words(nats: float, sd: float) -> str:
     measured = f"{_signed_nats(nats, sd)} per held-out reading"
     if nats > 2 * sd:
         return f"Yes: each reading is {math.exp(min(nats, 50.0)):.3g} times as probable as before ({measured})."
@@ -176,7 +183,7 @@ def _signed_nats(nats: float, sd: float) -> str:
     return f"{readable(written if written.startswith('-') else f'+{written}')} nats"
 
 
-def _shares(shares: Mapping[tuple[str, ...], float], model: str) -> str:
+def _shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str:
     held = (
         f"{listed(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
         for names, share in shares.items()
@@ -184,7 +191,7 @@ def _shares(shares: Mapping[tuple[str, ...], float], model: str) -> str:
     return f"Posterior samples in {model} contain: {', '.join(held)}."
 
 
-def _chance(diagnosis: Diagnosis) -> str:
+def _chance_in_words(diagnosis: Diagnosis) -> str:
     p_value, p = diagnosis.p_value, p_in_words(diagnosis.p_value)
     if p_value > _CHANCE:
         often = f"with nothing missing, {100 * p_value:.0f} of 100 recordings look as odd as this ({p})"
@@ -341,7 +348,7 @@ def _before_and_after(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple
     )
 
 
-def _gain(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _gain_of_repair(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     shown = (
         (

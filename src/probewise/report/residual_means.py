@@ -110,14 +110,14 @@ def _equal_groups(values: FloatArray, rows: IntArray, least: int) -> list[IntArr
     mine = values[rows]
     share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
     n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
-    groups = _merged_groups(_steps(mine, rows, n), least)
+    groups = _merged_groups(_rows_by_step(mine, rows, n), least)
     if len(groups) >= min(_FEW_STEPS, n) or rows.size < _FEW_STEPS * least:
         return groups
     # Where most readings share a few values, groups of equal size show more than bins of equal width.
     return np.array_split(rows[np.argsort(mine, kind="stable")], min(n, rows.size // least))
 
 
-def _steps(mine: FloatArray, rows: IntArray, n: int) -> list[IntArray]:
+def _rows_by_step(mine: FloatArray, rows: IntArray, n: int) -> list[IntArray]:
     step = np.minimum((n * (mine - mine.min()) / max(float(np.ptp(mine)), 1e-300)).astype(int), n - 1)
     return [rows[step == k] for k in range(n)]
 

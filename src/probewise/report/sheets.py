@@ -186,7 +186,7 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
         low = np.floor((places.min(axis=0) - AROUND_MM) / _ROUND_MM) * _ROUND_MM
         high = np.ceil((places.max(axis=0) + AROUND_MM) / _ROUND_MM) * _ROUND_MM
         lines = (where_white(pattern),)
-        sheets.append(Sheet(name, pattern, _pair(low), _pair(high), lines, orientations_rad=turns))
+        sheets.append(Sheet(name, pattern, _two_floats(low), _two_floats(high), lines, orientations_rad=turns))
     return tuple(sheets)
 
 
@@ -205,8 +205,8 @@ def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
     return Sheet(
         name,
         Uniform(1.0),
-        _pair(low),
-        _pair(high),
+        _two_floats(low),
+        _two_floats(high),
         lines,
         outline_mm=outline_mm,
         frame="the field's lower left corner",
@@ -311,16 +311,16 @@ def _sheet_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float,
     """Corners of a sheet that shows these points, (n, 2)."""
     low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
-    return _pair(low), _pair(high)
+    return _two_floats(low), _two_floats(high)
 
 
 def _pages_needed(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
     width, height = page_mm[0] - LEFT_MM - RIGHT_MM, page_mm[1] - BOTTOM_MM - TOP_MM
     w, h = sheet.size_mm
-    return _count(w, width), _count(h, height)
+    return _n_pages(w, width), _n_pages(h, height)
 
 
-def _count(length_mm: float, room_mm: float) -> int:
+def _n_pages(length_mm: float, room_mm: float) -> int:
     return 1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
 
 
@@ -347,6 +347,6 @@ def _corners(outline_mm: FloatArray) -> tuple[tuple[float, float], ...]:
     return tuple((x, y) for x, y in outline_mm[:-1].tolist())
 
 
-def _pair(values: FloatArray | Sequence[float]) -> tuple[float, float]:
+def _two_floats(values: FloatArray | Sequence[float]) -> tuple[float, float]:
     x, y = values
     return float(x), float(y)

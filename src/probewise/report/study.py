@@ -38,8 +38,8 @@ def answer(study: Study) -> str:
     row, found = next(iter(study.table().items()))
     share = "All" if found.reached.value == 1 else f"{number(100 * found.reached.value, 1)} % of the"
     return (
-        f"{row.name[0].upper()}{row.name[1:]}: {with_error(found.mean.value, _half(found.mean))} readings on average, "
-        f"median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
+        f"{row.name[0].upper()}{row.name[1:]}: {with_error(found.mean.value, _half_width(found.mean))} readings on "
+        f"average, median {found.median.value:g}. {share} {found.n_runs} runs reached the precision asked for."
     )
 
 
@@ -189,7 +189,7 @@ def _ratio_words(bits: float, capacity_bits: float) -> str:
 
 
 def _estimate_words(estimate: Estimate) -> str:
-    half = _half(estimate)
+    half = _half_width(estimate)
     return with_error(estimate.value, half) if half > 0 else number(estimate.value, 1)
 
 
@@ -198,5 +198,5 @@ def _percent(estimate: Estimate) -> str:
     return f"{_estimate_words(scaled)} %" if math.isfinite(estimate.value) else "–"
 
 
-def _half(estimate: Estimate) -> float:
+def _half_width(estimate: Estimate) -> float:
     return 0.5 * (estimate.high - estimate.low)

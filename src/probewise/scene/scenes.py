@@ -40,10 +40,10 @@ class KnownScene:
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Region by pattern name; theta (n_samples, 0) is ignored."""
-        return self._built
+        return self._region_by_name
 
     @cached_property
-    def _built(self) -> Mapping[str, Region]:
+    def _region_by_name(self) -> Mapping[str, Region]:
         return {name: region_of(pattern) for name, pattern in self.patterns.items()}
 
 

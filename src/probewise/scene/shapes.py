@@ -61,24 +61,24 @@ class Placed:
         if u.ndim != 2 or u.shape[1] != len(self.names):
             raise ShapeError(f"parameters have shape {u.shape}; allowed: (n_samples, {len(self.names)})")
         own = self.own.from_unit_cube(u[:, 2:])
-        low, high = self._room(own)
+        low, high = self._bounds_of_centre(own)
         return np.concatenate([low + (high - low) * u[:, :2], own], axis=1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map parameters to the unit cube, both (n_samples, n_params)."""
-        low, high = self._room(theta[:, 2:])
+        low, high = self._bounds_of_centre(theta[:, 2:])
         centre = np.clip((theta[:, :2] - low) / np.maximum(high - low, 1e-300), 0.0, 1.0)
         return np.concatenate([centre, self.own.to_unit_cube(theta[:, 2:])], axis=1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples,); -inf outside the support."""
         own = self.own.log_prob(theta[:, 2:])
-        low, high = self._room(theta[:, 2:])
+        low, high = self._bounds_of_centre(theta[:, 2:])
         inside = ((theta[:, :2] >= low) & (theta[:, :2] <= high)).all(axis=1)
         room = np.where(inside, np.prod(np.maximum(high - low, 1e-300), axis=1), 1.0)
         return np.where(inside & np.isfinite(own), own - np.log(room), -np.inf)
 
-    def _room(self, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _bounds_of_centre(self, own: FloatArray) -> tuple[FloatArray, FloatArray]:
         size = np.array([self.field.width_mm, self.field.height_mm])
         margin = np.zeros((len(own), 2)) if self.extent is None else self.extent(own)
         return margin, size - margin

@@ -179,7 +179,7 @@ class Chain:
             return np.concatenate([self.predict(block, plan) for block in blocks])
         view = self.look(theta, plan)
         plain = not self.effects and not is_commanded(plan)
-        return self._scaled(view.seen, theta) if plain else self.read(view, theta, plan)
+        return self._plain_readings(view.seen, theta) if plain else self.read(view, theta, plan)
 
     def _at_once(self, theta: FloatArray, plan: Plan) -> int:
         """Return the number of hypotheses per block, limited by memory where footprints can differ between readings."""
@@ -205,7 +205,7 @@ class Chain:
         n_ssf = len(self.ssf.names)
         return self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
 
-    def _scaled(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
+    def _plain_readings(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
         """Turn R into readings where no effect acts; overwrites `seen`."""
         i_min, i_max = self._levels(theta)
         reading = seen if len(seen) == len(theta) else np.repeat(seen, len(theta), axis=0)

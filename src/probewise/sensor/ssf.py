@@ -279,8 +279,8 @@ def field_of(
         # Conditioning v on u leaves one exponential per Gaussian and pixel.
         slope = cov[n] / var_u[n]
         var_free = var_v[n] - slope * cov[n]
-        across = _within(u_mm, mu[n], np.sqrt(var_u[n]))
-        up = _within(v_mm, mv[n], np.sqrt(var_v[n]))
+        across = _pixels_reached(u_mm, mu[n], np.sqrt(var_u[n]))
+        up = _pixels_reached(v_mm, mv[n], np.sqrt(var_v[n]))
         off_u = u_mm[across] - mu[n]
         own = (v_mm[up] - mv[n])[:, None] - slope * off_u
         own *= own
@@ -293,7 +293,7 @@ def field_of(
     return SSFField(total, pixel, (float(u_mm[0]), float(v_mm[0])))
 
 
-def _within(centres: FloatArray, mean: float, sd: float) -> slice:
+def _pixels_reached(centres: FloatArray, mean: float, sd: float) -> slice:
     """Find the pixels that a Gaussian reaches."""
     return slice(*np.searchsorted(centres, [mean - _REACH * sd, mean + _REACH * sd]))
 
@@ -309,7 +309,7 @@ def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_g
     shares = np.full(n_samples, 1 / n_samples) if weights is None else np.asarray(weights) / np.sum(weights)
     w, u, v, var_u, var_v, cov = (a[:, 0].ravel() for a in arrays)
     covs = np.stack([var_u, cov, cov, var_v], axis=-1).reshape(-1, 2, 2)
-    return _merged(w * np.repeat(shares, n), np.stack([u, v], axis=-1), covs, n_gaussians)
+    return _merge_gaussians(w * np.repeat(shares, n), np.stack([u, v], axis=-1), covs, n_gaussians)
 
 
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
@@ -320,7 +320,7 @@ def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
     covs = np.zeros((int(kept.sum()), 2, 2))
-    return _merged(values[kept], field.centers_mm[kept], covs, n_gaussians)
+    return _merge_gaussians(values[kept], field.centers_mm[kept], covs, n_gaussians)
 
 
 def total_variation(mixture: FixedMixture, field: SSFField) -> float:
@@ -348,7 +348,7 @@ def _quadratic(off: FloatArray, matrix: FloatArray) -> FloatArray:
     return np.asarray(matrix[0, 0] * x * x + matrix[1, 1] * y * y + 2 * matrix[0, 1] * x * y)
 
 
-def _merged(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
+def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gaussians: int) -> FixedMixture:
     """Merge weighted Gaussians (or points, covariance zero) into a few, by expectation-maximisation."""
     if n_gaussians < 1:
         raise ParameterError("n_gaussians", n_gaussians, "1 or more")

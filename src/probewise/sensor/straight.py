@@ -70,26 +70,26 @@ class StraightEdges:
         return _EdgeViews.of(self)
 
     @cached_property
-    def _place(self) -> slice | None:
+    def _contiguous_rows(self) -> slice | None:
         """The rows as a slice where they are contiguous, so that the result can be a view instead of a copy."""
         together = bool((np.diff(self.rows) == 1).all())
         return slice(int(self.rows[0]), int(self.rows[-1]) + 1) if together else None
 
     def see(self, footprint: Footprint, out: FloatArray) -> None:
         """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
-        seen = np.empty((len(out), len(self.rows))) if self._place is None else out[:, self._place]
+        seen = np.empty((len(out), len(self.rows))) if self._contiguous_rows is None else out[:, self._contiguous_rows]
         if len(self.distance_mm) == 1 and not _varies(footprint):
             self._views.see(footprint, seen)
         else:
             self._see_each(footprint, seen)
             seen *= self.inside - self.outside
             seen += self.outside
-        if self._place is None:
+        if self._contiguous_rows is None:
             out[:, self.rows] = seen
 
     def _see_each(self, footprint: Footprint, share: FloatArray) -> None:
         """Compute responses where the position varies with the hypothesis or the footprint with the reading."""
-        weight, *moments = (self._own(a) for a in (footprint.weight, *footprint.moments))
+        weight, *moments = (self._own_columns(a) for a in (footprint.weight, *footprint.moments))
         varies = _varies(footprint)
         angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
         per_sd, shift = np.broadcast_arrays(*_projected(angles[:, None], *moments))
@@ -108,11 +108,11 @@ class StraightEdges:
                 normal_cdf_in_place(cells)
                 share[block] += cells * _rows_of(weight, block)[:, :, g]
 
-    def _own(self, array: FloatArray) -> FloatArray:
+    def _own_columns(self, array: FloatArray) -> FloatArray:
         """Select the columns of these readings, as a view where they are contiguous."""
-        if self._place is None or array.shape[1] == 1:
+        if self._contiguous_rows is None or array.shape[1] == 1:
             return columns_of(array, self.rows)
-        return array[:, self._place]
+        return array[:, self._contiguous_rows]
 
 
 @dataclass(frozen=True, eq=False)

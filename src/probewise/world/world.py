@@ -135,7 +135,7 @@ class World:
             edge_mm=edge_distance(surface, np.array([x_mm]), np.array([y_mm])),
         )
         look = self._look([(surface, np.zeros(1, dtype=np.int64))], rows, height_mm)
-        return float(self._noisy(look, rng)[0])
+        return float(self._with_noise(look, rng)[0])
 
     def look(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> Look:
         """Simulate a plan up to the seen white fraction: the part of `expected` that integrates light.
@@ -153,10 +153,10 @@ class World:
     def answer(self, look: Look) -> FloatArray:
         """Return the noise-free readings, not rounded, shape (n_points,)."""
         rows = look.rows
-        signal = (self.white - self.black) * self._changed("response", look.seen, rows) * look.dimming
-        reading = self.black + self._changed("gain", signal, rows)
+        signal = (self.white - self.black) * self._through_changes("response", look.seen, rows) * look.dimming
+        reading = self.black + self._through_changes("gain", signal, rows)
         for stage in ("offset", "lag", "saturation"):
-            reading = self._changed(stage, reading, rows)
+            reading = self._through_changes(stage, reading, rows)
         return reading
 
     def expected(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> FloatArray:
@@ -202,17 +202,19 @@ class World:
         ParameterError
             If the plan reads over a pattern that is not described.
         """
-        return Recording(plan, self._noisy(self.look(plan, surfaces) if look is None else look, rng))
+        return Recording(plan, self._with_noise(self.look(plan, surfaces) if look is None else look, rng))
 
     def _look(self, surfaces: _Surfaces, sent: Rows, height_mm: float | None = None) -> Look:
-        place = self._changed("place", sent.place_mm, sent)
-        there = replace(sent, place_mm=place, orientation_rad=self._changed("turn", sent.orientation_rad, sent))
-        pattern = self._changed("pattern", np.zeros_like(place), there)
-        center = place + self._changed("tilt", np.zeros_like(place), there)
-        scale = self._changed("height", np.full(len(place), height_mm or self.height_mm), there) / self.height_mm
+        place = self._through_changes("place", sent.place_mm, sent)
+        there = replace(sent, place_mm=place, orientation_rad=self._through_changes("turn", sent.orientation_rad, sent))
+        pattern = self._through_changes("pattern", np.zeros_like(place), there)
+        center = place + self._through_changes("tilt", np.zeros_like(place), there)
+        scale = (
+            self._through_changes("height", np.full(len(place), height_mm or self.height_mm), there) / self.height_mm
+        )
         if scale.min() <= 0:
             raise ParameterError("height_mm", float(scale.min() * self.height_mm), "greater than 0 at every reading")
-        retouch = self._retouched if any(isinstance(effect, Retouches) for effect in self.concealed) else None
+        retouch = self._through_retouches if any(isinstance(effect, Retouches) for effect in self.concealed) else None
         seen, edge_mm = np.zeros(len(place)), np.empty(len(place))
         for surface, chosen in surfaces:
             edge_mm[chosen] = edge_distance(surface, *(place - pattern)[chosen].T)
@@ -229,25 +231,25 @@ class World:
                 seen[chosen] += glimpse.share * white(glimpse.spot, x_mm, y_mm)
         there = replace(there, edge_mm=edge_mm)
         # Illumination by the LED falls with the inverse square of the distance.
-        return Look(self._changed("seen", seen, there), scale**-2.0, there)
+        return Look(self._through_changes("seen", seen, there), scale**-2.0, there)
 
-    def _noisy(self, look: Look, rng: np.random.Generator | None) -> FloatArray:
+    def _with_noise(self, look: Look, rng: np.random.Generator | None) -> FloatArray:
         readings = self.answer(look)
         if rng is not None:
-            noise = self._disturbed("noise", rng.standard_normal(len(readings)), look, rng)
+            noise = self._through_disturbances("noise", rng.standard_normal(len(readings)), look, rng)
             readings = readings + self.noise_sd * noise
-        readings = self._changed("quantisation", readings, look.rows)
+        readings = self._through_changes("quantisation", readings, look.rows)
         if self.step is not None:
             readings = np.round(readings / self.step) * self.step
-        return readings if rng is None else self._disturbed("loss", readings, look, rng)
+        return readings if rng is None else self._through_disturbances("loss", readings, look, rng)
 
-    def _changed(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
+    def _through_changes(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
         for effect in self.concealed:
             if effect.stage == stage and isinstance(effect, Changes):
                 values = effect.change(values, rows)
         return values
 
-    def _retouched(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    def _through_retouches(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         for effect in self.concealed:
             if isinstance(effect, Retouches):
                 albedo = effect.retouch(albedo, x_mm, y_mm)
@@ -260,7 +262,9 @@ class World:
                 glimpses = effect.look(glimpses)
         return glimpses
 
-    def _disturbed(self, stage: Stage, values: FloatArray, look: Look, rng: np.random.Generator) -> FloatArray:
+    def _through_disturbances(
+        self, stage: Stage, values: FloatArray, look: Look, rng: np.random.Generator
+    ) -> FloatArray:
         for effect in self.concealed:
             if effect.stage == stage and isinstance(effect, Disturbs):
                 values = effect.disturb(values, look.rows, look.seen, rng)

@@ -204,7 +204,7 @@ class Motor:
         side: Side = 1 if goal >= here else -1
         if self._target is None:
             here = self._synchronise()
-        target = goal - side * self._coasts(self.drive.fast_power, side)
+        target = goal - side * self._coast_counts(self.drive.fast_power, side)
         if min(side * (target - here), side * (target - self._known_target)) > 0:
             here = self._limited_move(target, side, self.drive.fast_power, here)
         return here
@@ -251,11 +251,11 @@ class Motor:
     def _approach(self, goal: int, side: Side, here: int) -> int:
         """Move towards the goal: fast to well short of it, or slowly all the way."""
         fast, slow = self.drive.fast_power, self.drive.slow_power
-        target = goal - side * self._coasts(slow, side)
+        target = goal - side * self._coast_counts(slow, side)
         if side * self._known_target >= side * target:
             here = self._synchronise()  # a target left by a move in the other direction would lead beyond the goal
         least = max(side * here, side * self._known_target) + 1  # a target behind this position causes no motion
-        short = goal - side * (2 * self.drive.lead_counts + self._coasts(fast, side))
+        short = goal - side * (2 * self.drive.lead_counts + self._coast_counts(fast, side))
         if side * short > least + self.drive.lead_counts:
             return self._limited_move(short, side, fast, here)
         return self._limited_move(side * max(side * target, least), side, slow, here)
@@ -264,20 +264,20 @@ class Motor:
         """Back off behind the goal, far enough for a slow move to start and take up the play."""
         back: Side = 1 if side == -1 else -1
         fast, slow = self.drive.fast_power, self.drive.slow_power
-        behind = goal - side * (self._coasts(slow, side) + 2 * self.drive.lead_counts)
+        behind = goal - side * (self._coast_counts(slow, side) + 2 * self.drive.lead_counts)
         least = max(back * here, back * self._known_target) + 1
-        short = behind + side * self._coasts(fast, back)
+        short = behind + side * self._coast_counts(fast, back)
         if back * short > least + self.drive.lead_counts:
             return self._limited_move(short, back, fast, here)
         return self._limited_move(back * max(back * behind, least), back, slow, here)
 
-    def _coasts(self, power: int, side: Side) -> int:
+    def _coast_counts(self, power: int, side: Side) -> int:
         share = power / self.drive.fast_power
         return round(self._coast.get((power, side), share * self.drive.coast_counts))
 
     def _limited_move(self, target: int, side: Side, power: int, here: int) -> int:
         """Make one limited move to a firmware target, and read the resulting count."""
-        stop = target + side * self._coasts(power, side)
+        stop = target + side * self._coast_counts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
         if not self._start(target, side, self._command(side * power, side * (target - self._known_target))):

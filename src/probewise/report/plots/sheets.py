@@ -54,7 +54,7 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
         If a sheet needs too many pages.
     """
     cut = [(sheet, tiles_of(sheet, paper)) for sheet in sheets]
-    n_covers = len(_batches(cut))
+    n_covers = len(_groups_of_five(cut))
     buffer = io.BytesIO()
     about = {"Title": title, "Creator": "probewise", "Producer": None, "CreationDate": None}
     with mpl.rc_context({"path.simplify": False}), PdfPages(buffer, metadata=about) as pdf:
@@ -64,15 +64,15 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
             firsts.append(number)
             number += len(tiles)
         n_pages = number - 1
-        for k, batch in enumerate(_batches(list(zip(cut, firsts, strict=True)))):
-            pdf.savefig(_cover(batch, paper, title, f"page {k + 1} of {n_pages}"))
+        for k, batch in enumerate(_groups_of_five(list(zip(cut, firsts, strict=True)))):
+            pdf.savefig(_cover_page(batch, paper, title, f"page {k + 1} of {n_pages}"))
         for (sheet, tiles), first in zip(cut, firsts, strict=True):
             for k, tile in enumerate(tiles):
                 pdf.savefig(_page(sheet, tiles, tile, first, f"page {first + k} of {n_pages}"))
     return buffer.getvalue()
 
 
-def _batches(items: Sequence[Any]) -> list[Sequence[Any]]:
+def _groups_of_five(items: Sequence[Any]) -> list[Sequence[Any]]:
     return [items[k : k + 5] for k in range(0, len(items), 5)]
 
 
@@ -85,7 +85,7 @@ def _paper(page_mm: tuple[float, float]) -> Axes:
     return ax
 
 
-def _cover(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
+def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
     page = PAPERS_MM[paper]
     ax = _paper(page)
     top = page[1] - 18.0
@@ -189,12 +189,12 @@ def _page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: s
         LEFT_MM + 3.0, tile.page_mm[1] - 6.0, f"{sheet.name}{place}: {sheet.lines[0]}", fontsize=_USUAL, va="center"
     )
     ax.text(tile.page_mm[0] - 10.0, 6.0, number, fontsize=_SMALL, ha="right", va="center")
-    joins = _joins(tiles, tile, first)
+    joins = _joining_pages(tiles, tile, first)
     ax.text(tile.page_mm[0] - 10.0, 10.0, joins, fontsize=_SMALL, ha="right", va="center")
     return ax.figure  # type: ignore[return-value]
 
 
-def _joins(tiles: Sequence[Tile], tile: Tile, first: int) -> str:
+def _joining_pages(tiles: Sequence[Tile], tile: Tile, first: int) -> str:
     """Name the pages to be glued on this page's strips."""
     at = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
     right, above = at.get((tile.column + 1, tile.row)), at.get((tile.column, tile.row + 1))

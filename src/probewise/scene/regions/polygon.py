@@ -122,10 +122,10 @@ def _directed_pieces(edges: FloatArray) -> FloatArray:
 
 @outlines.register
 def _(region: PolygonRegion, *, n_vertices: int = 96) -> list[FloatArray]:
-    return [_joined(edges) for edges in region.edges_mm]
+    return [_outline_of_edges(edges) for edges in region.edges_mm]
 
 
-def _joined(edges: FloatArray) -> FloatArray:
+def _outline_of_edges(edges: FloatArray) -> FloatArray:
     points = [edges[0, 0]]
     for start, end in edges:
         if not np.array_equal(points[-1], start):

@@ -91,7 +91,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     )
     if any(isinstance(hidden.effect, Disturbs) for hidden in secret.hidden):
         model = "white"  # only one noise fault at a time
-    plan = replace(setup.plan, instrumentation=_instrument(setup.plan, model))
+    plan = replace(setup.plan, instrumentation=_instrumentation_of(setup.plan, model))
     concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in secret.hidden))
     world = with_noise(concealing, model, duration_s=setup.duration_s)
     truth = Truth(
@@ -160,7 +160,7 @@ def _conceal(stratum: Stratum, turn: int, setup: CleanSetup, sizer: EffectSizer,
     """Draw the effects of a stratum once."""
 
     def one(name: str) -> Hidden:
-        return _sized(name, stratum.size, setup, sizer, rng)
+        return _hidden_of_size(name, stratum.size, setup, sizer, rng)
 
     match stratum.kind:
         case "single":
@@ -183,7 +183,9 @@ def _conceal(stratum: Stratum, turn: int, setup: CleanSetup, sizer: EffectSizer,
             return _Secret((one(stratum.kind),))
 
 
-def _sized(name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator) -> Hidden:
+def _hidden_of_size(
+    name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
+) -> Hidden:
     candidate = INSIDE.get(name) or OUTSIDE[name]
     of_amplitude = candidate.draw(setup, rng)
     amplitude = candidate.first
@@ -195,6 +197,6 @@ def _sized(name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng:
     return Hidden(effect, sizer.size(effect), region_of(effect, sizer))
 
 
-def _instrument(plan: Plan, model: str) -> Instrumentation:
+def _instrumentation_of(plan: Plan, model: str) -> Instrumentation:
     step = 1.0 if model == "quantised" else None
     return replace(plan.instrumentation, step=step, description="Simulated readings of a challenge")

@@ -71,7 +71,7 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     }
     start_s, plans = float(plan.time_s[-1]), {}
     for name, scan in scans.items():
-        plans[name] = _after(plan, scan, start_s + _BREAK_S)
+        plans[name] = _scan_after(plan, scan, start_s + _BREAK_S)
         start_s = float(plans[name].time_s[-1])
     return plans
 
@@ -91,7 +91,7 @@ def _off_grid(pattern: Pattern, rng: np.random.Generator) -> Pattern:
             return pattern
 
 
-def _after(plan: Plan, scan: _Scan, start_s: float) -> Plan:
+def _scan_after(plan: Plan, scan: _Scan, start_s: float) -> Plan:
     n_points = len(scan.places_mm)
     time_s = start_s + _READING_S * np.arange(n_points)
     # The battery keeps draining at the same rate.

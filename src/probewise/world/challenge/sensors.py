@@ -49,23 +49,35 @@ NOISE_NAMES: Mapping[str, str] = {
 
 
 def _gaussian(rng: np.random.Generator) -> Spot:
-    blob = Blob(1.0, _center(rng), (4.0 * _about(rng), 2.5 * _about(rng)), float(rng.uniform(-0.4, 0.4)))
+    blob = Blob(
+        1.0, _center(rng), (4.0 * _factor_about_one(rng), 2.5 * _factor_about_one(rng)), float(rng.uniform(-0.4, 0.4))
+    )
     return gaussian_spot([blob], pixel_mm=_PIXEL_MM)
 
 
 def _two_lobes(rng: np.random.Generator) -> Spot:
     u, v = _center(rng)
-    apart = 3.5 * _about(rng)
+    apart = 3.5 * _factor_about_one(rng)
     blobs = [
-        Blob(float(rng.uniform(0.5, 0.7)), (u - apart, v), (2.2 * _about(rng), 2.5 * _about(rng)), 0.2),
-        Blob(float(rng.uniform(0.3, 0.5)), (u + apart, v - 1.0), (2.0 * _about(rng), 3.0 * _about(rng)), -0.2),
+        Blob(
+            float(rng.uniform(0.5, 0.7)),
+            (u - apart, v),
+            (2.2 * _factor_about_one(rng), 2.5 * _factor_about_one(rng)),
+            0.2,
+        ),
+        Blob(
+            float(rng.uniform(0.3, 0.5)),
+            (u + apart, v - 1.0),
+            (2.0 * _factor_about_one(rng), 3.0 * _factor_about_one(rng)),
+            -0.2,
+        ),
     ]
     return gaussian_spot(blobs, pixel_mm=_PIXEL_MM)
 
 
 def _ridge(rng: np.random.Generator) -> Spot:
     return ridge_spot(
-        9.0 * _about(rng),
+        9.0 * _factor_about_one(rng),
         center_mm=_center(rng),
         lobes=float(rng.uniform(0.15, 0.35)),
         ridge_mm=float(rng.uniform(-4.0, -2.0)),
@@ -78,12 +90,16 @@ def _ridge(rng: np.random.Generator) -> Spot:
 def _ring(rng: np.random.Generator) -> Spot:
     off_axis = float(rng.uniform(0.2, 0.6))
     return ring_spot(
-        3.3 * _about(rng), 2.0 * _about(rng), center_mm=_center(rng), off_axis=off_axis, pixel_mm=_PIXEL_MM
+        3.3 * _factor_about_one(rng),
+        2.0 * _factor_about_one(rng),
+        center_mm=_center(rng),
+        off_axis=off_axis,
+        pixel_mm=_PIXEL_MM,
     )
 
 
 def _skewed(rng: np.random.Generator) -> Spot:
-    core = (1.6 * _about(rng), 1.1 * _about(rng))
+    core = (1.6 * _factor_about_one(rng), 1.1 * _factor_about_one(rng))
     return tailed_spot(core, center_mm=_center(rng), skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
 
 
@@ -128,7 +144,7 @@ def with_noise(world: World, model: str, *, duration_s: float) -> World:
     return replace(world, concealed=(*world.concealed, *more[model]))
 
 
-def _about(rng: np.random.Generator) -> float:
+def _factor_about_one(rng: np.random.Generator) -> float:
     return float(rng.uniform(0.85, 1.15))
 
 

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Self
 
 from probewise._kinds import did_you_mean
-from probewise.cli._common import CommandError, a_path, caution
+from probewise.cli._common import CommandError, add_path, caution
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -60,12 +60,7 @@ WAIT_S = 0.5  # longest wait for a person between checks of signals and keep-ali
 
 def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that ships") -> None:
     """Add --geometry, with the default in its help."""
-    parser.add_argument(
-        "--geometry",
-        type=a_path,
-        metavar="ARM.toml",
-        help=f"the arm as built: lengths, gears, ports, limits (default: {default})",
-    )
+    add_path(parser, "--geometry", "ARM.toml", f"the arm as built: lengths, gears, ports, limits (default: {default})")
 
 
 def geometry_of(arguments: argparse.Namespace) -> Geometry:

@@ -24,7 +24,9 @@ __all__ = [
     "Verb",
     "a_path",
     "add_common",
+    "add_count",
     "add_out_directory",
+    "add_path",
     "add_quiet",
     "caution",
     "keeps",
@@ -99,15 +101,23 @@ def add_quiet(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress and no summary; errors still show")
 
 
+def add_count(parser: argparse._ActionsContainer, name: str, about: str, *, default: int | None = None) -> None:
+    """Add an option that takes a whole number greater than 0."""
+    parser.add_argument(name, type=positive_int, default=default, metavar="N", help=about)
+
+
+def add_path(
+    parser: argparse._ActionsContainer, name: str, metavar: str, about: str, *, required: bool = False
+) -> None:
+    """Add an argument or option that takes the name of a file or directory; `required` is for options."""
+    action = parser.add_argument(name, type=a_path, metavar=metavar, help=about)
+    action.required |= required
+
+
 def add_out_directory(parser: argparse.ArgumentParser) -> None:
     """Add --out DIR."""
-    parser.add_argument(
-        "--out",
-        type=a_path,
-        required=True,
-        metavar="DIR",
-        help="directory for the results; made if missing, files of the same names are replaced",
-    )
+    about = "directory for the results; made if missing, files of the same names are replaced"
+    add_path(parser, "--out", "DIR", about, required=True)
 
 
 def a_path(text: str) -> Path:

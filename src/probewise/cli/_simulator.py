@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import a_path
+from probewise.cli._common import add_path
 from probewise.errors import FileError, ParameterError
 
 if TYPE_CHECKING:
@@ -18,11 +18,11 @@ __all__ = ["add_simulator", "read_tables", "refuse_beside"]
 
 def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead of the light sensor") -> None:
     """Add --simulator FILE.py; the help says what it replaces."""
-    parser.add_argument(
+    add_path(
+        parser,
         "--simulator",
-        type=a_path,
-        metavar="FILE.py",
-        help=f"a simulator of your own{replaces}; the file says which columns of the table it reads",
+        "FILE.py",
+        f"a simulator of your own{replaces}; the file says which columns of the table it reads",
     )
 
 

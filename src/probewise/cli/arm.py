@@ -29,6 +29,8 @@ from probewise.cli._common import (
     OneLineParser,
     Verb,
     a_path,
+    add_count,
+    add_path,
     add_quiet,
     caution,
     keeps,
@@ -92,11 +94,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         arms=_LEGO_ARMS,
     )
     fit.add_argument("--out", type=a_path, required=True, metavar="ARM.toml", help="where the fitted geometry goes")
-    fit.add_argument(
+    add_path(
+        fit,
         "--marks",
-        type=a_path,
-        metavar="MARKS.csv",
-        help="where marks are kept (default: beside --out); without --arm they are read from there and only fitted",
+        "MARKS.csv",
+        "where marks are kept (default: beside --out); without --arm they are read from there and only fitted",
     )
     fit.add_argument(
         "--block-mm",
@@ -129,9 +131,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     heights.add_argument(
         "places", nargs="*", metavar="X,Y", help="places in mm, two or more (default: the field's middle and the marks)"
     )
-    heights.add_argument(
-        "--readings", type=positive_int, default=16, metavar="N", help="number of readings at each height (default 16)"
-    )
+    add_count(heights, "--readings", "number of readings at each height (default 16)", default=16)
 
     _task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
 
@@ -162,9 +162,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     own.add_argument("--step", metavar="STEP", help="rounding step of the readings, such as 1")
     for task, scene in ((scan, True), (record, False)):
         simulated = task.add_argument_group("with simulated and emulator")
-        simulated.add_argument(
-            "--sensor", type=a_path, metavar="S.json", help="its sensor (default: that of the shipped recordings)"
-        )
+        add_path(simulated, "--sensor", "S.json", "its sensor (default: that of the shipped recordings)")
         simulated.add_argument("--seed", type=seed_number, metavar="N", help=f"seed of noise (default {DEFAULT_SEED})")
         if scene:
             simulated.add_argument("--scene", metavar="X,Y,R", help="target on the field, as for emulate-nxt")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, a_path, add_quiet, say
+from probewise.cli._common import Verb, add_path, add_quiet, say
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._simulator import add_simulator, refuse_beside
@@ -20,24 +20,14 @@ __all__ = ["VERB"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
-    parser.add_argument(
-        "plan",
-        type=a_path,
-        metavar="PLAN.csv",
-        help="plan or recording, its JSON beside it; with --simulator any table",
-    )
-    parser.add_argument(
-        "--sensor",
-        type=a_path,
-        metavar="S.json",
-        help="the calibrated sensor (default: a typical one)",
-    )
+    add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
+    add_path(parser, "--sensor", "S.json", "the calibrated sensor (default: a typical one)")
     add_simulator(parser)
-    parser.add_argument(
+    add_path(
+        parser,
         "--out",
-        type=a_path,
-        metavar="DIR",
-        help="directory for audit.json, audit.png, report.html and cure_plan.csv; without it, only the text",
+        "DIR",
+        "directory for audit.json, audit.png, report.html and cure_plan.csv; without it, only the text",
     )
     add_quiet(parser)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, positive_int, say
+from probewise.cli._common import Verb, a_path, add_common, add_count, add_out_directory, positive_int, say
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_directory, staged
 from probewise.errors import ParameterError
@@ -29,13 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"numbers of Gaussians to compare (default {' '.join(map(str, ORDERS))})",
     )
-    parser.add_argument(
-        "--live",
-        type=positive_int,
-        default=N_LIVE,
-        metavar="N",
-        help=f"live points of nested sampling (default {N_LIVE})",
-    )
+    add_count(parser, "--live", f"live points of nested sampling (default {N_LIVE})", default=N_LIVE)
     parser.add_argument(
         "--method",
         choices=("refined", "quick", "paper"),

@@ -6,7 +6,7 @@ import argparse
 import shlex
 from functools import partial
 
-from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, positive_int, say
+from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, say
 from probewise.cli._executor import add_executor, campaign_keeps, campaign_running
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
@@ -17,25 +17,23 @@ __all__ = ["VERB"]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
     add_out_directory(parser)
-    parser.add_argument(
+    add_count(
+        parser,
         "--cases",
-        type=positive_int,
-        default=60,
-        metavar="N",
-        help="number of recordings, always the first of the seed; 60 give one case of each kind, 6000 the whole table "
+        "number of recordings, always the first of the seed; 60 give one case of each kind, 6000 the whole table "
         "(default 60)",
+        default=60,
     )
     parser.add_argument(
         "--systems",
         action="store_true",
         help="recordings of twelve kinds of system, each with its owner's file, instead of a light sensor's",
     )
-    parser.add_argument(
+    add_count(
+        parser,
         "--rounds",
-        type=positive_int,
+        "take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: none)",
         default=1,
-        metavar="N",
-        help="take the readings that the diagnosis advises until it is settled, N rounds at most (default 1: none)",
     )
     add_executor(parser)
     add_common(parser)

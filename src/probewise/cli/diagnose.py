@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, say
+from probewise.cli._common import Verb, a_path, add_common, add_out_directory, add_path, say
 from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import is_journal, journal_recording, journal_sensor
 from probewise.cli._output import check_out_directory, staged
@@ -38,11 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="recording, its JSON beside it, or the journal.jsonl of an explore run; with --simulator any table; "
         "several are diagnosed together",
     )
-    parser.add_argument(
+    add_path(
+        parser,
         "--sensor",
-        type=a_path,
-        metavar="S.json",
-        help="an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)",
+        "S.json",
+        "an earlier calibration, whose posterior becomes the prior (default with a journal: the one of its run)",
     )
     add_simulator(parser)
     parser.add_argument(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import SCENE
-from probewise.cli._common import Verb, a_path, add_common, say
+from probewise.cli._common import Verb, a_path, add_common, add_path, say
 from probewise.cli._output import check_out_file
 from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import LinkError, ParameterError
@@ -33,17 +33,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"the circle on the field, in mm (default {SCENE}), or ellipse:X,Y,A,B,ANGLE, "
         "polygon:X,Y,X,Y,..., edge:ANGLE,OFFSET, corner:X,Y,DX,DY, uniform:ALBEDO",
     )
-    parser.add_argument(
+    add_path(
+        parser,
         "--sensor",
-        type=a_path,
-        metavar="S.json",
-        help="the light sensor, as calibrate writes it (default: that of the shipped recordings)",
+        "S.json",
+        "the light sensor, as calibrate writes it (default: that of the shipped recordings)",
     )
-    parser.add_argument(
+    add_path(
+        parser,
         "--geometry",
-        type=a_path,
-        metavar="ARM.toml",
-        help="the arm as built: lengths, gears, ports, limits (default: the file that ships)",
+        "ARM.toml",
+        "the arm as built: lengths, gears, ports, limits (default: the file that ships)",
     )
     parser.add_argument(
         "--fault",
@@ -62,12 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="MIN",
         help="minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)",
     )
-    parser.add_argument(
-        "--link",
-        type=a_path,
-        metavar="PATH",
-        help="a symbolic link to keep on the device, also after a disconnection",
-    )
+    add_path(parser, "--link", "PATH", "a symbolic link to keep on the device, also after a disconnection")
     parser.add_argument("--log", type=a_path, metavar="FILE", help="write every telegram and fault to a file")
     add_common(parser)
 

@@ -10,7 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import ARMS, Telling, add_geometry, require_choices, warn_of_clearance, warn_of_goal
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, keeps, positive_int, say
+from probewise.cli._common import (
+    Verb,
+    a_path,
+    add_common,
+    add_count,
+    add_out_directory,
+    add_path,
+    keeps,
+    positive_int,
+    say,
+)
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import FileError
@@ -55,11 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="when nested sampling ends with --method paper: at a change of log evidence below 1e-8 (default), or "
         "where the log evidence can rise by 0.05 at most",
     )
-    parser.add_argument(
+    add_path(
+        parser,
         "--levels",
-        type=a_path,
-        metavar="REC.csv",
-        help="recording with readings over black and over white, from which the naive model of --method paper takes "
+        "REC.csv",
+        "recording with readings over black and over white, from which the naive model of --method paper takes "
         "its levels and sds (a simulated arm reads both before it starts)",
     )
     parser.add_argument(
@@ -85,13 +95,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"where the readings come from: {ARMS} (default simulated)",
     )
     add_geometry(parser, "the file that ships; the simulated arm has its reach, and a sensor that does not turn")
-    parser.add_argument(
-        "--max-readings",
-        type=positive_int,
-        default=MAX_READINGS,
-        metavar="N",
-        help=f"largest number of readings (default {MAX_READINGS})",
-    )
+    add_count(parser, "--max-readings", f"largest number of readings (default {MAX_READINGS})", default=MAX_READINGS)
     parser.add_argument(
         "--live", action="store_true", help="show the robot's view in a browser while it works (DIR/live.html)"
     )

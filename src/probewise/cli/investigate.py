@@ -13,11 +13,11 @@ from probewise.cli._arm import ARMS, ArmName, add_geometry, asker, geometry_of, 
 from probewise.cli._common import (
     CommandError,
     Verb,
-    a_path,
     add_common,
+    add_count,
     add_out_directory,
+    add_path,
     keeps,
-    positive_int,
     positive_number,
     say,
 )
@@ -61,22 +61,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_geometry(parser)
     add_out_directory(parser)
-    parser.add_argument(
-        "--sensor", type=a_path, metavar="S.json", help="an earlier calibration, whose posterior becomes the prior"
-    )
+    add_path(parser, "--sensor", "S.json", "an earlier calibration, whose posterior becomes the prior")
     parser.add_argument(
         "--truth",
         metavar="NAME:V,V",
         help="effect concealed in the simulated world, such as backlash:0.5 or nothing; several joined by + (default: "
         "one effect drawn from the seed, named at the end)",
     )
-    parser.add_argument(
-        "--readings",
-        type=positive_int,
-        default=400,
-        metavar="N",
-        help="largest number of readings beyond the first plan (default 400)",
-    )
+    add_count(parser, "--readings", "largest number of readings beyond the first plan (default 400)", default=400)
     parser.add_argument(
         "--minutes",
         type=positive_number("minutes"),
@@ -84,13 +76,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="M",
         help="largest number of minutes beyond the first plan (default: no limit)",
     )
-    parser.add_argument(
-        "--rounds",
-        type=positive_int,
-        default=6,
-        metavar="N",
-        help="largest number of rounds, including the first (default 6)",
-    )
+    add_count(parser, "--rounds", "largest number of rounds, including the first (default 6)", default=6)
     parser.add_argument(
         "--no-hands",
         action="store_true",

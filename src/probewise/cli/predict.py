@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import Verb, a_path, add_common, say
+from probewise.cli._common import Verb, a_path, add_common, add_path, say
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_file
 from probewise.cli._simulator import add_simulator
@@ -14,18 +14,13 @@ __all__ = ["VERB"]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
-    parser.add_argument(
+    add_path(
+        parser,
         "sensor",
-        type=a_path,
-        metavar="S.json",
-        help="sensor model, as calibrate and diagnose write it; with --simulator a repaired.json or calibrated.json",
+        "S.json",
+        "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json or calibrated.json",
     )
-    parser.add_argument(
-        "plan",
-        type=a_path,
-        metavar="PLAN.csv",
-        help="plan or recording, its JSON beside it; with --simulator any table",
-    )
+    add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
     parser.add_argument("--out", type=a_path, required=True, metavar="P.csv", help="where the prediction goes")
     add_simulator(parser)
     add_common(parser)

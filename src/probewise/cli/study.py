@@ -9,7 +9,7 @@ import shlex
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_out_directory, add_quiet, positive_int, say
+from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, say
 from probewise.cli._executor import add_executor, campaign_keeps, campaign_running
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
@@ -29,16 +29,8 @@ _SIZES = ("small", "plain", "gross")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
     add_out_directory(parser)
-    parser.add_argument(
-        "--circles",
-        type=positive_int,
-        default=200,
-        metavar="N",
-        help="circles per row, always the first ones (default 200)",
-    )
-    parser.add_argument(
-        "--quoted", type=positive_int, metavar="N", help="circles of the first row (default as --circles)"
-    )
+    add_count(parser, "--circles", "circles per row, always the first ones (default 200)", default=200)
+    add_count(parser, "--quoted", "circles of the first row (default as --circles)")
     parser.add_argument(
         "--concealed",
         action="store_true",
@@ -49,12 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seed", type=int, metavar="S", help="with --concealed: circles, noise and robot of another seed"
     )
     parser.add_argument("--size", choices=_SIZES, help="with --concealed: only this one of the three sizes")
-    parser.add_argument(
-        "--clean",
-        type=positive_int,
-        metavar="N",
-        help="with --concealed: circles of the row without a concealed effect",
-    )
+    add_count(parser, "--clean", "with --concealed: circles of the row without a concealed effect")
     parser.add_argument(
         "--beside-paper",
         action="store_true",
@@ -73,12 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     one.add_argument(
         "--nested-stop", metavar="NAME", help="when the paper's nested sampling ends: change (of ln Z) or remaining"
     )
-    parser.add_argument(
-        "--max-readings",
-        type=positive_int,
-        default=100,
-        metavar="N",
-        help="a run that is not done after N readings counts as a miss (default 100)",
+    add_count(
+        parser, "--max-readings", "a run that is not done after N readings counts as a miss (default 100)", default=100
     )
     add_executor(parser)
     add_quiet(parser)

@@ -52,15 +52,13 @@ def test_a_case_that_cannot_be_drawn_is_noted(monkeypatch):
 
 
 @pytest.mark.slow
-def test_a_case_depends_on_its_seed_and_number_alone():
-    one, other = ({**run_case(Task(1, 9)), "cpu_s": None} for _ in range(2))
-    assert one == other
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("number", [1, 9, 26])
 def test_a_case_goes_through_strict_json_into_every_row(number):
-    found = json.loads(json.dumps(run_case(Task(1, number)), allow_nan=False))
+    """And one of them again: it depends on its seed and number alone."""
+    found = run_case(Task(1, number))
+    if number == 9:
+        assert {**run_case(Task(1, number)), "cpu_s": None} == {**found, "cpu_s": None}
+    found = json.loads(json.dumps(found, allow_nan=False))
     assert "failed" not in found
     assert found["kind"] == stratum_of(number)[0].kind
     assert (found["settled"] is not None) == (found["kind"] == "alias")

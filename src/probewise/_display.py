@@ -11,8 +11,6 @@ import html
 from collections.abc import Callable
 from typing import Protocol
 
-__all__ = ["ShowsItself", "before_first_display", "render_html"]
-
 _waiting: list[Callable[[], object]] = []
 
 

@@ -16,29 +16,6 @@ from numpy.typing import NDArray
 
 from probewise.errors import ParameterError, UnitWarning
 
-__all__ = [
-    "did_you_mean",
-    "radians_meant",
-    "require_callable",
-    "require_finite_number",
-    "require_flag",
-    "require_kind",
-    "require_like",
-    "require_mapping",
-    "require_number",
-    "require_one_of",
-    "require_one_or_several",
-    "require_pair",
-    "require_path",
-    "require_progress",
-    "require_rng",
-    "require_takes",
-    "require_takes_places",
-    "require_text",
-    "require_texts",
-    "require_whole",
-]
-
 _FULL_TURN_RAD = math.tau * (1 + 1e-9)
 _MOST_LISTED = 250  # characters of names, so that what was perhaps meant is not cut off
 

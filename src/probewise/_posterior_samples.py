@@ -7,8 +7,6 @@ from collections.abc import Mapping
 from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["MIN_SAMPLES", "require_absent", "require_samples"]
-
 MIN_SAMPLES = 500
 """Least number of posterior samples in a file: fewer do not give 95 % intervals."""
 

@@ -18,8 +18,6 @@ from probewise.progress import Progress, silent
 if TYPE_CHECKING:
     from probewise.calibration import Rung
 
-__all__ = ["of_nested", "progress_or_bar", "progress_shown"]
-
 _PATIENCE_S = 2.0  # shorter work shows no bar
 _BETWEEN_LINES_S = 5.0
 _SHARE_OF_ALL = 0.05  # of the elapsed time, the least wait between lines, so that long work does not flood a log

@@ -10,8 +10,6 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Final
 
-__all__ = ["ENDING", "SAME_S", "deferred"]
-
 # Ctrl-C, `kill`, a closed terminal, Ctrl-\; Windows has neither of the last two, but Ctrl-Break and a closed window.
 _NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT", "SIGBREAK")
 ENDING: Final = tuple(signal.Signals[name] for name in _NAMES if hasattr(signal, name))

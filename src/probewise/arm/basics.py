@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Literal, Protocol, TypeAlias
 
-__all__ = ["Clock", "Side"]
-
 Side: TypeAlias = Literal[-1, 1]
 """Direction of arrival: -1 with the count decreasing, 1 increasing."""
 

@@ -18,8 +18,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 from probewise.recordings.where_white import where_white
 
-__all__ = ["BY_HAND_S", "Request", "bounds_of", "carry_out", "duration_s", "readings_of", "recorded"]
-
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)
 BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor

@@ -19,8 +19,6 @@ from probewise.arm.marks import LEAST_MARKS
 from probewise.arm.uncertainty import FITTED, RULER_SDS, places_of, slopes_mm, values_of
 from probewise.errors import ParameterError, ProbewiseError, ShapeError
 
-__all__ = ["FittedGeometry", "MarksDisagreeError", "fit_geometry"]
-
 LEAST_P = 1e-3  # p-value below which the marks disagree
 MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # largest sds of a geometry that counts as determined by the marks
 

@@ -18,8 +18,6 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.basics import Side
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["JOINTS", "ROOM_COUNTS", "Accuracy", "Geometry", "Joint", "placed_mm", "wrapped"]
-
 JOINTS = ("base", "shoulder", "elbow")
 """The joints in the order of the columns of all arrays of angles."""
 

@@ -15,8 +15,6 @@ from probewise.arm.uncertainty import FITTED
 from probewise.errors import FileError, ParameterError, shown
 from probewise.recordings.text import read_text
 
-__all__ = ["FORMAT", "read_geometry", "shipped_geometry", "with_fitted"]
-
 FORMAT = "arm/1"
 ELBOWS = ("absolute", "relative")
 _HEADER = re.compile(r"\s*\[\s*([\w.]+)\s*\]")

@@ -16,8 +16,6 @@ from scipy.special import chdtrc
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 
-__all__ = ["LEAST_HEIGHTS", "HeightCheck", "Look", "check_heights"]
-
 LEAST_HEIGHTS = 3
 _DEGREE = 2
 _TELLS = 5.0  # sds by which readings at the lowest and at the highest height must differ

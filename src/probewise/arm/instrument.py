@@ -10,8 +10,6 @@ from typing import Protocol, Self
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import radians_meant, require_kind, require_number
 
-__all__ = ["Instrument", "Pose", "Reading", "require_pose"]
-
 
 @dataclass(frozen=True)
 class Pose:

@@ -21,8 +21,6 @@ from probewise.arm.reach import require_reach
 from probewise.arm.scale import LegoScale
 from probewise.errors import LinkError, ReachError
 
-__all__ = ["LegoArm", "in_lego_units"]
-
 BASE, SHOULDER, ELBOW = range(3)
 N_RISES = 3  # coarse moves, of which the first one or two may stop short
 NEAR_TRAVEL_MM = 10.0  # depth below travel height up to which the sensor counts as raised

@@ -11,8 +11,6 @@ from probewise._arrays import FloatArray
 from probewise.arm.geometry import JOINTS, Geometry
 from probewise.errors import ReachError
 
-__all__ = ["SoftLimits"]
-
 N_STOPS = 33  # points checked along a move
 
 

@@ -11,8 +11,6 @@ from probewise.arm.basics import Side
 from probewise.arm.geometry import JOINTS, Geometry
 from probewise.arm.limits import SoftLimits
 
-__all__ = ["Machine", "Rehearsal"]
-
 
 class Machine(Protocol):
     """Three motors and a light sensor; joints are 0 to 2, base, shoulder, elbow. Leaving the block releases them."""

@@ -8,8 +8,6 @@ from probewise._arrays import FloatArray
 from probewise.arm.geometry import Geometry
 from probewise.errors import ReachError
 
-__all__ = ["LEAST_MARKS", "marks_of"]
-
 LEAST_MARKS = 5
 """Least number of marks, with place and height, that determine the nine parameters of the geometry."""
 

@@ -26,8 +26,6 @@ from probewise.arm.simulated import SimulatedArm, Speed
 from probewise.errors import FileError, LinkError, ParameterError, ShapeError
 from probewise.recordings.python_file import briefly, run_python_file
 
-__all__ = ["Measures", "OwnInstrument", "instrument_of", "require_measures"]
-
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
 _TAKEN = ("reading", "scan", "pattern", "orientation_deg")  # names of a recording's columns, not allowed for covariates

@@ -11,8 +11,6 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError, ReachError
 
-__all__ = ["FIELD_MM", "Bounds", "Reach", "Workspace", "require_reach"]
-
 FIELD_MM = (1048.0, 520.0)
 """Width and height of the paper's playing field, 131 x 65 LEGO units of 8 mm."""
 

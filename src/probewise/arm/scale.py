@@ -7,8 +7,6 @@ from dataclasses import dataclass
 
 from probewise.errors import ParameterError
 
-__all__ = ["LegoScale"]
-
 
 @dataclass(frozen=True)
 class LegoScale:

@@ -16,8 +16,6 @@ from probewise.arm.reach import Reach, Workspace, require_reach
 from probewise.arm.scale import LegoScale
 from probewise.errors import ParameterError, ReachError, ShapeError
 
-__all__ = ["Light", "SimulatedArm", "Speed"]
-
 LEGO = LegoScale()
 
 Light: TypeAlias = Callable[[Pose, float, float], float]

@@ -13,8 +13,6 @@ from probewise.arm.geometry import JOINTS
 from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.table import csv_text, number_text, read_table
 
-__all__ = ["Touched", "read_touched", "write_touched"]
-
 _TURNED = tuple(f"{joint}_turned_deg" for joint in JOINTS)
 _PLACE = ("x_mm", "y_mm", "height_mm")
 _LARGEST = 1e4

@@ -7,8 +7,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.arm.geometry import Geometry, placed_mm
 
-__all__ = ["FITTED", "RULER_SDS", "places_of", "slopes_mm", "values_of"]
-
 FITTED = (
     *("base home", "shoulder home", "elbow home", "upper link", "lower link"),
     *("base x", "base y", "shoulder forward", "shoulder height"),

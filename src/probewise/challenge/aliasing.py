@@ -17,8 +17,6 @@ from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
 
-__all__ = ["cosines", "residual_with_one_named"]
-
 _WORTH_A_REFIT = 0.8
 _STARTS = 3  # variants of an effect of a pair that are refitted
 _LIKE_AN_SSF = ("halo", "edge_blur")  # aliases of these may be an SSF with one more Gaussian

@@ -23,8 +23,6 @@ from probewise.world.challenge import Case, EffectSizer, Hidden, draw_case, stra
 from probewise.world.challenge.candidates import CleanSetup
 from probewise.world.concealed import Disturbs, Quantisation
 
-__all__ = ["Investigated", "Task", "run_case", "said"]
-
 _OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
 _LEAST_PROBABILITY = 1e-3
 _LEAST_COSINE = 0.5

@@ -12,8 +12,6 @@ from probewise._arrays import IntArray
 from probewise.challenge.scoring import NOISE, answers, fits, leading, on_mean
 from probewise.world.challenge import SINGLES
 
-__all__ = ["confusion"]
-
 OUTSIDE, SEVERAL = "outside", "several"
 
 

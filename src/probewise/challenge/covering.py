@@ -14,8 +14,6 @@ from probewise.sensor import footprint_of
 from probewise.world.challenge import Region
 from probewise.world.world import World
 
-__all__ = ["place_overlap", "sensor_truths_and_intervals", "truths_and_intervals"]
-
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 

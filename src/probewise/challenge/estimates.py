@@ -11,8 +11,6 @@ from scipy.stats import binomtest, t
 
 from probewise._arrays import FloatArray
 
-__all__ = ["Estimate", "mean", "resampled", "share"]
-
 _DRAWS = 400
 
 

@@ -14,8 +14,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.world.challenge import NO_PHYSICS, Case, held_out
 
-__all__ = ["log_densities"]
-
 
 def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator) -> dict[str, dict[str, float]]:
     """Sum the log predictive densities of each held-out scan, in nats.

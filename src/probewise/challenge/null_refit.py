@@ -15,8 +15,6 @@ from probewise.diagnosis.noise.models import NoiseModel
 from probewise.effects import Extent
 from probewise.recordings.plan import Recording
 
-__all__ = ["NullRefit"]
-
 _NOISE_SD = 0.6  # the middle noise level of a challenge; weights the readings against the priors
 _MOST_GAUSSIANS = 4
 _BEHIND = 3.0  # nats: once an SSF order is this far behind the best, higher orders are not tried

@@ -18,8 +18,6 @@ from probewise._arrays import FloatArray
 from probewise.challenge.scoring import HONEST_NATS, accepted
 from probewise.effects import VOCABULARY
 
-__all__ = ["oracle_covariate_rate", "oracle_name_rate", "oracle_set_size", "readings_by_repeating"]
-
 _DRAWS = 400
 _HELD = 0.95
 

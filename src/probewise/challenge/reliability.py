@@ -12,8 +12,6 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.challenge.estimates import Estimate, resampled, share
 from probewise.challenge.scoring import stated
 
-__all__ = ["Bin", "calibration_error", "reliability"]
-
 _EDGES = np.linspace(0, 1, 11)
 
 

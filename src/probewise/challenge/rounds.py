@@ -11,8 +11,6 @@ from probewise.challenge.estimates import Estimate, mean, share
 from probewise.challenge.scoring import NOISE, answers, extras, fits, leading, leading_name_right, names_of, on_mean
 from probewise.challenge.table import Row, alarms, singles_of
 
-__all__ = ["score_rounds"]
-
 Result = Mapping[str, Any]
 
 _BOOTSTRAPS = 2000

@@ -13,8 +13,6 @@ from probewise.challenge.case import Task, run_case
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 
-__all__ = ["run_challenge"]
-
 
 def run_challenge(
     n_cases: int,

@@ -9,22 +9,6 @@ from typing import Any
 from probewise.diagnosis.names import Names
 from probewise.world.challenge import NO_PHYSICS, NOISE_NAMES
 
-__all__ = [
-    "HONEST_NATS",
-    "NOISE",
-    "accepted",
-    "answers",
-    "extras",
-    "fits",
-    "is_outside",
-    "is_physics",
-    "leading",
-    "leading_name_right",
-    "names_of",
-    "on_mean",
-    "stated",
-]
-
 NOISE = frozenset(NOISE_NAMES.values()) | {"quantisation", "random_walk", "noise_per_run"}
 """Effects on the noise."""
 

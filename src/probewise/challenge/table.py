@@ -33,19 +33,6 @@ from probewise.challenge.scoring import (
     stated,
 )
 
-__all__ = [
-    "Decision",
-    "Row",
-    "alarms",
-    "by_effect",
-    "covering",
-    "merged_size",
-    "names_physics",
-    "score",
-    "singles_of",
-    "surely_wrong",
-]
-
 Decision: TypeAlias = Literal["met", "missed", "open"]
 Result: TypeAlias = Mapping[str, Any]
 

@@ -24,28 +24,6 @@ if TYPE_CHECKING:
     from probewise.emulator import Bench as EmulatedBench
     from probewise.world import Surface, World
 
-__all__ = [
-    "ARMS",
-    "SCENE",
-    "ArmName",
-    "Telling",
-    "add_geometry",
-    "asker",
-    "emulated_arm",
-    "geometry_of",
-    "in_steps",
-    "open_brick",
-    "open_emulated",
-    "open_nxt",
-    "open_own",
-    "parse_arm",
-    "parse_place",
-    "questioner",
-    "require_choices",
-    "warn_of_clearance",
-    "warn_of_goal",
-]
-
 ARMS = (
     "simulated; emulator, the LEGO arm in software, or emulator:TRUE.toml, built differently from --geometry; "
     "nxt:PORT such as nxt:/dev/rfcomm0 or nxt:COM5; or FILE.py, an instrument of your own"

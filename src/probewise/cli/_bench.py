@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from probewise.recordings import Instrumentation
     from probewise.world import Surface, World
 
-__all__ = ["Bench", "moved", "open_arm", "world_of"]
-
 _SEEN_MM = 0.5  # least offset of the sensor from a mark that a simulated person notices
 _TOUCHES_MM = 0.5  # least gap above the block that a simulated person notices
 

@@ -17,25 +17,6 @@ from typing import Any, NoReturn
 from probewise._kinds import did_you_mean
 from probewise.errors import ProbewiseError
 
-__all__ = [
-    "DEFAULT_SEED",
-    "CommandError",
-    "OneLineParser",
-    "Verb",
-    "a_path",
-    "add_common",
-    "add_count",
-    "add_out_directory",
-    "add_path",
-    "add_quiet",
-    "caution",
-    "keeps",
-    "positive_int",
-    "positive_number",
-    "say",
-    "seed_number",
-]
-
 DEFAULT_SEED = 2013  # year of the paper; printed with every run
 
 

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis
     from probewise.systems import RunTable
 
-__all__ = ["diagnose_simulator"]
-
 _OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next.csv")
 
 

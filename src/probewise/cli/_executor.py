@@ -13,8 +13,6 @@ from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import LinkError
 from probewise.progress import Progress
 
-__all__ = ["add_executor", "campaign_keeps", "campaign_running"]
-
 
 def add_executor(parser: argparse.ArgumentParser) -> None:
     """Add --workers and --scheduler."""

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from probewise._arrays import FloatArray
     from probewise.arm import Instrument, Reading
 
-__all__ = ["Site", "open_site"]
-
 
 @dataclass(frozen=True)
 class Site:

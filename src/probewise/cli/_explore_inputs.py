@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from probewise.inference import Naive
     from probewise.scene import Card
 
-__all__ = ["Inputs", "inputs_of"]
-
 
 @dataclass(frozen=True)
 class Inputs:

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from probewise._arrays import FloatArray
     from probewise.experiment import Exploration, Step
 
-__all__ = ["Pictures"]
-
 
 @dataclass
 class Pictures:

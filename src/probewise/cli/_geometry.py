@@ -11,8 +11,6 @@ from probewise.errors import ParameterError
 from probewise.experiment import Hidden
 from probewise.scene import SHAPES, Card, Field
 
-__all__ = ["parse_cards", "parse_field", "parse_truth"]
-
 
 def parse_field(text: str) -> Field:
     """Parse "WIDTH,HEIGHT" in mm."""

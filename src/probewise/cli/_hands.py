@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from probewise.cli._sheet_watch import SheetWatch
     from probewise.recordings import Plan
 
-__all__ = ["Hands", "is_pty"]
-
 
 class Hands:
     """Pass the requests of `carry_out` to a person; check white and black of a sheet before it is scanned.

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from probewise.recordings import Instrumentation, Recording
     from probewise.scene import Shape
 
-__all__ = ["is_journal", "journal_recording", "journal_sensor", "refuse_journal"]
-
 
 def is_journal(path: Path) -> bool:
     """Return whether a path is a journal, by its name."""

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from probewise.arm import LegoArm
     from probewise.arm.touched import Touched
 
-__all__ = ["Look", "bring"]
-
 STEP_MM = 5.0
 _MOST_MM = 60.0  # largest step
 _HELP = (

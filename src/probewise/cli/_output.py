@@ -21,8 +21,6 @@ from probewise._signals import deferred
 from probewise.cli._stopping import require_going_on
 from probewise.errors import FileError, ParameterError
 
-__all__ = ["Stage", "check_out_directory", "check_out_file", "staged"]
-
 _FOLDER, _COMMIT = ".writing", "commit.json"
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 

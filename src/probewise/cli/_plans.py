@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from probewise.arm import Geometry
     from probewise.recordings import Plan
 
-__all__ = ["commanded", "plan_named", "read_by_lego", "read_by_own"]
-
 
 def plan_named(text: str) -> Plan:
     """Read a plan from its file, or return a shipped one: paper, two_way."""

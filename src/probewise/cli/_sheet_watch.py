@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from probewise._arrays import BoolArray, FloatArray
     from probewise.recordings import Pattern, Plan
 
-__all__ = ["SheetWatch"]
-
 _SEES_MM = 14.0  # radius of the sensor's view
 _LOOK_MM = 25.0  # margin around the plan's places within which a sheet shows its pattern
 _SHARE = 0.05  # least contrast of white and black, as a share of the range of readings

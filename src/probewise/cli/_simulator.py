@@ -13,8 +13,6 @@ from probewise.errors import FileError, ParameterError
 if TYPE_CHECKING:
     from probewise.systems import RunTable, Simulator
 
-__all__ = ["add_simulator", "read_tables", "refuse_beside"]
-
 
 def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead of the light sensor") -> None:
     """Add --simulator FILE.py; the help says what it replaces."""

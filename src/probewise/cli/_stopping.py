@@ -18,8 +18,6 @@ from types import FrameType
 from probewise._signals import ENDING, SAME_S
 from probewise.errors import FileError, LinkError
 
-__all__ = ["Stopped", "require_going_on", "saying_what_is_kept", "stoppable"]
-
 
 class Stopped(KeyboardInterrupt):
     """Raised after a signal, its `number`; the text says what is kept."""

@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     from probewise.cli._bench import Bench
     from probewise.recordings import Plan
 
-__all__ = ["TASKS", "VERB"]
-
 PAPER = "paper"
 MARKS = "marks"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"

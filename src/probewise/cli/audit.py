@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from probewise.diagnosis import PlanAudit
     from probewise.progress import Progress
 
-__all__ = ["VERB"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""

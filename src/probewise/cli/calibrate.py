@@ -11,8 +11,6 @@ from probewise.cli._output import check_out_directory, staged
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
-__all__ = ["VERB"]
-
 MOST_LIVE = 100_000
 """More live points than this take days and all memory."""
 

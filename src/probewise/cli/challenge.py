@@ -11,8 +11,6 @@ from probewise.cli._executor import add_executor, campaign_keeps, campaign_runni
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import saying_what_is_kept
 
-__all__ = ["VERB"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""

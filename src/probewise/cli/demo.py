@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from probewise.report.robot_search import RobotSearch
     from probewise.scene import Circle
 
-__all__ = ["VERB"]
-
 MODELS: tuple[Model, ...] = ("naive", "ssf")
 MODEL_NAMES: dict[Model, str] = {"naive": "naive", "ssf": "SSF"}
 TRUSTS = {"trusting": 1.0, "doubting": 0.9}

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from probewise.recordings import Recording
     from probewise.scene import Shape
 
-__all__ = ["VERB", "generators", "write_results"]
-
 OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next_plan.csv", "next_plan.json")
 
 

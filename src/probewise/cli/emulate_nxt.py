@@ -21,8 +21,6 @@ from probewise.errors import LinkError, ParameterError
 if TYPE_CHECKING:
     from probewise.emulator import Bench, Stand, Trace
 
-__all__ = ["VERB"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""

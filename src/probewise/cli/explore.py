@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from probewise.cli._explore_inputs import Inputs
     from probewise.experiment import Exploration, Journal, Step
 
-__all__ = ["VERB"]
-
 
 class _ShapeNames:
     """Names of all shapes, looked up only when asked for: building the parser must not import numpy."""

@@ -9,8 +9,6 @@ from probewise.cli._common import CommandError, Verb, a_path, add_common, add_ou
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._simulator import add_simulator, read_tables
 
-__all__ = ["VERB"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from probewise.recordings import Plan
     from probewise.world import World
 
-__all__ = ["VERB"]
-
 PLANS = ("paper", "two_way")
 
 

@@ -9,8 +9,6 @@ from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_file
 from probewise.cli._simulator import add_simulator
 
-__all__ = ["VERB"]
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""

@@ -14,8 +14,6 @@ from probewise.errors import ParameterError
 if TYPE_CHECKING:
     from probewise.report.sheets import Sheet
 
-__all__ = ["VERB"]
-
 FIELD, TARGET, MARKS, JIG = "field", "target", "marks", "jig"
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from probewise.study import Row
 
-__all__ = ["VERB"]
-
 _FACTORS = ("population", "model", "utility", "noise", "width", "batch", "learn_sensor", "method", "nested_stop")
 _SIZES = ("small", "plain", "gross")
 

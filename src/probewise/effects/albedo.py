@@ -24,8 +24,6 @@ from probewise.scene.regions import edge_distance
 from probewise.sensor.gaussian import LabGaussian, seen_by_one
 from probewise.sensor.stages import SceneView, Stage
 
-__all__ = ["AlbedoGradient", "AlbedoPatch", "GradedRegion", "PatchedRegion"]
-
 _STEP = 1e-3  # of a standard deviation, for the central difference: its error is a millionth of this
 
 

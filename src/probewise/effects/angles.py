@@ -15,8 +15,6 @@ from probewise.effects.vocabulary import entries, give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["OrientationError", "ScanAngleError"]
-
 
 @dataclass(frozen=True)
 class OrientationError(LinearEffect[Poses]):

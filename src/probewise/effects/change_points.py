@@ -17,8 +17,6 @@ from probewise.effects.vocabulary import Gates, NamedEffect, V
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 
-__all__ = ["ChangePointEffect", "change_point_times"]
-
 _MOST_TIMES = 512
 _FEW = 48  # intervals, enough to detect that something changed in one of them
 

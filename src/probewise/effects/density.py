@@ -9,8 +9,6 @@ from scipy.special import log_ndtr
 
 from probewise._arrays import FloatArray
 
-__all__ = ["log_cell_density", "log_gaussian_density"]
-
 
 def log_gaussian_density(readings: FloatArray, mean: FloatArray, sd: FloatArray) -> FloatArray:
     """Natural log of the normal density, per unit of the reading; the arrays broadcast."""

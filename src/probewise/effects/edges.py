@@ -22,8 +22,6 @@ from probewise.scene.regions import edge_distance
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Footprint, Stage, View
 
-__all__ = ["EdgeBlur", "EdgeShadow", "Halo"]
-
 
 @dataclass(frozen=True)
 class EdgeBlur(LinearEffect[Footprint]):

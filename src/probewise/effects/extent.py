@@ -11,8 +11,6 @@ import numpy as np
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["Extent"]
-
 
 @dataclass(frozen=True, eq=False)
 class Extent:

@@ -16,8 +16,6 @@ from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
-__all__ = ["Dropouts", "Outliers"]
-
 _FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
 
 

@@ -17,8 +17,6 @@ from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["BatterySag", "GainDrift"]
-
 _BATTERY = "battery_mv"
 _REFERENCE_MV = 8000.0
 

@@ -14,8 +14,6 @@ from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["Glint"]
-
 
 @dataclass(frozen=True)
 class Glint(PatchEffect[FloatArray]):

@@ -12,8 +12,6 @@ from scipy.special import erfc
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 
-__all__ = ["SMALLEST_AND_LARGEST", "HeavyTailed", "LogHeavyTailed"]
-
 SMALLEST_AND_LARGEST = (0.05, 25.0)
 """Smallest and largest sd of the mixture, in typical sizes: with a narrower range large effects are misnamed."""
 

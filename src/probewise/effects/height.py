@@ -14,8 +14,6 @@ from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import raised
 from probewise.sensor.stages import Footprint, Stage
 
-__all__ = ["HeightGradient", "HeightOffset"]
-
 _USUAL_MM = 14.0  # the height assumed where a recording gives none
 
 

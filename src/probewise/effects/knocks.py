@@ -15,8 +15,6 @@ from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["ArmKnock", "GainStep"]
-
 
 @dataclass(frozen=True)
 class ArmKnock(ChangePointEffect[Poses]):

@@ -14,8 +14,6 @@ from probewise.priors import Empty, Marginal, Prior, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect
 
-__all__ = ["Estimated", "Informed", "Known"]
-
 V = TypeVar("V")
 
 

@@ -17,8 +17,6 @@ from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
-__all__ = ["Quantisation", "lattice_step", "lattice_step_sd"]
-
 _TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printed values
 _DIGITS = 1e-6  # of a step: below this a difference is rounding
 

@@ -13,8 +13,6 @@ from probewise.effects.heavy_tailed import HeavyTailed
 from probewise.effects.vocabulary import NamedEffect, V
 from probewise.priors import Product
 
-__all__ = ["LinearEffect", "OneScanEffect", "scans_in_words"]
-
 
 class LinearEffect(NamedEffect[V]):
     """Base of effects whose readings change in proportion to each parameter, to first order.

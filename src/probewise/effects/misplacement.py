@@ -16,8 +16,6 @@ from probewise.recordings.patterns import HalfPlane, Ramp, Stripes
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SceneView, Stage
 
-__all__ = ["EdgeMisplacement", "ScanMisplacement"]
-
 
 @dataclass(frozen=True)
 class EdgeMisplacement(LinearEffect[SceneView]):

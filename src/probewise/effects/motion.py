@@ -7,8 +7,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 
-__all__ = ["direction_varies", "in_scans", "mountings", "sign_of_motion"]
-
 
 def sign_of_motion(plan: Plan) -> FloatArray:
     """Sign of the last motion along X, or along Y where X did not move; 0 without motion, (n_points,)."""

@@ -17,8 +17,6 @@ from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
 
-__all__ = ["CorrelatedNoise", "DriftingNoise", "NoisePerRun", "RandomWalk", "SignalDependentNoise"]
-
 
 @dataclass(frozen=True)
 class CorrelatedNoise(NoiseEffect):

@@ -10,8 +10,6 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.effects.density import log_cell_density, log_gaussian_density
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["NoiseRows", "draw_readings", "log_density", "variance"]
-
 _NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
 
 

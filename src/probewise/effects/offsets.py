@@ -16,8 +16,6 @@ from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["AmbientGradient", "AmbientStep", "OffsetDrift"]
-
 
 @dataclass(frozen=True)
 class AmbientGradient(LinearEffect[FloatArray]):

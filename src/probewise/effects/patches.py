@@ -19,8 +19,6 @@ from probewise.effects.vocabulary import NamedEffect, V, entries
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.plan import Plan
 
-__all__ = ["ALONG_X", "PatchEffect", "PatchPrior", "ScanLine", "bell", "scanned_lines"]
-
 _RADII = (0.04, 0.1, 0.25)  # of the line's length, for the bank; the prior reaches twice as far either way
 _MARGIN = 0.1  # of the line's length: a patch may lie beyond its ends
 _STRAIGHT = 0.02  # of a scan's length: the largest deviation from a straight line

@@ -14,8 +14,6 @@ from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["Backlash", "PositionScale"]
-
 
 @dataclass(frozen=True)
 class Backlash(LinearEffect[Poses]):

@@ -11,8 +11,6 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.effects.noise_distribution import log_density, variance
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["PredictiveMixture"]
-
 
 @dataclass(eq=False)
 class PredictiveMixture:

@@ -18,8 +18,6 @@ from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["BentRails", "MissingTooth"]
-
 _UNIT_MM = 10.0
 _MOST_PLACES = 160
 

@@ -18,8 +18,6 @@ from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["Hysteresis", "Lag"]
-
 
 @dataclass(frozen=True)
 class Hysteresis(LinearEffect[FloatArray]):

@@ -17,8 +17,6 @@ from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint, Stage
 
-__all__ = ["Reflection"]
-
 _ANGLES = 8
 
 

@@ -15,8 +15,6 @@ from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["Nonlinearity"]
-
 
 @dataclass(frozen=True)
 class Nonlinearity(NamedEffect[FloatArray]):

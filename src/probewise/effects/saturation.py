@@ -16,8 +16,6 @@ from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
-__all__ = ["Saturation"]
-
 
 @dataclass(frozen=True)
 class Saturation(NamedEffect[FloatArray]):

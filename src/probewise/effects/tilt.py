@@ -12,8 +12,6 @@ from probewise.effects.vocabulary import give_or_take
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["SensorTilt"]
-
 
 @dataclass(frozen=True)
 class SensorTilt(LinearEffect[Poses]):

@@ -17,8 +17,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseLevel
 
-__all__ = ["Gates", "NamedEffect", "NoiseEffect", "V", "entries", "give_or_take"]
-
 V = TypeVar("V")
 
 

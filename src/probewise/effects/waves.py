@@ -16,8 +16,6 @@ from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-__all__ = ["Flicker", "PeriodicPositionError", "StickSlip"]
-
 # Two full turns: every phase has an equivalent far from both ends.
 _PHASE = Uniform(-2 * np.pi, 2 * np.pi)
 _MOST_FREQUENCIES = 1024

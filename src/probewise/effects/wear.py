@@ -15,8 +15,6 @@ from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import raised
 from probewise.sensor.stages import Footprint, Poses, Stage
 
-__all__ = ["SlowSinking", "SlowTurn"]
-
 
 @dataclass(frozen=True)
 class SlowTurn(LinearEffect[Poses]):

@@ -9,8 +9,6 @@ from probewise.priors import Prior
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, Stage
 
-__all__ = ["Wrapped"]
-
 V = TypeVar("V")
 
 

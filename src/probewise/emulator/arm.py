@@ -9,8 +9,6 @@ from typing import Self
 from probewise.emulator.geometry import Geometry, JointNumbers
 from probewise.emulator.motor import Motor, MotorNature
 
-__all__ = ["EmulatedArm", "Joint", "Stand"]
-
 _BEYOND_LIMITS_DEG = 3.0  # a joint's mechanical stops lie this far outside the file's limits
 
 

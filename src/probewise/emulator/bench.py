@@ -18,8 +18,6 @@ from probewise.emulator.sensors import Light, NothingAnalog, sonar
 from probewise.emulator.table import Table
 from probewise.world import Surface, World
 
-__all__ = ["Bench", "set_up"]
-
 _WALL_CM = 42
 
 

@@ -16,8 +16,6 @@ from probewise.emulator.protocol import Refused, Request, Status, parse, reply
 from probewise.emulator.sensors import NothingAnalog
 from probewise.errors import ParameterError
 
-__all__ = ["ADDRESS", "SLEEP_MIN", "Battery", "Brick"]
-
 ADDRESS = bytes.fromhex("0016530A0B0C")
 SLEEP_MIN = (0, 2, 5, 10, 30, 60)
 """The sleep times of the brick's menu, in minutes; 0 is never."""

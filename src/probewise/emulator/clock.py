@@ -7,8 +7,6 @@ from typing import TypeAlias
 
 from probewise.errors import ParameterError
 
-__all__ = ["Clock", "VirtualClock"]
-
 Clock: TypeAlias = Callable[[], float]
 """Seconds since any fixed moment; `time.monotonic` is one."""
 

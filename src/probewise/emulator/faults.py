@@ -8,8 +8,6 @@ from typing import Self
 
 from probewise.errors import ParameterError
 
-__all__ = ["Faults"]
-
 
 @dataclass(frozen=True)
 class Faults:

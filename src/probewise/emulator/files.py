@@ -9,8 +9,6 @@ from fnmatch import fnmatchcase
 
 from probewise.emulator.protocol import Refused, Status
 
-__all__ = ["Files"]
-
 _N_HANDLES = 16
 _NAME = 20
 _LONGEST_READ = 122  # what fits a Bluetooth message of 128 bytes

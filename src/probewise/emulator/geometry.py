@@ -15,8 +15,6 @@ from typing import Any
 from probewise.errors import FileError, shown
 from probewise.recordings import read_text
 
-__all__ = ["Geometry", "JointNumbers", "read_geometry", "shipped_geometry"]
-
 LARGEST = 1e6
 
 

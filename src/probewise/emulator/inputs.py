@@ -11,8 +11,6 @@ from probewise.emulator.clock import Clock
 from probewise.emulator.protocol import Refused, Status
 from probewise.emulator.sensors import AD_MAX, Analog, Digital, NothingAnalog
 
-__all__ = ["Inputs", "Sensor"]
-
 Sensor: TypeAlias = Analog | Digital
 
 _NONE, _LIGHT_ON, _LIGHT_OFF, _SOUND, _DIGITAL = 0x00, 0x05, 0x06, (0x07, 0x08), (0x0A, 0x0B)

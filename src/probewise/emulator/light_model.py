@@ -12,8 +12,6 @@ from probewise.emulator.clock import Clock
 from probewise.emulator.table import Table
 from probewise.world import World
 
-__all__ = ["LightModel"]
-
 _BRIGHTEST_MM = 8.0  # closer than this the divider between LED and photodiode shades the surface
 _SAME_STAND_MM = 1.0
 _CUT_OFF = 0.5

@@ -6,8 +6,6 @@ from probewise.emulator.clock import VirtualClock
 from probewise.emulator.radio import Radio
 from probewise.errors import LinkError
 
-__all__ = ["VirtualLine"]
-
 
 class VirtualLine:
     """A serial line that advances the virtual clock instead of waiting.

@@ -10,8 +10,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-__all__ = ["Motor", "MotorNature"]
-
 
 @dataclass(frozen=True)
 class MotorNature:

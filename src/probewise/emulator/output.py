@@ -17,8 +17,6 @@ from enum import IntEnum
 from probewise.emulator.motor import Motor
 from probewise.emulator.protocol import FieldValue
 
-__all__ = ["Output", "OutputSetting", "RunState", "bounded", "quotient"]
-
 _ON, _BRAKE, _REGULATED = 0x01, 0x02, 0x04  # bits of the mode byte
 _SPEED, _SYNC = 0x01, 0x02  # bits of the regulation byte
 _REGULATION_MS = 100

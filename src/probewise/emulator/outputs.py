@@ -10,8 +10,6 @@ from probewise.emulator.motor import Motor
 from probewise.emulator.output import Output, OutputSetting, RunState, bounded, quotient
 from probewise.emulator.protocol import Refused, Status
 
-__all__ = ["Outputs"]
-
 _ALL = 0xFF
 _TICK_S = 1e-3
 _WATCHED_TICKS = 10

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 
 from probewise.emulator.protocol import Refused, Status
 
-__all__ = ["Programs"]
-
 _N_BOXES = 20
 _ANSWERS = 10  # a program's outbox n is the host's box n + 10
 _DEPTH = 5

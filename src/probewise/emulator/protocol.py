@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TypeAlias
 
-__all__ = ["COMMANDS", "Command", "FieldValue", "Frames", "Refused", "Request", "Status", "framed", "parse", "reply"]
-
 FieldValue: TypeAlias = int | bytes
 
 _REPLY, _NO_REPLY = 0x02, 0x80

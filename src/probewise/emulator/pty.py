@@ -14,8 +14,6 @@ from probewise.emulator.clock import Clock
 from probewise.emulator.radio import Radio
 from probewise.errors import FileError
 
-__all__ = ["Terminal", "serve"]
-
 _LONGEST_WAIT_S = 0.05
 
 

@@ -18,8 +18,6 @@ from probewise.emulator.clock import Clock
 from probewise.emulator.faults import Faults
 from probewise.emulator.protocol import COMMANDS, Frames, Status, framed, parse, reply
 
-__all__ = ["Event", "Radio", "Trace", "no_trace"]
-
 Event: TypeAlias = Literal[">", "<", "!"]
 Trace: TypeAlias = Callable[[float, Event, str], None]
 """Called with the time in s, the event (> telegram to the brick, < telegram from it, ! fault) and its text."""

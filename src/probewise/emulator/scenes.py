@@ -9,8 +9,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Uniform
 from probewise.world import Oval, Surface
 
-__all__ = ["FORMS", "parse_scene", "scene_text"]
-
 FORMS = (
     "[circle:]X,Y,RADIUS",
     "ellipse:X,Y,A,B,ANGLE",

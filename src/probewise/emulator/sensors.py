@@ -8,8 +8,6 @@ from typing import Protocol
 
 from probewise.emulator.clock import Clock
 
-__all__ = ["Analog", "Digital", "Light", "NothingAnalog", "sonar"]
-
 AD_MAX = 1023
 
 

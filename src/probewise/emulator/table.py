@@ -9,8 +9,6 @@ from probewise.emulator.scenes import FORMS, parse_scene
 from probewise.errors import ParameterError
 from probewise.world import Surface
 
-__all__ = ["Table"]
-
 
 @dataclass
 class Table:

@@ -16,8 +16,6 @@ from probewise.priors import Joint, Marginal, Prior, Product
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["GaussianInferred", "GaussianKnown"]
-
 _LOG_2PI = math.log(2 * math.pi)
 
 

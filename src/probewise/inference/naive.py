@@ -17,8 +17,6 @@ from probewise._kinds import require_number
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 
-__all__ = ["Naive"]
-
 
 @dataclass(frozen=True)
 class Naive:

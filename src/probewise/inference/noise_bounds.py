@@ -11,8 +11,6 @@ from probewise.effects import lattice_step
 from probewise.inference.student_t import StudentT
 from probewise.recordings.plan import Recording
 
-__all__ = ["reading_span", "sd_ceiling", "sd_floor", "student_t"]
-
 
 def reading_span(recording: Recording) -> float:
     """Range of the usable readings; if they are all equal, the declared range, or else 1."""

@@ -14,8 +14,6 @@ from probewise.priors import Prior, require_prior
 from probewise.recordings.plan import Recording, require_recording
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["Likelihood", "Problem", "SensorProblem", "require_likelihood", "require_model"]
-
 _MOST_NUMBERS = 1_000_000  # predicted at a time, to bound memory
 
 

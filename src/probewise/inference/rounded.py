@@ -14,8 +14,6 @@ from probewise._kinds import require_number
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 
-__all__ = ["Rounded"]
-
 _FAR = 200.0  # sds from the prediction that the table covers
 _PER_SD = 50.0  # table entries per sd: linear interpolation errs by less than 1e-4
 

@@ -20,8 +20,6 @@ from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
 from probewise.errors import ParameterError, ShapeError
 from probewise.inference._residuals import residuals
 
-__all__ = ["PooledSigma", "StudentT", "log_sigma_integral"]
-
 _LOG_2PI = math.log(2 * math.pi)
 _TINY = 1e-250
 _N_TERMS = 100

@@ -12,8 +12,6 @@ from probewise._signals import deferred
 from probewise.errors import FileError
 from probewise.recordings.locking import remove_abandoned, try_lock
 
-__all__ = ["write_bytes_atomically", "write_text_atomically"]
-
 _SUFFIX = ".part"
 
 

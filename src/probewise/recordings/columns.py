@@ -16,20 +16,6 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.patterns import PATTERNS, Pattern
 from probewise.recordings.table import MISSING
 
-__all__ = [
-    "Table",
-    "column",
-    "columns_of",
-    "covariates_of",
-    "named_patterns",
-    "pattern_codes",
-    "require_patterns",
-    "scan_codes",
-    "seconds",
-    "undescribed",
-    "with_missing",
-]
-
 _A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
 _THE_ONLY = "pattern"  # name of a single pattern that was given without one
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")

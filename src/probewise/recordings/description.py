@@ -29,8 +29,6 @@ from probewise.recordings.strict_json import json_of
 from probewise.recordings.table import LARGEST
 from probewise.recordings.text import read_text
 
-__all__ = ["Description", "degrees_of", "description_text", "read_description"]
-
 FORMAT = "recording/1"
 _CONTROLS = ("orientation_deg", "height_mm", "led", "speed")
 

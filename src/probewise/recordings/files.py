@@ -22,8 +22,6 @@ from probewise.recordings.patterns import Image
 from probewise.recordings.plan import Plan, Recording, range_text, require_plan, require_recording
 from probewise.recordings.table import LARGEST, MISSING, Table, count_numbers, csv_text, number_text, read_table
 
-__all__ = ["plan_columns", "read_plan", "read_plan_and_readings", "read_recording", "write_plan", "write_recording"]
-
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
 _A_NAME = "a printable text without blanks around it"

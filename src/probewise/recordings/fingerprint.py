@@ -11,8 +11,6 @@ from probewise.recordings.patterns import Image
 from probewise.recordings.plan import Recording
 from probewise.recordings.table import csv_text, number_text
 
-__all__ = ["fingerprint"]
-
 
 def fingerprint(recording: Recording) -> str:
     """Hash a recording's content: SHA-256, hexadecimal, of its files in a normal form.

@@ -16,8 +16,6 @@ from probewise._arrays import FloatArray
 from probewise.errors import FileError, ParameterError
 from probewise.recordings.text import read_bytes
 
-__all__ = ["image_bytes", "read_image"]
-
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by PNG colour type
 _ALLOWED = "a PNG of 8 bits per channel (grey, RGB, palette, with or without alpha), not interlaced, or .npy"

@@ -12,8 +12,6 @@ from pathlib import Path
 
 from probewise.errors import FileError
 
-__all__ = ["locked", "remove_abandoned", "try_lock"]
-
 _BUSY = {errno.EACCES, errno.EAGAIN, errno.EDEADLK, errno.EWOULDBLOCK}
 _BEHIND = 1 << 20  # Windows locks bytes against reading too: lock one far beyond the process id
 _RETRY_S = 0.05

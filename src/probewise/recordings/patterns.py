@@ -17,8 +17,6 @@ from probewise._arrays import FloatArray, floats
 from probewise._kinds import require_finite_number, require_pair
 from probewise.errors import ParameterError
 
-__all__ = ["PATTERNS", "Disc", "HalfPlane", "Image", "Pattern", "Polygon", "Quadrant", "Ramp", "Stripes", "Uniform"]
-
 
 class _Checked:
     """Base of the patterns: converts numbers to floats and pairs to tuples, and refuses everything else."""

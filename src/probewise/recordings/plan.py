@@ -31,16 +31,6 @@ from probewise.recordings.columns import (
 )
 from probewise.recordings.patterns import Pattern
 
-__all__ = [
-    "Instrumentation",
-    "Plan",
-    "Recording",
-    "range_text",
-    "require_described",
-    "require_plan",
-    "require_recording",
-]
-
 
 @dataclass(frozen=True)
 class Instrumentation:

@@ -13,8 +13,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Quadrant, Uniform
 from probewise.recordings.plan import Instrumentation, Plan
 
-__all__ = ["jittered", "paper_plan", "two_way_plan"]
-
 LEGO = Instrumentation(
     unit="LEGO",
     min=0.0,

@@ -16,8 +16,6 @@ from probewise.recordings.files import plan_columns
 from probewise.recordings.plan import Plan
 from probewise.recordings.table import csv_text, number_text, read_table
 
-__all__ = ["Prediction", "prediction_summary", "read_prediction", "write_prediction"]
-
 
 @dataclass(frozen=True, eq=False)
 class Prediction(ShowsItself):

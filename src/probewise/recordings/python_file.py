@@ -14,8 +14,6 @@ from probewise._kinds import require_path
 from probewise.errors import FileError, shortened
 from probewise.recordings.text import read_text
 
-__all__ = ["briefly", "run_python_file", "run_python_text"]
-
 _LONGEST = 200
 
 

@@ -7,8 +7,6 @@ from pathlib import Path
 
 from probewise.errors import ParameterError
 
-__all__ = ["SHIPPED", "shipped"]
-
 SHIPPED = ("paper", "concealed")
 
 

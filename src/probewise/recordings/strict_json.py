@@ -9,8 +9,6 @@ from typing import Any
 
 from probewise.errors import FileError, shown
 
-__all__ = ["json_of", "strict_json"]
-
 _MOST_DIGITS = 400  # more digits than any finite float has before the point
 
 

@@ -19,8 +19,6 @@ from probewise.errors import FileError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.text import read_text
 
-__all__ = ["LARGEST", "MISSING", "Table", "count_numbers", "csv_text", "number_text", "read_table"]
-
 LARGEST = 1e15
 """Largest magnitude of a number in a file: beyond, squares and differences lose all precision."""
 

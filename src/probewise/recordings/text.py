@@ -7,8 +7,6 @@ from pathlib import Path
 
 from probewise.errors import FileError, PipeWarning
 
-__all__ = ["read_bytes", "read_text"]
-
 
 def read_bytes(path: Path, what: str) -> bytes:
     """Read a whole file.

@@ -6,8 +6,6 @@ import math
 
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
 
-__all__ = ["where_white"]
-
 _SIDES = {
     0: "on the right, x > {:g} mm",
     1: "on top, y > {:g} mm",

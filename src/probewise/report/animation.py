@@ -10,8 +10,6 @@ from PIL import Image
 
 from probewise.errors import ParameterError
 
-__all__ = ["gif"]
-
 
 def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -> bytes:
     """Join PNGs into a GIF that loops for ever.

@@ -13,8 +13,6 @@ from probewise.report.plots import AxesGrid, audit_matrix, png
 from probewise.report.terms import explained, terms_of
 from probewise.report.words import count, number, readable
 
-__all__ = ["answer", "figures", "picture", "write_page"]
-
 _CURED_BY = "The fewest extra readings that would help"
 
 

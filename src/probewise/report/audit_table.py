@@ -9,8 +9,6 @@ from probewise.effects import spoken_name
 from probewise.report.html import Markup, table
 from probewise.report.words import number, unit_name
 
-__all__ = ["audit_table"]
-
 _SIZES = {
     "albedo": "change of albedo",
     "amp": "amplitude",

@@ -21,8 +21,6 @@ from probewise.report.plots import (
 )
 from probewise.report.words import count, number, readable, signed, unit_name, with_error, within, without_unit
 
-__all__ = ["answer", "evidence_table", "figures", "parameter_table", "sections", "ssf_table", "write_page"]
-
 
 def answer(sensor: FittedSensor) -> str:
     """Say in one sentence what the calibration found."""

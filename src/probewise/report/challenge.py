@@ -17,8 +17,6 @@ from probewise.report.plots import confusion_matrix, png, reliability_diagram
 from probewise.report.terms import explained, terms_of
 from probewise.report.words import count, readable
 
-__all__ = ["answer", "table_csv", "table_of_rows", "write_page"]
-
 Results = Sequence[Mapping[str, Any]]
 
 _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}

@@ -10,8 +10,6 @@ from probewise.report.plots.concealed import row_name
 from probewise.report.words import count
 from probewise.study import ConcealedRow
 
-__all__ = ["answer", "write_page"]
-
 
 def answer(rows: Sequence[ConcealedRow]) -> str:
     """Summarise in one sentence how many runs ended sure and wrong, with doubt and without."""

@@ -9,17 +9,6 @@ from probewise.diagnosis import Diagnosis, Place
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.report.words import unit_name
 
-__all__ = [
-    "category_names",
-    "covariate_label",
-    "covariate_unit",
-    "covariate_values",
-    "covariate_words",
-    "family_words",
-    "label_of",
-    "words_and_unit",
-]
-
 UNITS = {"place": "mm", "time": "s", "orientation": "degree", "edge_distance": "mm"}
 SUFFIXES = {"mv": "mV", "v": "V", "mm": "mm", "s": "s", "deg": "degree", "c": "°C", "k": "K", "percent": "%"}
 """Units by the last part of a user's column name, such as battery_mv."""

@@ -16,8 +16,6 @@ from probewise.report.residual_means import Means, mean_residuals
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
-__all__ = ["CovariateView", "ResidualNoise", "along_scan", "is_line", "of_place", "seen_first", "telling"]
-
 _SEEN = 2.3  # sds beyond which a mean visibly leaves the band
 _N_SAMPLES = 200  # posterior samples for the variance that the fit absorbs
 _ASTRAY = 0.01  # largest deviation of a scan from its line, as a share of its length

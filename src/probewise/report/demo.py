@@ -45,18 +45,6 @@ from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import side_by_side
 from probewise.report.words import count, number, readable
 
-__all__ = [
-    "answer",
-    "answers",
-    "comparison_lines",
-    "comparison_rows",
-    "comparison_table",
-    "diagnosis_figures",
-    "equal_start",
-    "figures",
-    "write_page",
-]
-
 FIRST = 3  # as in the paper's figure
 HEADER = (
     "sensor model",

@@ -32,8 +32,6 @@ from probewise.report.plots.residuals import AFTER, BEFORE
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
-__all__ = ["changed_most", "figures", "shown_first"]
-
 _WORTH_A_BAR = 0.005
 _MOST_BARS = 6
 _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readings' value counts as lost

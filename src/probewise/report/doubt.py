@@ -14,8 +14,6 @@ from probewise.report.plots import PAGE_IN, belief_in_the_sensor, explain_field,
 from probewise.report.robot_search import RobotSearch
 from probewise.report.words import count, number
 
-__all__ = ["SATURATION", "answer", "figures", "section"]
-
 SATURATION = 40.0
 """Reading at which the concealed effect of the demo, saturation, sets in; the model expects 60 over white."""
 

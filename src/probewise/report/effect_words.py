@@ -7,8 +7,6 @@ from types import MappingProxyType
 
 from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, public_name, spoken_name
 
-__all__ = ["EFFECTS_IN_WORDS", "FORMS_IN_WORDS", "effect_in_words", "hypothesis_in_words", "is_in_words", "listed"]
-
 EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
     {name: effect.words for name, effect in {**EFFECTS, **NUISANCES}.items()}
     | {"ssf_order": "a finer sensitivity function"}

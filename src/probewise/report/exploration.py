@@ -23,18 +23,6 @@ from probewise.report.plots import (
 from probewise.report.words import count, interval, number, probability, unit_name, unit_of, with_error, without_unit
 from probewise.scene import outlines
 
-__all__ = [
-    "answer",
-    "errors_text",
-    "frame",
-    "frame_of_both",
-    "live_page",
-    "shape_table",
-    "steps_table",
-    "view",
-    "write_page",
-]
-
 MODEL_NAMES = {"ssf": "SSF"}
 _LEAST_SHOWN = 1e-3  # probability of an effect, to be listed in the table
 _MOST_SHOWN = 6

@@ -14,8 +14,6 @@ from probewise.report.plots import predicted_and_recorded, residual_clouds, svg
 from probewise.report.words import number, readable, unit_name
 from probewise.systems import RunTable
 
-__all__ = ["answer", "figures", "write_page"]
-
 _MOST_COLUMNS = 6
 _LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 

@@ -12,8 +12,6 @@ from probewise.report.covariate import words_and_unit
 from probewise.report.effect_words import effect_in_words, hypothesis_in_words, listed
 from probewise.report.words import count
 
-__all__ = ["MOST_WORDS", "headline"]
-
 MOST_WORDS = 20
 _SURE = 0.5
 _RIVAL = 0.1  # probability from which a hypothesis is named as a rival

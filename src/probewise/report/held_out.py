@@ -8,8 +8,6 @@ from probewise._arrays import IntArray
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 
-__all__ = ["most_gained"]
-
 
 def most_gained(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
     """Return the held-out part with the largest gain: name, gain in nats per reading, row numbers, (n_rows,).

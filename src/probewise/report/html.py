@@ -10,19 +10,6 @@ from dataclasses import dataclass
 
 from PIL import Image
 
-__all__ = [
-    "Markup",
-    "Section",
-    "definition_list",
-    "element",
-    "figure",
-    "fragment",
-    "page",
-    "paragraph",
-    "slideshow",
-    "table",
-]
-
 _FEWEST_LISTED = 4  # sections from which on a page has a list of contents
 _CSS_DPI = 96.0
 _MOST_COLUMNS = 3  # of a table that fits a narrow screen

@@ -15,8 +15,6 @@ from probewise.report.plots import beliefs_by_round, png
 from probewise.report.terms import explained, terms_of
 from probewise.report.words import count, probability, readable
 
-__all__ = ["answer", "believed", "believed_picture", "write_page"]
-
 _MOST_TOLD = 4
 _LEAST_TOLD = 0.005
 

@@ -14,8 +14,6 @@ from probewise.report.plots import playing_field
 from probewise.report.words import count
 from probewise.scene import outlines
 
-__all__ = ["fine_map", "paper_view", "window_mm"]
-
 _FINER = 2  # times as many places per side as the robot's grid, which is coarser than an edge is wide
 _MARGIN_MM = 30.0
 _OUTLINE = 0.45

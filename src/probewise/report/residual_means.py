@@ -10,8 +10,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["Means", "mean_residuals"]
-
 _STEPS = 24
 _MOST_STEPS = 60
 _LEAST_ROWS = 4

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from probewise._arrays import FloatArray
 from probewise.experiment import Exploration
 
-__all__ = ["RobotSearch"]
-
 
 @dataclass(frozen=True, eq=False)
 class RobotSearch:

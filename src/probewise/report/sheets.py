@@ -17,18 +17,6 @@ from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polyg
 from probewise.recordings.plan import Plan
 from probewise.recordings.where_white import where_white
 
-__all__ = [
-    "PAPERS_MM",
-    "Sheet",
-    "Tile",
-    "field_sheet",
-    "jig_sheets",
-    "marks_sheet",
-    "plan_sheets",
-    "target_sheet",
-    "tiles_of",
-]
-
 PAPERS_MM: Mapping[str, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 """Width and height of the papers, upright."""
 

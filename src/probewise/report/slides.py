@@ -8,8 +8,6 @@ from itertools import zip_longest
 
 from PIL import Image
 
-__all__ = ["side_by_side"]
-
 _COLOURS = 256
 
 

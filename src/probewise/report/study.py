@@ -15,8 +15,6 @@ from probewise.report.plots import png, readings_needed, widths_of_runs
 from probewise.report.words import count, number, with_error
 from probewise.study import LEAST_FOR_MEDIAN, REFERENCE, Estimate, Row, Study, Summary, experiment_of
 
-__all__ = ["answer", "table_csv", "table_of_bounds", "table_of_rows", "write_page"]
-
 _COLUMNS: tuple[tuple[str, str], ...] = (
     ("reached", "share that reached the precision, 95 % interval"),
     ("mean", "mean readings, standard error (a miss counted as the limit)"),

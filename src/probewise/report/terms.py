@@ -10,8 +10,6 @@ from types import MappingProxyType
 
 from probewise.report.html import Markup, Section, element, paragraph
 
-__all__ = ["TERMS", "explained", "terms_of"]
-
 TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "residual": (r"(?i)\bresiduals?\b", "recorded minus predicted reading"),

@@ -5,20 +5,6 @@ from __future__ import annotations
 import math
 import re
 
-__all__ = [
-    "count",
-    "interval",
-    "number",
-    "probability",
-    "readable",
-    "signed",
-    "unit_name",
-    "unit_of",
-    "with_error",
-    "within",
-    "without_unit",
-]
-
 _UNITS = {"mm": "mm", "rad": "rad", "deg": "°", "s": "s", "counts": "counts", "mv": "mV", "v": "V"}
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 

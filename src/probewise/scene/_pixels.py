@@ -6,8 +6,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 
-__all__ = ["share_behind_edge", "share_in_edges"]
-
 
 def share_behind_edge(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
     """Share of a square on the positive side of a straight edge.

@@ -9,8 +9,6 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_like
 from probewise.priors import Prior
 
-__all__ = ["Region", "Scene", "Shape", "require_shape"]
-
 
 class Region(Protocol):
     """An albedo field for each hypothesis: `n_regions` of them, 1 where all share one.

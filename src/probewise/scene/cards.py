@@ -16,8 +16,6 @@ from probewise.scene.albedo import Region
 from probewise.scene.regions import PolygonRegion, edge_distance, outlines
 from probewise.scene.scenes import HypothesisScene, SameForAll
 
-__all__ = ["Card", "CardedRegion", "CardedScene", "laid_over"]
-
 
 @dataclass(frozen=True)
 class Card:

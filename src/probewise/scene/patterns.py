@@ -19,8 +19,6 @@ from probewise.scene.regions import (
     disc_region,
 )
 
-__all__ = ["region_of"]
-
 
 def region_of(pattern: Pattern) -> Region:
     """Build the region that a pattern of a recording describes (n_regions is 1).

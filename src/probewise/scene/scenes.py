@@ -15,8 +15,6 @@ from probewise.recordings.patterns import Pattern
 from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.patterns import region_of
 
-__all__ = ["HypothesisScene", "KnownScene", "SameForAll"]
-
 
 @dataclass(frozen=True)
 class KnownScene:

@@ -19,8 +19,6 @@ from probewise.priors import Prior, Product, Uniform
 from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.regions import EllipseRegion, MixtureOfRegions, PolygonRegion, UniformRegion, disc_region
 
-__all__ = ["SHAPES", "AnyOf", "Circle", "Ellipse", "Field", "Placed", "Rectangle", "RegularPolygon"]
-
 Bounds = tuple[float, float]
 
 

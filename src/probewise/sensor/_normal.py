@@ -9,8 +9,6 @@ from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
 
-__all__ = ["CENTRE", "PER_SD", "normal_cdf", "normal_cdf_in_place"]
-
 _LIMIT = 8.5  # standard deviations: beyond, the cumulative is 0 or 1 within 1e-17
 _CELLS = 2**13
 PER_SD = _CELLS / (2 * _LIMIT)  # cells of the table per standard deviation

@@ -12,8 +12,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 
-__all__ = ["N_BENDS", "N_FREE_FORM", "bends_of", "free_form", "is_free_form"]
-
 
 def _rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
     """Return places (n, 2) and widths (n,); each ring is (radius, number, width, rotation in steps)."""

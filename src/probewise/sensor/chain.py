@@ -32,17 +32,6 @@ from probewise.sensor.stages import (
 )
 from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
 
-__all__ = [
-    "Chain",
-    "FixedLevels",
-    "FreeLevels",
-    "Levels",
-    "region_named",
-    "require_levels",
-    "require_scene",
-    "response",
-]
-
 _MANY = 8  # Gaussians, from which on it pays to look for hypotheses that share their geometry
 _MOST_NUMBERS = 2_000_000  # held in memory at once of footprints that differ between readings
 _SAME = 1e-9  # mm and mm^2: smaller differences are rounding

@@ -14,8 +14,6 @@ from probewise._arrays import FloatArray
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint
 
-__all__ = ["COMMANDED", "height_ratio", "is_commanded", "led_state", "raised", "raised_as_commanded"]
-
 COMMANDED = ("height_mm", "led")
 
 

@@ -15,8 +15,6 @@ from probewise.scene.albedo import Region
 from probewise.sensor.ssf import SSFField
 from probewise.sensor.stages import Poses
 
-__all__ = ["seen_discrete"]
-
 _PIXELS_AT_ONCE = 2**16
 
 

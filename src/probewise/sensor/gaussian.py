@@ -33,17 +33,6 @@ from probewise.scene.regions import (
 )
 from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_in_place
 
-__all__ = [
-    "ACCURATE_NODES",
-    "FAST_NODES",
-    "LabGaussian",
-    "beyond_corner",
-    "mass_in_quadrant",
-    "seen",
-    "seen_by_one",
-    "turned",
-]
-
 ACCURATE_NODES = 64
 FAST_NODES = 20
 

@@ -12,8 +12,6 @@ from probewise.scene.albedo import Scene
 from probewise.sensor.chain import Levels, region_named, require_levels, require_scene
 from probewise.sensor.stages import require_columns
 
-__all__ = ["NaiveSensor"]
-
 
 @dataclass(frozen=True)
 class NaiveSensor:

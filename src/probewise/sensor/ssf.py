@@ -15,20 +15,6 @@ from probewise._kinds import require_whole
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor.stages import Footprint
 
-__all__ = [
-    "DiscreteSSF",
-    "FixedMixture",
-    "FreeMixture",
-    "SSFField",
-    "SSFModel",
-    "field_of",
-    "footprint_of",
-    "mean_mixture",
-    "mixture_names",
-    "mixture_of_field",
-    "total_variation",
-]
-
 _REACH = 6.5  # sds: beyond, a Gaussian's density is below 1e-9 of its peak
 _NEGLIGIBLE = 1e-9  # share of a field's light that is not drawn
 

@@ -20,18 +20,6 @@ from probewise.priors import Prior
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 
-__all__ = [
-    "Effect",
-    "Footprint",
-    "NoiseLevel",
-    "Poses",
-    "SceneView",
-    "SensorModel",
-    "Stage",
-    "View",
-    "require_columns",
-]
-
 
 class Stage(IntEnum):
     """The stage of the chain at which an effect acts."""

@@ -17,8 +17,6 @@ from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf_in_place
 from probewise.sensor.gaussian import LabGaussian, beyond_corner, mass_in_quadrant, turned
 from probewise.sensor.stages import Footprint, Poses
 
-__all__ = ["StraightCorners", "StraightEdges", "columns_of"]
-
 _BLOCK = 2**14  # elements at a time: they fit the cache
 _FEW_ANGLES = 16  # up to so many, a product with a mostly zero matrix is cheaper than indexing columns
 _SAME_ANGLE, _SAME_MM = 1e-12, 1e-10  # smaller differences of angles (radians) and places are rounding

@@ -10,8 +10,6 @@ from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.world.painting import Covered, Oval, Surface
 
-__all__ = ["across_edge", "edge_distance"]
-
 _N_RIM = 720  # points on an oval's outline among which the nearest is searched
 
 

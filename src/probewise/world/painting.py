@@ -22,8 +22,6 @@ from probewise.recordings.patterns import (
     Uniform,
 )
 
-__all__ = ["Covered", "Oval", "Surface", "paint"]
-
 
 @dataclass(frozen=True)
 class Oval:

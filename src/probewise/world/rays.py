@@ -14,8 +14,6 @@ from probewise.world.edges import edge_distance
 from probewise.world.painting import Surface, paint
 from probewise.world.spots import Spot
 
-__all__ = ["Retouch", "seen_white"]
-
 Retouch: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """(albedo, x_mm, y_mm), places in the lab frame, to changed albedo; arrays of one shape."""
 

@@ -10,8 +10,6 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.recordings.plan import Plan
 
-__all__ = ["Rows"]
-
 
 @dataclass(frozen=True, eq=False)
 class Rows:

@@ -30,8 +30,6 @@ from probewise.world.concealed import (
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
-__all__ = ["BLACK", "BLOB", "CANDIDATES", "NOISE_SD", "SEEDS", "WHITE", "main", "make", "truth"]
-
 BLOB = Blob(share=1.0, center_mm=(0.0, 1.5), sd_mm=(4.0, 2.5), correlation=0.15)
 """The true SSF of both recordings: one Gaussian, shifted towards the photodiode and wider along x'."""
 

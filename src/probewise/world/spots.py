@@ -12,8 +12,6 @@ from scipy.ndimage import gaussian_filter
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["Blob", "Spot", "blurred", "gaussian_spot", "raster_spot", "ridge_spot", "ring_spot", "tailed_spot"]
-
 Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 

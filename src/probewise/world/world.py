@@ -28,8 +28,6 @@ from probewise.world.rays import seen_white
 from probewise.world.rows import Rows
 from probewise.world.spots import Spot
 
-__all__ = ["Look", "World", "simulate"]
-
 _Surfaces = Sequence[tuple[Surface, IntArray]]
 """Each surface with the rows read over it."""
 

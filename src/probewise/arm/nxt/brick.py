@@ -27,8 +27,6 @@ from probewise.arm.nxt.telegram import (
 )
 from probewise.errors import LinkError, LowBatteryWarning
 
-__all__ = ["LOW_MV", "Brick"]
-
 LOW_MV = 6000
 """Voltage below which six cells are nearly empty: motors slow down, and the brick soon switches itself off."""
 

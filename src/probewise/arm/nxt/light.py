@@ -12,8 +12,6 @@ from probewise.arm.nxt.telegram import GetInputValues, InputValues, Mode, Sensor
 from probewise.arm.nxt.wire import TelegramError
 from probewise.errors import LinkError, ParameterError
 
-__all__ = ["Light", "LightReading", "SensorError", "normalized_of"]
-
 AD_MAX = 1023
 N_INVALID = 3  # least number of attempts, since one may use up the allowed time on a slow connection
 _BRIGHT_COUNTS = 200  # 800 mV of 5000 mV in the firmware's integer arithmetic: 5 V is 1023 counts

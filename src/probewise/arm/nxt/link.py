@@ -29,8 +29,6 @@ from probewise.arm.nxt.telegram import (
 from probewise.arm.nxt.wire import Answer, TelegramError
 from probewise.errors import LinkError, ParameterError
 
-__all__ = ["ByteStream", "Link", "NoAnswerError", "Timing"]
-
 A = TypeVar("A", bound=Answer)
 
 FENCES: tuple[Request[Answer], ...] = (GetBatteryLevel(), GetFirmwareVersion(), KeepAlive())

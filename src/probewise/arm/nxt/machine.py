@@ -14,8 +14,6 @@ from probewise.arm.limits import SoftLimits
 from probewise.arm.nxt.brick import Brick
 from probewise.arm.nxt.motor import Motor
 
-__all__ = ["BrickMachine"]
-
 
 class BrickMachine:
     """A brick wired as in the arm's geometry.

@@ -29,8 +29,6 @@ from probewise.arm.nxt.telegram import (
 from probewise.arm.nxt.wire import TelegramError
 from probewise.errors import LinkError, ParameterError
 
-__all__ = ["Drive", "Guard", "Motor", "MotorError"]
-
 Guard: TypeAlias = Callable[[int, int], None]
 """Function that raises ReachError if the motor must not go from one rotation count to another."""
 

@@ -12,8 +12,6 @@ from probewise.errors import LinkError
 if TYPE_CHECKING:
     import serial
 
-__all__ = ["SerialPort"]
-
 WRITE_S = 2.0
 
 

@@ -6,8 +6,6 @@ from collections.abc import Mapping
 
 from probewise.errors import LinkError
 
-__all__ = ["MEANINGS", "OK", "BrickError"]
-
 OK = 0x00
 
 MEANINGS: Mapping[int, str] = {

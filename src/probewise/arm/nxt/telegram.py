@@ -16,39 +16,6 @@ from typing import ClassVar, Generic, TypeVar, cast
 from probewise.arm.nxt.status import OK, BrickError
 from probewise.arm.nxt.wire import Answer, Fields, TelegramError, Whole, field_of, shown
 
-__all__ = [
-    "ALL_OUTPUTS",
-    "LONGEST",
-    "BatteryLevel",
-    "DeviceInfo",
-    "Done",
-    "FirmwareVersion",
-    "GetBatteryLevel",
-    "GetCurrentProgramName",
-    "GetDeviceInfo",
-    "GetFirmwareVersion",
-    "GetInputValues",
-    "GetOutputState",
-    "InputValues",
-    "KeepAlive",
-    "Mode",
-    "OutputMode",
-    "OutputState",
-    "ProgramName",
-    "Regulation",
-    "Reply",
-    "Request",
-    "ResetMotorPosition",
-    "RunState",
-    "SensorType",
-    "SetInputMode",
-    "SetOutputState",
-    "SleepLimit",
-    "decode",
-    "encode",
-    "framed",
-]
-
 A_co = TypeVar("A_co", bound=Answer, covariant=True)
 
 SYSTEM, REPLY, NO_REPLY = 0x01, 0x02, 0x80

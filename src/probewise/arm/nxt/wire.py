@@ -10,8 +10,6 @@ from typing import Any, ClassVar, Self
 
 from probewise.errors import LinkError, ParameterError
 
-__all__ = ["Answer", "Fields", "TelegramError", "Whole", "field_of", "shown"]
-
 
 class TelegramError(LinkError):
     """Raised for bytes that are not a telegram; the message gives them and what was expected."""

@@ -24,8 +24,6 @@ from probewise.report.plots.canvas import (
     tidy,
 )
 
-__all__ = ["arm_and_sensor", "arm_lengths", "draw_sensor_face"]
-
 _ROD_MM = 26.0  # distance between the two rods of each parallelogram, as drawn
 _ARROW: dict[str, Any] = {"arrowstyle": "-|>", "color": BLACK}
 _LABEL: dict[str, Any] = {"fontsize": SMALL_PT, "textcoords": "offset points", "arrowprops": _ARROW}

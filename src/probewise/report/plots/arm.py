@@ -15,8 +15,6 @@ from probewise.report.plots.canvas import BLACK, SMALL_PT, axes_or_new, tidy
 from probewise.report.plots.scene import bar_beside, out_of_reach
 from probewise.report.words import number
 
-__all__ = ["reach_map"]
-
 _LINES_DEG = 15.0  # step between contours of equal orientation
 
 

@@ -22,8 +22,6 @@ from probewise.report.plots.canvas import (
     tidy,
 )
 
-__all__ = ["audit_matrix"]
-
 COLOUR = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
 
 _NOT_COMPARED = "#e8e8e8"

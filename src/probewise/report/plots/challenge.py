@@ -11,8 +11,6 @@ from probewise._arrays import IntArray
 from probewise.challenge import Bin
 from probewise.report.plots.canvas import BLACK, BLUE, GREY, SMALL_PT, axes_or_new, legend_above, tidy
 
-__all__ = ["confusion_matrix", "reliability_diagram"]
-
 
 def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
     """Draw the share of right diagnoses against the stated probability, with Wilson intervals and numbers of cases.

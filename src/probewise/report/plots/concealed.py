@@ -20,8 +20,6 @@ from probewise.report.plots.canvas import (
 from probewise.study import ConcealedRow
 from probewise.study.table import Estimate
 
-__all__ = ["doubt_beside_trust", "row_name"]
-
 _PANELS = (
     ("sure_and_wrong", "sure and wrong", "share of the runs"),
     ("intervals_hold", "95 % intervals that hold", "share of the intervals"),

@@ -10,8 +10,6 @@ from matplotlib.ticker import MaxNLocator
 
 from probewise.report.plots.canvas import axes_or_new, legend_above, tidy
 
-__all__ = ["belief_in_the_sensor"]
-
 _MOST = 5  # effects with a colour of their own; the others share one
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 _CLEAN, _REST = "#D9D9D9", "#7F7F7F"

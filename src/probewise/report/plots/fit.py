@@ -8,8 +8,6 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, BLUE, legend_above, stack_of_axes, tidy
 
-__all__ = ["predicted_and_recorded"]
-
 
 def predicted_and_recorded(
     readings: FloatArray, predicted: FloatArray, sd: FloatArray, *, label: str, unit: str, ax: Axes | None = None

@@ -34,8 +34,6 @@ from probewise.report.plots.canvas import (
 )
 from probewise.report.words import unit_of, with_error, within, without_unit
 
-__all__ = ["corner_plot", "insertion_plot", "run_plot", "trace_plot"]
-
 Posterior: TypeAlias = NestedResult | Weighted
 
 # Darker points have more weight, so that they show on white; lightness falls evenly, so that it can be read in grey.

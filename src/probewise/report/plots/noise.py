@@ -17,8 +17,6 @@ from probewise.report.plots.canvas import (
     tidy,
 )
 
-__all__ = ["correlation_of_neighbours", "lattice_of_readings", "lost_readings", "spread_by_level", "tails"]
-
 _MOST_LAGS = 12
 _STEPS = 12
 _PLAIN = "95 % of white noise"

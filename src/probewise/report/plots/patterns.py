@@ -14,8 +14,6 @@ from probewise.report.plots.canvas import BLACK, CYCLE, GREY, AxesGrid, axes_or_
 from probewise.report.plots.readings import MARKERS, tracks
 from probewise.report.words import number, signed, unit_name
 
-__all__ = ["quadrant_patterns", "sensor_orientations"]
-
 _DARK, _BRIGHT = "#1b1b1b", "#ffffff"
 _AROUND_MM = 16.0
 

@@ -25,8 +25,6 @@ from probewise.report.plots.canvas import (
 from probewise.report.plots.readings import Track, along_label, tracks
 from probewise.report.words import unit_name
 
-__all__ = ["calibration_check", "predicted_against_recorded", "residuals_against"]
-
 MAX_PANELS = 8
 
 

@@ -12,8 +12,6 @@ from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, CYCLE, SMALL_PT, axes_or_new, legend_above, tidy
 from probewise.report.words import count
 
-__all__ = ["information_gained", "posterior_widths", "towards_target"]
-
 
 def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 4.0, ax: Axes | None = None) -> Axes:
     """Draw the largest posterior sd of a parameter after each reading, and the target precision.

@@ -15,8 +15,6 @@ from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import CYCLE, axes_or_new, legend_above, tidy
 from probewise.report.words import unit_name
 
-__all__ = ["Track", "readings_by_orientation", "tracks"]
-
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
 MAX_NAMED = 8  # tracks in the legend; with more there is none
 

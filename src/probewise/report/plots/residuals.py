@@ -29,16 +29,6 @@ from probewise.report.plots.canvas import (
 from probewise.report.residual_means import Means
 from probewise.report.words import number, signed, unit_name
 
-__all__ = [
-    "AFTER",
-    "BEFORE",
-    "gain_by_scan",
-    "mean_residuals_along",
-    "one_scan",
-    "readings_in_order",
-    "residual_clouds",
-]
-
 BEFORE, AFTER = "as calibrated", "repaired"
 _CROWDED = 500  # number of dots from which they are paler
 _MANY = 1500  # number of dots from which they are an image inside the SVG

@@ -15,8 +15,6 @@ from probewise.report.plots.canvas import BLACK, BLUE, SMALL_PT, VERMILLION, Axe
 from probewise.report.plots.readings import Track, tracks
 from probewise.report.words import unit_name
 
-__all__ = ["before_and_after", "residuals_by_scan"]
-
 _MOST_GROUPS, _LEAST_ROWS = 18, 5  # number of groups of neighbours in a running mean
 _TELLING = 0.3  # share of the repair's largest change: the figure shows where the change exceeds it
 _BEFORE, _AFTER = "calibrated model", "repaired model"

@@ -16,8 +16,6 @@ from numpy.typing import ArrayLike
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, COPPER, OUT_OF_REACH, SMALL_PT, AxesGrid, axes_or_new, key_below
 
-__all__ = ["bar_beside", "explain_field", "out_of_reach", "playing_field"]
-
 LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
 NEXT_GREEN = "#00e08a"  # the palette's green, lighter, so that the next place shows on copper
 CARD_YELLOW = "#ffd54a"

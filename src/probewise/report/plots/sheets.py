@@ -21,8 +21,6 @@ from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
 from probewise.report.sheets import BOTTOM_MM, LEFT_MM, PAPERS_MM, Sheet, Tile, tiles_of
 from probewise.scene import region_of
 
-__all__ = ["sheets_pdf"]
-
 _MM_PER_IN = 25.4
 _RULER_MM = 100
 _PIXEL_MM = 0.25  # pixel size for patterns that have no outline

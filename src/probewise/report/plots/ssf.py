@@ -15,8 +15,6 @@ from probewise.report.plots.scene import bar_beside
 from probewise.report.words import with_error
 from probewise.sensor import SSFField
 
-__all__ = ["log_evidences", "spatial_sensitivity", "ssf_by_order"]
-
 
 def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str = "") -> Axes:
     """Draw an SSF in the sensor frame, with contours at 1/2 and 1/10 of its peak.

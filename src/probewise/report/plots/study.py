@@ -23,8 +23,6 @@ from probewise.report.plots.progress import towards_target
 from probewise.report.words import count
 from probewise.study import Summary
 
-__all__ = ["readings_needed", "widths_of_runs"]
-
 _BAND = (0.16, 0.84)
 
 

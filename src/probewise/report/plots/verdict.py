@@ -10,8 +10,6 @@ from matplotlib.axes import Axes
 
 from probewise.report.plots.canvas import BLUE, CYCLE, GREY, SMALL_PT, axes_or_new, legend_above, tidy
 
-__all__ = ["beliefs_by_round", "hypothesis_probabilities"]
-
 _SHOWN = 6  # hypotheses with a colour of their own
 _VISIBLE = 0.02  # probability from which a hypothesis has one
 

@@ -7,8 +7,6 @@ import numpy as np
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["OneRowEach", "batch", "require_positive"]
-
 
 class OneRowEach:
     """Base of regions whose first field has one row for each hypothesis, as `batch` leaves it."""

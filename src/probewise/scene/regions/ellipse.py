@@ -11,8 +11,6 @@ from probewise.scene._pixels import share_behind_edge
 from probewise.scene.regions.checks import OneRowEach, batch, require_positive
 from probewise.scene.regions.geometry import edge_distance, outlines
 
-__all__ = ["EllipseRegion", "disc_region"]
-
 
 @dataclass(frozen=True, eq=False)
 class EllipseRegion(OneRowEach):

@@ -10,8 +10,6 @@ from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.scene.albedo import Region
 
-__all__ = ["edge_distance", "outlines"]
-
 
 @singledispatch
 def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:

@@ -11,8 +11,6 @@ from probewise.scene._pixels import share_behind_edge
 from probewise.scene.regions.checks import OneRowEach, batch
 from probewise.scene.regions.geometry import edge_distance
 
-__all__ = ["HalfPlaneRegion"]
-
 
 @dataclass(frozen=True, eq=False)
 class HalfPlaneRegion(OneRowEach):

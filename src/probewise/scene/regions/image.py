@@ -11,8 +11,6 @@ import numpy as np
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["ImageRegion"]
-
 
 @dataclass(frozen=True, eq=False)
 class ImageRegion:

@@ -12,8 +12,6 @@ from probewise.scene.albedo import Region
 from probewise.scene.regions.checks import OneRowEach
 from probewise.scene.regions.geometry import edge_distance, outlines
 
-__all__ = ["MixtureOfRegions"]
-
 
 @dataclass(frozen=True, eq=False)
 class MixtureOfRegions(OneRowEach):

@@ -14,8 +14,6 @@ from probewise.scene._pixels import share_in_edges
 from probewise.scene.regions.checks import OneRowEach, batch
 from probewise.scene.regions.geometry import edge_distance, outlines
 
-__all__ = ["PolygonRegion"]
-
 
 @dataclass(frozen=True, eq=False)
 class PolygonRegion(OneRowEach):

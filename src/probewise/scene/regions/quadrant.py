@@ -12,8 +12,6 @@ from probewise.scene.regions.checks import OneRowEach, batch
 from probewise.scene.regions.geometry import edge_distance
 from probewise.scene.regions.polygon import PolygonRegion
 
-__all__ = ["QuadrantRegion"]
-
 
 @dataclass(frozen=True, eq=False)
 class QuadrantRegion(OneRowEach):

@@ -13,8 +13,6 @@ from probewise.scene._pixels import share_behind_edge
 from probewise.scene.regions.checks import OneRowEach, batch, require_positive
 from probewise.scene.regions.geometry import edge_distance
 
-__all__ = ["StripesRegion"]
-
 
 @dataclass(frozen=True, eq=False)
 class StripesRegion(OneRowEach):

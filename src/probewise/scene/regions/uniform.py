@@ -9,8 +9,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.scene.regions.checks import OneRowEach, batch
 
-__all__ = ["UniformRegion"]
-
 
 @dataclass(frozen=True, eq=False)
 class UniformRegion(OneRowEach):

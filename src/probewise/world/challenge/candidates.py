@@ -15,8 +15,6 @@ from probewise.recordings.plan import Plan
 from probewise.world.concealed import Concealed
 from probewise.world.world import World
 
-__all__ = ["CleanSetup", "Draw", "EffectSampler", "OfAmplitude", "log_uniform", "plain", "sign", "signed"]
-
 OfAmplitude: TypeAlias = Callable[[float], Concealed]
 """Amplitude (greater than 0) to effect."""
 

@@ -21,8 +21,6 @@ from probewise.world.challenge.truth import Alias, Hidden, Truth
 from probewise.world.concealed import Disturbs
 from probewise.world.world import World
 
-__all__ = ["ALIASES", "Case", "draw_case", "held_out"]
-
 ALIASES: tuple[tuple[str, str], ...] = (
     ("backlash", "edge_misplacement"),
     ("height_gradient", "albedo_gradient"),

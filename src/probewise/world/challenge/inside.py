@@ -19,8 +19,6 @@ from probewise.world.challenge.candidates import (
     signed,
 )
 
-__all__ = ["INSIDE", "NEEDS_SENSOR", "NO_PHYSICS", "PAIRABLE", "SINGLES"]
-
 
 def _sloping(make: Callable[[float, float], concealed.Concealed]) -> Draw:
     """Draw a direction within 60 degrees of X, which every plan moves along."""

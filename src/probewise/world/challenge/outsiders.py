@@ -18,8 +18,6 @@ from probewise.world.challenge.candidates import (
     signed,
 )
 
-__all__ = ["OUTSIDE"]
-
 
 def _place_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     s, at_mm = sign(rng), rng.uniform(-3, 3)

@@ -13,8 +13,6 @@ from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Qua
 from probewise.recordings.plan import Plan
 from probewise.recordings.plans import jittered, paper_plan, two_way_plan
 
-__all__ = ["PLANS", "draw_plan", "held_out_plans"]
-
 PLANS: Mapping[str, Callable[[], Plan]] = {"paper": paper_plan, "two_way": two_way_plan}
 
 _READING_S, _BREAK_S = 1.2, 30.0

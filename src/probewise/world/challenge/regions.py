@@ -22,8 +22,6 @@ from probewise.world.concealed import (
     ScanMisplacement,
 )
 
-__all__ = ["Region", "region_of"]
-
 
 @dataclass(frozen=True)
 class Region:

@@ -19,17 +19,6 @@ from probewise.world.concealed import (
 from probewise.world.spots import Blob, Spot, gaussian_spot, ridge_spot, ring_spot, tailed_spot
 from probewise.world.world import World
 
-__all__ = [
-    "NOISE_LEVELS",
-    "NOISE_MODELS",
-    "NOISE_NAMES",
-    "OTHER_NOISE",
-    "SSFS",
-    "draw_sensor",
-    "draw_spot",
-    "with_noise",
-]
-
 _PIXEL_MM = 0.5  # resolution of the raster: an SSF may be constant over half a millimetre
 
 NOISE_LEVELS: Mapping[str, float] = {"low": 0.4, "middle": 0.6, "high": 1.0}

@@ -20,8 +20,6 @@ from probewise.world.concealed import Concealed, CorrelatedNoise, Disturbs, Drop
 from probewise.world.concealed.stages import ANSWERING
 from probewise.world.world import Look
 
-__all__ = ["EffectSizer", "NormAfterRefit", "amplitude_of_size", "noise_size"]
-
 NormAfterRefit: TypeAlias = Callable[[Recording, Recording], float]
 """Norm of an effect after a refit of the null model: noise-free readings (without, with effect) to reading units.
 

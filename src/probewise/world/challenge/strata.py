@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
-__all__ = ["WHEEL", "CaseKind", "Stratum", "stratum_of"]
-
 CaseKind: TypeAlias = Literal["clean", "single", "pair", "outside", "alias", "ssf_order"]
 """What a case conceals: nothing, one effect, two, one out of vocabulary, an aliased one, or one more Gaussian."""
 

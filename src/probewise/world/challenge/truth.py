@@ -13,8 +13,6 @@ from probewise.world.challenge.sensors import NOISE_NAMES
 from probewise.world.challenge.strata import Stratum
 from probewise.world.concealed import Concealed
 
-__all__ = ["Alias", "Hidden", "Truth"]
-
 
 @dataclass(frozen=True)
 class Hidden:

@@ -12,8 +12,6 @@ from probewise._arrays import FloatArray
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = ["Backlash", "OrientationError", "PeriodicPositionError", "PositionScale", "ScanAngleError"]
-
 
 @dataclass(frozen=True)
 class Backlash:

@@ -11,8 +11,6 @@ from probewise._arrays import FloatArray
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = ["Lag", "Quantisation", "Saturation"]
-
 
 @dataclass(frozen=True)
 class Lag:

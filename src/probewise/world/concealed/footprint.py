@@ -13,8 +13,6 @@ from probewise.world.concealed.stages import Glimpse, Stage
 from probewise.world.rows import Rows
 from probewise.world.spots import Blob, blurred, gaussian_spot
 
-__all__ = ["EdgeBlur", "EdgeShadow", "Halo", "HeightGradient", "HeightOffset", "SSFOrder", "SensorTilt"]
-
 
 @dataclass(frozen=True)
 class SensorTilt:

@@ -12,8 +12,6 @@ from probewise.errors import ParameterError
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = ["BatterySag", "GainDrift", "Nonlinearity"]
-
 
 @dataclass(frozen=True)
 class Nonlinearity:

@@ -13,8 +13,6 @@ from probewise._arrays import FloatArray
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = ["CorrelatedNoise", "DriftingNoise", "Dropouts", "HeavyTails", "Outliers", "SignalDependentNoise"]
-
 
 @dataclass(frozen=True)
 class CorrelatedNoise:

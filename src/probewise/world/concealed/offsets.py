@@ -12,8 +12,6 @@ from probewise._arrays import FloatArray
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = ["AmbientGradient", "AmbientStep", "Flicker", "Glint", "Hysteresis", "OffsetDrift"]
-
 
 @dataclass(frozen=True)
 class AmbientGradient:

@@ -13,21 +13,6 @@ from probewise._arrays import FloatArray
 from probewise.world.concealed.stages import Glimpse, Stage
 from probewise.world.rows import Rows
 
-__all__ = [
-    "AfterGlow",
-    "BentRail",
-    "Chirp",
-    "CrossTalk",
-    "DeadZone",
-    "Ghost",
-    "PeakMemory",
-    "PlaceStep",
-    "SlippedPaper",
-    "StickSlip",
-    "ThermalGain",
-    "TwistedRail",
-]
-
 
 @dataclass(frozen=True)
 class BentRail:

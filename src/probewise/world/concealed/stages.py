@@ -12,8 +12,6 @@ from probewise._arrays import FloatArray
 from probewise.world.rows import Rows
 from probewise.world.spots import Spot
 
-__all__ = ["ANSWERING", "STAGES", "Changes", "Concealed", "Disturbs", "Glimpse", "Looks", "Retouches", "Stage"]
-
 Stage: TypeAlias = Literal[
     "place",
     "turn",

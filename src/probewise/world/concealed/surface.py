@@ -11,8 +11,6 @@ from probewise._arrays import FloatArray
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = ["AlbedoGradient", "AlbedoPatch", "EdgeMisplacement", "ScanMisplacement"]
-
 
 @dataclass(frozen=True)
 class EdgeMisplacement:

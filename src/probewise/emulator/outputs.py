@@ -63,13 +63,14 @@ class Outputs:
         """Simulate all milliseconds up to now."""
         n_ticks = int((now_s - self._ticked_s) / _TICK_S + 1e-6)
         self._ticked_s += n_ticks * _TICK_S
+        moving = [port for port in self.ports if not port.is_at_rest]
         for number in range(n_ticks):
-            moving = [port for port in self.ports if not port.is_at_rest]
             if not moving:
                 return
             self._tick(moving, battery_mv)
             if number % _WATCHED_TICKS == 0:
                 self._watch()
+            moving = [port for port in moving if not port.is_at_rest]  # one at rest stays there without a command
 
     def release(self) -> None:
         """Let all motors coast, as the start or end of a program does."""

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "instruments" / "printer.py"
 ORIGIN_MM = (110.0, 110.0)
-CIRCLE = Disc((125.0, 95.0), 35.0)
+CIRCLE = Disc((125.0, 95.0), 55.0)
 SPOT = gaussian_spot([Blob(share=1.0, center_mm=(0.0, 1.0), sd_mm=(3.0, 2.0), correlation=0.0)])
 WORLD = World(SPOT, black=140.0, white=840.0, noise_sd=8.0)
 
@@ -92,7 +92,7 @@ def test_record_calibrate_explore_and_diagnose_with_the_printer(tmp_path, monkey
         run("diagnose", "mine.csv", "--out", "diagnosis")
     result = json.loads((tmp_path / "found" / "result.json").read_text(encoding="utf-8"))
     assert result["known"]
-    for parameter, true in zip(result["shape"]["parameters"], (125.0, 95.0, 35.0), strict=True):
+    for parameter, true in zip(result["shape"]["parameters"], (125.0, 95.0, 55.0), strict=True):
         assert abs(parameter["mean"] - true) < 4 * parameter["sd"]
     diagnosis = json.loads((tmp_path / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
     assert diagnosis["verdict"] == "clean"

@@ -74,7 +74,7 @@ def test_play_that_is_not_known_is_another_circle_to_the_robot_which_says_so(sen
     """The circle is found in the arm's own frame: by its posterior, an error as large has a chance of 1e-4."""
     play_deg, out = 2.0, tmp_path / "out"
     arm = f"emulator:{built_with(play_deg, tmp_path / 'true.toml')}"
-    circle = np.array([498.6, 312.3, 51.9])
+    circle = np.array([498.6, 262.3, 91.9])
     options = ("--truth", ",".join(map(str, circle)), "--seed", 1, "--quiet")
     assert main([str(w) for w in ("explore", "--sensor", sensor_file, "--arm", arm, "--out", out, *options)]) == 0
     result = json.loads((out / "result.json").read_text())

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise.errors import ParameterError, ShapeError
+from probewise.scene.albedo import Region
 
 
-class OneRowEach:
+class OneRowEach(Region, Protocol):
     """Base of regions whose first field has one row for each hypothesis, as `batch` leaves it."""
 
     @property

@@ -29,10 +29,7 @@ class Touched:
 def read_touched(path: Path) -> tuple[FloatArray, FloatArray]:
     """Read marks: turns in radians and places in mm, both (n_marks, 3).
 
-    Raises
-    ------
-    FileError
-        If a column is missing or a cell is not a number; only `height_mm` may be empty.
+    Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty.
     """
     table = read_table(path)
     table.require(*_TURNED, *_PLACE)

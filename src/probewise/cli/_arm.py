@@ -73,10 +73,7 @@ class ArmName:
 def parse_arm(text: str) -> ArmName:
     """Parse the name of an arm: "simulated", "emulator[:TRUE.toml]", "nxt:PORT" or "FILE.py".
 
-    Raises
-    ------
-    ParameterError
-        If it is none of these.
+    Raises ParameterError if it is none of these.
     """
     if text == "simulated":
         return ArmName("simulated")
@@ -240,10 +237,8 @@ def require_choices(
 ) -> None:
     """Raise ParameterError for poses that a user's instrument (already entered) does not declare as possible.
 
-    Raises
-    ------
-    ParameterError
-        If orientations or heights are given for an instrument that does not declare `turns` or `lifts`.
+    Raises ParameterError if orientations or heights are given for an instrument that does not declare `turns` or
+    `lifts`.
     """
     from probewise.arm import OwnInstrument
 

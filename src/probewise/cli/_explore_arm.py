@@ -35,10 +35,7 @@ class Site:
 def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> Site:
     """Open the chosen arm, to continue after the readings `taken`.
 
-    Raises
-    ------
-    ParameterError, FileError, ArmError
-        If a truth was given with a real arm, or the arm cannot be opened.
+    Raises ParameterError, FileError or ArmError if a truth was given with a real arm, or the arm cannot be opened.
     """
     chosen, geometry, start_s = inputs.arm, inputs.geometry, taken[-1].time_s if taken else 0.0
     if chosen.kind in ("nxt", "file"):

@@ -55,10 +55,7 @@ class Inputs:
 def inputs_of(arguments: argparse.Namespace) -> Inputs:
     """Read and check the options.
 
-    Raises
-    ------
-    ParameterError, FileError
-        If an option contradicts another, or a file cannot be read.
+    Raises ParameterError or FileError if an option contradicts another, or a file cannot be read.
     """
     chosen = parse_arm(arguments.arm)
     if chosen.kind == "file" and arguments.geometry is not None:

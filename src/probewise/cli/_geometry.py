@@ -43,10 +43,8 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
 def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> Hidden:
     """Parse "[SHAPE:]V,V,...", the parameters of the true shape; without a text, draw them from the prior.
 
-    Raises
-    ------
-    ParameterError
-        If the text names an unknown shape, lacks a number, or has one that the shape's prior excludes.
+    Raises ParameterError if the text names an unknown shape, lacks a number, or has one that the shape's prior
+    excludes.
     """
     if text is None:
         return Hidden.drawn({name: SHAPES[name](field) for name in names}, rng=rng)

@@ -25,10 +25,7 @@ def is_journal(path: Path) -> bool:
 def refuse_journal(path: Path) -> None:
     """Refuse a journal where a plan or a recording is needed, since the shape below its sensor is unknown.
 
-    Raises
-    ------
-    FileError
-        If the path is a journal.
+    Raises FileError if the path is a journal.
     """
     if is_journal(path):
         raise FileError(
@@ -41,10 +38,7 @@ def refuse_journal(path: Path) -> None:
 def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
     """Read a journal: its readings by the given sensor, and the hypothesised shape.
 
-    Raises
-    ------
-    FileError
-        If it is not a journal, has no reading, or has a shape unknown to `explore`.
+    Raises FileError if it is not a journal, has no reading, or has a shape unknown to `explore`.
     """
     from probewise.experiment import read_journal
 
@@ -58,10 +52,7 @@ def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shap
 def journal_sensor(path: Path) -> Path:
     """Find the sensor.json of a journal's run, at its original path or beside the journal.
 
-    Raises
-    ------
-    FileError
-        If the journal names none, or the file found is a different one.
+    Raises FileError if the journal names none, or the file found is a different one.
     """
     from probewise.calibration import read_sensor
     from probewise.experiment import read_journal, sensor_named

@@ -27,10 +27,7 @@ def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead 
 def refuse_beside(arguments: argparse.Namespace, *names: str) -> None:
     """Refuse options that apply only to light sensors.
 
-    Raises
-    ------
-    ParameterError
-        If one of them is given.
+    Raises ParameterError if one of them is given.
     """
     for name in names:
         value = getattr(arguments, name)
@@ -42,12 +39,8 @@ def refuse_beside(arguments: argparse.Namespace, *names: str) -> None:
 def read_tables(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
     """Read and join tables of one system; also return notes on their columns.
 
-    Raises
-    ------
-    FileError
-        If one cannot be read, lacks a column that the simulator names, or has unusable content.
-    ParameterError
-        If two tables are the same.
+    Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,
+    ParameterError if two tables are the same.
     """
     from probewise.systems import join_tables, read_run_table
 

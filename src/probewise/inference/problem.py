@@ -47,10 +47,7 @@ def require_model(model: object) -> None:
 def scores(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Score predictions (n_samples, n_points) by a likelihood: (n_samples,).
 
-    Raises
-    ------
-    ShapeError
-        If the likelihood, which may be a user's own, does not return one number per hypothesis.
+    Raises ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
     """
     scored = likelihood.log_prob(readings, predicted)
     if np.shape(scored) != (len(predicted),):

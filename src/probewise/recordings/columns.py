@@ -36,10 +36,7 @@ class Table(Protocol):
 def columns_of(table: Table) -> dict[str, Any]:
     """Return a table's columns by name.
 
-    Raises
-    ------
-    ParameterError
-        If it has no columns by name.
+    Raises ParameterError if it has no columns by name.
     """
     names: Any = getattr(table, "columns", None)  # of a data frame, pandas or polars
     if isinstance(table, Mapping) or names is None:
@@ -52,12 +49,7 @@ def columns_of(table: Table) -> dict[str, Any]:
 def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
     """Check one number per reading, shape (n_points,); a single number is repeated if `n_points` is given.
 
-    Raises
-    ------
-    ParameterError
-        If a value is not a number.
-    ShapeError
-        If the length is not n_points.
+    Raises ParameterError if a value is not a number, ShapeError if the length is not n_points.
     """
     out = floats(values, name)
     if out.ndim == 0 and n_points is not None:
@@ -106,10 +98,7 @@ def seconds(values: ArrayLike) -> ArrayLike:
 def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
     """Check the other logged columns: one number per reading in each.
 
-    Raises
-    ------
-    ParameterError
-        If they have no names, or the name of one of a recording's own columns.
+    Raises ParameterError if they have no names, or the name of one of a recording's own columns.
     """
     if columns is None:
         return {}
@@ -125,10 +114,7 @@ def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> di
 def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
     """Convert a selection of rows (numbers, one truth value per row, or a slice) to row numbers, (n_rows,).
 
-    Raises
-    ------
-    ParameterError
-        If the selection is none of these, or a row does not exist.
+    Raises ParameterError if the selection is none of these, or a row does not exist.
     """
     allowed = f"numbers of rows in a list, up to {n_points - 1}; {n_points} truth values; or a slice"
     if isinstance(rows, slice):
@@ -175,10 +161,7 @@ def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[Int
 def named_patterns(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:
     """Return patterns by name; a single pattern lies under every reading.
 
-    Raises
-    ------
-    ParameterError
-        If there is none, or one is not a pattern.
+    Raises ParameterError if there is none, or one is not a pattern.
     """
     by_name = patterns if isinstance(patterns, Mapping) else {_THE_ONLY: patterns}
     if not by_name:
@@ -199,10 +182,7 @@ def require_patterns(patterns: Mapping[str, Pattern]) -> None:
 def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, Pattern], n_points: int) -> IntArray:
     """Return the index in `patterns` of each reading's pattern, (n_points,).
 
-    Raises
-    ------
-    ParameterError
-        If a name is not described, or there are several patterns and no names.
+    Raises ParameterError if a name is not described, or there are several patterns and no names.
     """
     known = list(patterns)
     if names is None:

@@ -190,10 +190,7 @@ _KIND_OF = {
 def read_description(path: Path) -> Description:
     """Read NAME.json.
 
-    Raises
-    ------
-    FileError
-        If it is missing, does not parse, or a field is missing or invalid.
+    Raises FileError if it is missing, does not parse, or a field is missing or invalid.
     """
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
     content = json_of(path, text, "strict JSON, each name once")
@@ -252,10 +249,7 @@ def _instrumentation(top: _Fields) -> Instrumentation:
 def description_text(instrumentation: Instrumentation, patterns: Mapping[str, Pattern]) -> str:
     """Return the text of NAME.json, with numbers in full precision.
 
-    Raises
-    ------
-    ParameterError
-        If the format does not have a pattern's kind.
+    Raises ParameterError if the format does not have a pattern's kind.
     """
     inst = instrumentation
     reading = {"unit": inst.unit, "min": inst.min, "max": inst.max, "step": inst.step}

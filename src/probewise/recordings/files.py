@@ -110,10 +110,7 @@ def write_plan(plan: Plan, path: PathLike) -> None:
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     """Format the rows of a plan as cells by column, in full precision.
 
-    Raises
-    ------
-    ParameterError
-        If the format cannot hold the plan.
+    Raises ParameterError if the format cannot hold the plan.
     """
     for name in (*plan.scan_names, *plan.pattern_names, *plan.covariates):
         if name != name.strip() or not name.isprintable():

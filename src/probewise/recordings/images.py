@@ -31,10 +31,7 @@ def read_image(path: Path) -> FloatArray:
     Grey values 0 to 255 are linear in albedo; colours are averaged over their channels; transparent
     pixels have albedo 0, as outside the image.
 
-    Raises
-    ------
-    FileError
-        If it is not such an image, is damaged, or has values outside 0 to 255.
+    Raises FileError if it is not such an image, is damaged, or has values outside 0 to 255.
     """
     content = read_bytes(path, _ALLOWED)
     if path.suffix.lower() == ".npy":
@@ -47,10 +44,7 @@ def read_image(path: Path) -> FloatArray:
 def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
     """Encode albedo (n_rows, n_columns) as the file that `read_image` reads back: '.npy' or '.png'.
 
-    Raises
-    ------
-    ParameterError
-        If `suffix` is another, or is '.png' and the albedo is not in steps of 1/255.
+    Raises ParameterError if `suffix` is another, or is '.png' and the albedo is not in steps of 1/255.
     """
     values = albedo * 255.0
     if suffix.lower() == ".npy":

@@ -132,10 +132,8 @@ def _cell_words(cell: str) -> str:
 def read_table(path: Path, *, progress: Progress = silent) -> Table:
     """Read a CSV file with one header row; blank lines are skipped.
 
-    Raises
-    ------
-    FileError
-        If there is no header, a column is repeated, a row is too short or too long, or quotes do not close.
+    Raises FileError if there is no header, a column is repeated, a row is too short or too long, or quotes do not
+    close.
     """
     text = read_text(path, "a CSV file")
     n_lines = text.count("\n")

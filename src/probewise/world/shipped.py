@@ -56,10 +56,7 @@ CANDIDATES: tuple[Concealed, ...] = (
 def truth(name: str) -> World:
     """Return the world of a shipped recording, with its concealed effect.
 
-    Raises
-    ------
-    ParameterError
-        If there is no recording of that name.
+    Raises ParameterError if there is no recording of that name.
     """
     choice, _, _ = _streams(name)
     world = World(gaussian_spot([BLOB]), black=BLACK, white=WHITE, noise_sd=NOISE_SD)
@@ -73,10 +70,7 @@ def make(name: str) -> Recording:
 
     Readings are rounded to 0.001, far below the noise, so that floating-point differences between machines vanish.
 
-    Raises
-    ------
-    ParameterError
-        If there is no recording of that name.
+    Raises ParameterError if there is no recording of that name.
     """
     _, times, noise = _streams(name)
     plan = paper_plan() if name == "paper" else two_way_plan()

@@ -58,10 +58,7 @@ COPPER: Colormap = LinearSegmentedColormap.from_list(
 def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -> Axes:
     """Return the axes given, or those of a new figure.
 
-    Raises
-    ------
-    ParameterError
-        If something other than axes is given; a figure is the usual mistake.
+    Raises ParameterError if something other than axes is given; a figure is the usual mistake.
     """
     if ax is not None:
         require_kind("ax", ax, Axes, _AXES)
@@ -81,12 +78,7 @@ def axes_or_grid(
 ) -> AxesGrid:
     """Return the axes given, shape (n_rows, n_columns), or those of a new figure.
 
-    Raises
-    ------
-    ShapeError
-        If those given have another shape.
-    ParameterError
-        If something else than axes is given.
+    Raises ShapeError if those given have another shape, ParameterError if something else than axes is given.
     """
     if axes is None:
         return grid_of_axes(n_rows, n_columns, size_in=size_in, **options)

@@ -90,9 +90,12 @@ def test_record_calibrate_explore_and_diagnose_with_the_printer(tmp_path, monkey
         person.surface, person.turned_rad = CIRCLE, 0.0
         run("explore", "--sensor", "my_sensor/sensor.json", *own, "--field", "220,220", "--out", "found")
         run("diagnose", "mine.csv", "--out", "diagnosis")
+    run("diagnose", "found/journal.jsonl", "--out", "of_run")
     result = json.loads((tmp_path / "found" / "result.json").read_text(encoding="utf-8"))
     assert result["known"]
     for parameter, true in zip(result["shape"]["parameters"], (125.0, 95.0, 55.0), strict=True):
         assert abs(parameter["mean"] - true) < 4 * parameter["sd"]
-    diagnosis = json.loads((tmp_path / "diagnosis" / "diagnosis.json").read_text(encoding="utf-8"))
-    assert diagnosis["verdict"] == "clean"
+    assert result["left_out"]["credible_set"] == ["clean"]
+    for name in ("diagnosis", "of_run"):
+        diagnosis = json.loads((tmp_path / name / "diagnosis.json").read_text(encoding="utf-8"))
+        assert diagnosis["verdict"] == "clean"

@@ -108,15 +108,24 @@ def a_path(text: str) -> Path:
     return Path(text)
 
 
-def positive_int(text: str) -> int:
-    """Parse an integer above zero, for argparse."""
+def _whole_number(text: str, *, least: int, allowed: str) -> int:
     try:
         value = int(text)
     except ValueError:
-        value = 0
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number greater than 0")
+        value = least - 1
+    if value < least:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number {allowed}")
     return value
+
+
+def positive_int(text: str) -> int:
+    """Parse an integer above zero, for argparse."""
+    return _whole_number(text, least=1, allowed="greater than 0")
+
+
+def seed_number(text: str) -> int:
+    """Parse an integer of 0 or more, for argparse."""
+    return _whole_number(text, least=0, allowed="of 0 or more")
 
 
 def positive_number(unit: str) -> Callable[[str], float]:
@@ -132,17 +141,6 @@ def positive_number(unit: str) -> Callable[[str], float]:
         return value
 
     return read
-
-
-def seed_number(text: str) -> int:
-    """Parse an integer of 0 or more, for argparse."""
-    try:
-        value = int(text)
-    except ValueError:
-        value = -1
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 0 or more")
-    return value
 
 
 def say(text: str, *, quiet: bool = False) -> None:

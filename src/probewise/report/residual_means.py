@@ -144,3 +144,13 @@ def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float
 def _longest_memory(rho: float) -> int:
     """Return the lag at which an AR(1) correlation falls below a hundredth."""
     return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0
+
+
+def running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Average groups of neighbours in x, each about one twentieth of the points."""
+    ok = np.isfinite(x) & np.isfinite(y)
+    x, y = x[ok], y[ok]
+    if x.size == 0:
+        return x, y
+    groups = np.array_split(np.argsort(x, kind="stable"), max(1, min(20, len(x) // 4)))
+    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])

@@ -30,11 +30,7 @@ class BrickMachine:
         self.brick = brick
         self.limits = SoftLimits(geometry)
         self._joints = geometry.joints
-        self._zeros = [
-            0,
-            0,
-            0,
-        ]  # counts at home; not 0 between finding a stop and the next reset
+        self._zeros = [0] * 3  # counts at home; not 0 between finding a stop and the next reset
         self._motors = [brick.motor(joint.port, guard=partial(self._check, k)) for k, joint in enumerate(self._joints)]
         self._light = brick.light(geometry.sensor_port)
 

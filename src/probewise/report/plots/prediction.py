@@ -23,6 +23,7 @@ from probewise.report.plots.canvas import (
     tidy,
 )
 from probewise.report.plots.readings import Track, along_label, tracks
+from probewise.report.residual_means import running_mean
 from probewise.report.words import unit_name
 
 MAX_PANELS = 8
@@ -151,17 +152,8 @@ def residuals_against(
     for residual, colour, name in ((before, VERMILLION, "model as calibrated"), (after, BLUE, "repaired model")):
         ok = np.isfinite(residual) & np.isfinite(covariate)
         ax.plot(covariate[ok], residual[ok], ".", color=colour, markersize=2.5, alpha=0.45)
-        center, average = _running_mean(covariate[ok], residual[ok])
+        center, average = running_mean(covariate[ok], residual[ok])
         ax.plot(center, average, color=colour, linewidth=2.0, label=name)
     ax.axhline(0, color=BLACK, linewidth=0.7)
     legend_above(ax)
     return tidy(ax, x=label, y=f"recorded − predicted ({unit_name(unit)})")
-
-
-def _running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average groups of neighbours in x, each about one twentieth of the points."""
-    if x.size == 0:
-        return x, y
-    order = np.argsort(x, kind="stable")
-    groups = np.array_split(order, max(1, min(20, len(x) // 4)))
-    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])

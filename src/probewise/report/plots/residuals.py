@@ -26,7 +26,7 @@ from probewise.report.plots.canvas import (
     stack_of_axes,
     tidy,
 )
-from probewise.report.residual_means import Means
+from probewise.report.residual_means import Means, running_mean
 from probewise.report.words import number, signed, unit_name
 
 BEFORE, AFTER = "as calibrated", "repaired"
@@ -130,7 +130,7 @@ def one_scan(
         above.plot(along, predicted, label=f"predicted, {name}", **curve)
         below.plot(along, readings - predicted, label=f"residual, {name}", **{**style, "alpha": 0.5})
         if joined:
-            below.plot(*_running_mean(along, readings - predicted), color=colour, linewidth=1.6, linestyle=line)
+            below.plot(*running_mean(along, readings - predicted), color=colour, linewidth=1.6, linestyle=line)
     below.sharex(above)
     tidy(above, x="", y=f"reading ({unit})")
     tidy(below, x=label, y=f"residual ({unit})")
@@ -176,7 +176,7 @@ def residual_clouds(
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
             _dots(ax, at, residuals, colour, "")
             ax.plot(
-                *_running_mean(at, residuals),
+                *running_mean(at, residuals),
                 color=colour,
                 linewidth=2.0,
                 linestyle=line,
@@ -244,13 +244,3 @@ def _names_on_x(ax: Axes, names: Sequence[str]) -> None:
     at = np.arange(len(names))
     ax.set_xticks(at[::skip], [name.replace("_", " ") for name in names[::skip]], fontsize=SMALL_PT, **slant)
     ax.set_xlim(-0.6, len(names) - 0.4)
-
-
-def _running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average groups of neighbours in x, each about one twentieth of the points."""
-    ok = np.isfinite(x) & np.isfinite(y)
-    x, y = x[ok], y[ok]
-    if x.size == 0:
-        return x, y
-    groups = np.array_split(np.argsort(x, kind="stable"), max(1, min(20, len(x) // 4)))
-    return np.array([x[g].mean() for g in groups]), np.array([y[g].mean() for g in groups])

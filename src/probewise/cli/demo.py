@@ -184,7 +184,7 @@ def _calibrate(seed: int, full: bool, pool: Executor) -> Calibration:
 
 
 def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> tuple[Exploration, list[bytes]]:
-    """RobotSearch for the circle from an empty field; return the run and a picture of each step."""
+    """Search for the circle from an empty field; return the run and a picture of each step."""
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run, surface_of
@@ -222,7 +222,7 @@ def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: 
 
 
 def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
-    """RobotSearch for the circle by the paper's rule, from a first reading on it that all models share."""
+    """Search for the circle by the paper's rule, from a first reading on it that all models share."""
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run_from, surface_of

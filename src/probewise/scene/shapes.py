@@ -82,15 +82,13 @@ class Placed:
         return margin, size - margin
 
 
-def _require_bounds(name: str, bounds: Bounds, field: Field) -> None:
+def _require_fit(shape: str, name: str, bounds: Bounds, field: Field, *, reach: float | None) -> None:
+    """Raise ParameterError for bounds in a wrong order; with `reach`, times the upper one, if it leaves the field."""
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = require_pair(name, bounds, "(low, high): its prior is even between them")
     if not 0 < low < high < math.inf:
         raise ParameterError(name, bounds, "0 < low < high, finite")
-
-
-def _require_room(shape: str, reach_mm: float, field: Field) -> None:
-    if 2 * reach_mm >= min(field.width_mm, field.height_mm):
+    if reach is not None and 2 * (reach_mm := reach * high) >= min(field.width_mm, field.height_mm):
         raise ParameterError(
             f"{shape}(inside=True)",
             f"up to {2 * reach_mm:g} mm wide",
@@ -114,9 +112,8 @@ class Circle:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        _require_bounds("radius_mm", self.radius_mm, self.field)
-        if self.inside:
-            _require_room("Circle", self.radius_mm[1], self.field)
+        reach = 1.0 if self.inside else None
+        _require_fit("Circle", "radius_mm", self.radius_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> Placed:
@@ -174,9 +171,8 @@ class Ellipse:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        _require_bounds("semi_axes_mm", self.semi_axes_mm, self.field)
-        if self.inside:
-            _require_room("Ellipse", self.semi_axes_mm[1], self.field)
+        reach = 1.0 if self.inside else None
+        _require_fit("Ellipse", "semi_axes_mm", self.semi_axes_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> Placed:
@@ -206,9 +202,8 @@ class Rectangle:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        _require_bounds("sides_mm", self.sides_mm, self.field)
-        if self.inside:
-            _require_room("Rectangle", self.sides_mm[1] / math.sqrt(2), self.field)
+        reach = 1 / math.sqrt(2) if self.inside else None
+        _require_fit("Rectangle", "sides_mm", self.sides_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> Placed:
@@ -234,15 +229,15 @@ class RegularPolygon:
 
     def __post_init__(self) -> None:
         require_whole("n_sides", self.n_sides, least=3)
-        _require_bounds("radius_mm", self.radius_mm, self.field)
-        if self.inside:
-            _require_room("RegularPolygon", self.radius_mm[1], self.field)
+        reach = 1.0 if self.inside else None
+        _require_fit("RegularPolygon", "radius_mm", self.radius_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> Placed:
         """Uniform over centre, radius, and angle within the polygon's symmetry."""
         own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
-        return Placed(self.field, own, self._extent if self.inside else None)
+        # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
+        return Placed(self.field, own, _round_extent if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a polygon for each hypothesis, theta (n_samples, 4)."""
@@ -252,10 +247,6 @@ class RegularPolygon:
     def _corners(self) -> FloatArray:
         t = 2 * np.pi * np.arange(self.n_sides) / self.n_sides
         return np.stack([np.cos(t), np.sin(t)], axis=-1)
-
-    def _extent(self, own: FloatArray) -> FloatArray:
-        # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
-        return _round_extent(own)
 
 
 def _turned_polygon(center_mm: FloatArray, corners_mm: FloatArray, angle_rad: FloatArray) -> PolygonRegion:

@@ -114,6 +114,7 @@ class RandomWalk(NoiseEffect):
     most: float = 3.0
 
     name = "random_walk"
+    words = "a zero that wanders"
     stage = Stage.NOISE
     units = ("noise sd",)
     covariates = ("time", "row", "run")
@@ -154,6 +155,7 @@ class NoisePerRun(NoiseEffect):
     n_rows: tuple[int, ...] = ()
 
     name = "noise_per_run"
+    words = "noise that differs from run to run"
     stage = Stage.NOISE
     covariates = ("run",)
 

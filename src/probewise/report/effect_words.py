@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
-from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, public_name, spoken_name
+from probewise.effects import EFFECTS, NUISANCES, PROPOSAL, NoisePerRun, RandomWalk, public_name, spoken_name
+from probewise.systems.forms import WORDS
 
 EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
     {name: effect.words for name, effect in {**EFFECTS, **NUISANCES}.items()}
@@ -15,39 +16,7 @@ EFFECTS_IN_WORDS: Mapping[str, str] = MappingProxyType(
 
 
 FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
-    {
-        "offset_step": "a jump of all readings",
-        "gain_step": "a jump of the readings' gain",
-        "offset_per_run": "an offset of its own in each run",
-        "gain_per_run": "a gain of its own in each run",
-        "delay": "readings that come late",
-        "settling": "readings that settle at the start of each run",
-        "interference": "a wave in the readings",
-        "random_walk": "a zero that wanders",
-        "noise_per_run": "noise that differs from run to run",
-        "clock_drift": "a clock that runs fast or slow",
-        "sensitivity": "readings that depend on {0}",
-        "input_offset": "an offset of {0}",
-        "input_gain": "a wrong scale of {0}",
-        "input_delay": "a late effect of {0}",
-        "input_saturation": "a limit of {0}",
-        "dead_zone": "a dead zone of {0}",
-        "periodic_error": "a periodic error of {0}",
-        "backlash": "backlash (play) of {0}",
-        "drifts": "a drift of {0}",
-        "steps": "a jump of {0}",
-        "differs": "{0} that differs from run to run",
-        "depends": "{0} that depends on {1}",
-        "damping": "damping of {0}",
-        "drag": "drag on {0}",
-        "friction": "dry friction of {0}",
-        "forcing": "a constant force on {0}",
-        "periodic_forcing": "a periodic force on {0}",
-        "cubic": "a cubic term of {1} in the rate of {0}",
-        "quadratic": "a quadratic term of {1} in the rate of {0}",
-        "coupling": "a coupling of {1} to {0}",
-        "limit": "a bound of {0}",
-    }
+    {**WORDS, **{noise.name: noise.words for noise in (RandomWalk, NoisePerRun)}}
 )
 """A noun phrase for each effect on a user's simulator, with placeholders for its targets."""
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 from probewise.effects import AGAIN
+from probewise.systems.forms import inputs, parameters, rates, readings
 from probewise.systems.forms.about import About
 from probewise.systems.forms.extras import forms_of_extras
 from probewise.systems.forms.form import Form
@@ -13,7 +16,10 @@ from probewise.systems.forms.parameters import forms_on_parameters
 from probewise.systems.forms.rates import forms_on_rates
 from probewise.systems.forms.readings import forms_on_readings
 
-__all__ = ["About", "Form", "driving_columns", "forms_of"]
+__all__ = ["WORDS", "About", "Form", "driving_columns", "forms_of"]
+
+WORDS: Mapping[str, str] = MappingProxyType(readings.WORDS | inputs.WORDS | parameters.WORDS | rates.WORDS)
+"""A noun phrase for each form, with places for its targets."""
 
 
 def forms_of(about: About) -> dict[str, Form]:

@@ -44,3 +44,12 @@ def forms_on_parameters(about: About) -> Iterator[Form]:
 
 def _shifting(name: str, how: Modulation) -> Act:
     return lambda value, theta, table: {**value, name: value[name] + how.over(theta, table)}
+
+
+WORDS = {
+    "drifts": "a drift of {0}",
+    "steps": "a jump of {0}",
+    "differs": "{0} that differs from run to run",
+    "depends": "{0} that depends on {1}",
+}
+"""A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""

@@ -190,3 +190,17 @@ def _rate_scale(about: About, state: str) -> float:
         rates.append(np.diff(values[rows])[there] / gaps[there])
     joined = np.concatenate(rates)
     return float(np.sqrt(np.mean(joined**2))) or 1.0
+
+
+WORDS = {
+    "damping": "damping of {0}",
+    "drag": "drag on {0}",
+    "friction": "dry friction of {0}",
+    "forcing": "a constant force on {0}",
+    "periodic_forcing": "a periodic force on {0}",
+    "cubic": "a cubic term of {1} in the rate of {0}",
+    "quadratic": "a quadratic term of {1} in the rate of {0}",
+    "coupling": "a coupling of {1} to {0}",
+    "limit": "a bound of {0}",
+}
+"""A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""

@@ -320,3 +320,16 @@ def _ceiling(about: About) -> Iterator[Form]:
 
 def _between(prior: LogUniform) -> FloatArray:
     return np.asarray(np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None])
+
+
+WORDS = {
+    "offset_step": "a jump of all readings",
+    "gain_step": "a jump of the readings' gain",
+    "offset_per_run": "an offset of its own in each run",
+    "gain_per_run": "a gain of its own in each run",
+    "delay": "readings that come late",
+    "settling": "readings that settle at the start of each run",
+    "interference": "a wave in the readings",
+    "sensitivity": "readings that depend on {0}",
+}
+"""A noun phrase for each form here, with places for its targets, to follow "the model leaves out"."""

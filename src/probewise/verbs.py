@@ -307,12 +307,7 @@ def explore(
     require_flag("learn_sensor", learn_sensor)
     lies = posing.shape_of(shape, field)
     streams, hidden = posing.Streams.of(rng), None
-    wanted = method == "paper" and model == "naive"
-    missing, surplus = wanted and levels is None and arm is not None, levels is not None and not wanted
-    if missing or surplus:
-        allowed = "a recording with readings over black and over white" if wanted else "None"
-        raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
-    naive = _naive_levels(sensor, levels, rng=streams.levels) if wanted else None
+    naive = _naive_levels(sensor, levels, method=method, model=model, has_arm=arm is not None, rng=streams.levels)
     asked = posing.pose_experiment(
         sensor,
         lies,
@@ -364,12 +359,27 @@ def explore(
         )
 
 
-def _naive_levels(sensor: FittedSensor, levels: Recording | None, *, rng: np.random.Generator) -> Naive:
+def _naive_levels(
+    sensor: FittedSensor,
+    levels: Recording | None,
+    *,
+    method: MethodName,
+    model: Model,
+    has_arm: bool,
+    rng: np.random.Generator,
+) -> Naive | None:
     """Take the levels of the paper's naive model from a recording, or from readings of a simulated sensor."""
     from probewise import experiment as posing
+    from probewise.errors import ParameterError
 
+    wanted = method == "paper" and model == "naive"
+    if (wanted and has_arm and levels is None) or (levels is not None and not wanted):
+        allowed = "a recording with readings over black and over white" if wanted else "None"
+        raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
     if levels is not None:
         return posing.levels_from(levels, sensor)
+    if not wanted:
+        return None
     return posing.levels_in(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
 
 

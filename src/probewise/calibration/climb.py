@@ -32,13 +32,13 @@ _BISECTIONS = 40
 _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: one costs as much as a move.
 _DRAWS = 4
-# Times that the posterior's samples are kept; moves of each particle once it is reached, and between two exchanges.
+# Times that the posterior's samples are kept; moves of each particle once it is reached, and between two afresh.
 N_SNAPSHOTS = 4
-_N_MORE, _EXCHANGE = 24, 4
+_N_MORE, _AFRESH = 24, 2
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 6
-# A move's kind by a uniform number: all coordinates, then one Gaussian's or the levels', then a fresh last one.
-_BLOCK_FROM, _FRESH_FROM = 0.35, 0.7
+# Share of the moves that change the coordinates of one Gaussian, or the levels, alone.
+_BY_BLOCK = 0.5
 _WHOLE_JUMP = 0.1
 _JITTER = 1e-5
 # Doubt the clouds where they agree less than this.
@@ -199,7 +199,6 @@ def climb(
     rng: np.random.Generator,
     n_steps: int = _N_STEPS,
     n_more: int = _N_MORE,
-    exchange: Callable[[FloatArray], FloatArray] | None = None,
     told: Callable[[Rung], None] | None = None,
 ) -> Climb:
     """Climb to the posterior of N Gaussians.
@@ -224,8 +223,6 @@ def climb(
         Moves of each particle at each temperature.
     n_more
         Moves of each particle once the posterior is reached; samples are kept from the last half of them.
-    exchange
-        Moves parameters, (n, 6 N + 2), and leaves the posterior as it is.
     told
         Called after every temperature.
     """
@@ -268,8 +265,9 @@ def climb(
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):
-            now, share = _metropolis_step(now, partial(known, beta=beta), reference, beta, rng)
+            now, share = _moved_along_differences(now, partial(known, beta=beta), beta, rng)
             shares.append(share)
+        now = _moved_afresh(now, partial(known, beta=beta), reference, beta, rng)
         accepted = float(np.mean(shares))
         if beta == 1.0:
             now = known(now.x)
@@ -282,9 +280,9 @@ def climb(
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     if temperatures[-1] == 1.0:
         for k in range(1, n_more + 1):
-            now, _ = _metropolis_step(now, partial(known, beta=1.0), reference, 1.0, rng, fresh=exchange is None)
-            if exchange is not None and k % _EXCHANGE == 0:
-                now = known(space.enter(exchange(space.leave(now.x)[0])), 1.0)
+            now, _ = _moved_along_differences(now, partial(known, beta=1.0), 1.0, rng)
+            if k % _AFRESH == 0:
+                now = _moved_afresh(now, partial(known, beta=1.0), reference, 1.0, rng)
             if k in keep:
                 kept.append(now)
     kept = kept or [now]
@@ -337,14 +335,8 @@ def _next(rise: FloatArray, beta: float, least: float) -> float:
     return high
 
 
-def _metropolis_step(
-    now: _Cloud,
-    known: Callable[[FloatArray], _Cloud],
-    reference: KnownDensity,
-    beta: float,
-    rng: np.random.Generator,
-    *,
-    fresh: bool = True,
+def _moved_along_differences(
+    now: _Cloud, known: Callable[[FloatArray], _Cloud], beta: float, rng: np.random.Generator
 ) -> tuple[_Cloud, float]:
     """Move each particle once, one half after the other; tell the share of moves accepted.
 
@@ -352,7 +344,6 @@ def _metropolis_step(
     """
     n, d = now.x.shape
     n_gaussians = (d - 2) // 6
-    space = reference.prior.coordinates
     block_of = np.minimum(np.arange(d) // 6, n_gaussians)
     jitter = _JITTER * now.x.std(axis=0)
     order = rng.permutation(n)
@@ -360,26 +351,33 @@ def _metropolis_step(
     for half in (0, 1):
         own, other = order[half::2], order[1 - half :: 2]
         m = len(own)
-        kind = rng.random(m)
         old = now.take(own)
         in_block = block_of == rng.integers(n_gaussians + 1, size=m)[:, None]
-        by_block = kind > _BLOCK_FROM
+        by_block = rng.random(m) < _BY_BLOCK
         scale = 2.38 / math.sqrt(2 * d) * np.exp(0.4 * rng.standard_normal(m))
         scale *= np.where(by_block, math.sqrt(d / 6), 1.0)
         scale[rng.random(m) < _WHOLE_JUMP] = 1.0
         one, two = rng.choice(other, (2, m))
         step = scale[:, None] * (now.x[one] - now.x[two]) + jitter * rng.standard_normal((m, d))
-        x = old.x + np.where(by_block[:, None] & ~in_block, 0.0, step)
-        anew = np.flatnonzero(kind > _FRESH_FROM) if fresh else np.empty(0, dtype=np.int64)
-        here, _ = space.leave(old.x[anew])
-        there, log_drawn = reference.redrawn(here, rng=rng) if anew.size else (here, np.empty(0))
-        with np.errstate(invalid="ignore"):
-            x[anew] = space.enter(there)
-            new = known(x)
-            log_accept = new.tempered(beta) - old.tempered(beta)
-            # A fresh Gaussian comes from the reference's density: only the rest of the target counts.
-            log_accept[anew] += log_drawn + old.log_prior[anew] - new.log_prior[anew]
-            better = np.log(rng.random(m)) < log_accept
+        new = known(old.x + np.where(by_block[:, None] & ~in_block, 0.0, step))
+        better = np.log(rng.random(m)) < new.tempered(beta) - old.tempered(beta)
         n_accepted += int(better.sum())
         now = now.put(own[better], new.take(np.flatnonzero(better)))
     return now, n_accepted / n
+
+
+def _moved_afresh(
+    now: _Cloud,
+    known: Callable[[FloatArray], _Cloud],
+    reference: KnownDensity,
+    beta: float,
+    rng: np.random.Generator,
+) -> _Cloud:
+    """Propose to each particle a fresh one from the reference's density: only the rest of the target counts."""
+    space = reference.prior.coordinates
+    there, log_drawn = reference.redrawn(space.leave(now.x)[0], rng=rng)
+    with np.errstate(invalid="ignore"):
+        new = known(space.enter(there))
+        log_accept = new.tempered(beta) - now.tempered(beta) + log_drawn + now.log_prior - new.log_prior
+        better = np.flatnonzero(np.log(rng.random(len(there))) < log_accept)
+    return now.put(better, new.take(better))

@@ -33,8 +33,6 @@ _N_CLOUDS = 8
 _N_PARTICLES = 1000
 # Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
 _NEEDED = 20.0
-# Gaussians of the prior that each sample may exchange one of its own for.
-_N_TRIES = 4
 # Least effective share of the samples in a bridge.
 _LEAST_SHARE = 0.05
 # The first climb from a peak starts from a density so much wider: particles gather more easily than they spread.
@@ -199,7 +197,6 @@ def _from_below(
         few,
         log_z_below=log_z,
         error_below=error,
-        exchange=partial(removal.exchanged, n_tries=_N_TRIES, rng=rng),
         rng=rng,
         told=told,
     )

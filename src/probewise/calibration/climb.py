@@ -26,12 +26,12 @@ from probewise.nested.weights import n_effective, resampled
 __all__ = ["N_SNAPSHOTS", "Climb", "KnownDensity", "Rung", "climb"]
 
 # A change of temperature leaves at least this share of the particles effective.
-_KEPT = 0.5
+_KEPT = 0.25
 _N_STEPS = 3
 _BISECTIONS = 40
 _BRIDGE_STEPS = 30
-# Draws of the reference for each particle that is kept: one costs as much as a move.
-_DRAWS = 4
+# Draws of the reference for each particle that is kept: so many at a time, until enough are effective, and at most.
+_DRAWS, _MOST_DRAWS = 2, 4
 # Times that the posterior's samples are kept; moves of each particle once it is reached, and between two afresh.
 N_SNAPSHOTS = 4
 _N_MORE, _AFRESH = 24, 2
@@ -180,6 +180,15 @@ class _Cloud:
         out.log_likelihood[rows], out.log_reference[rows] = other.log_likelihood, other.log_reference
         return out
 
+    def joined(self, other: _Cloud, n_clouds: int) -> _Cloud:
+        """Join to each cloud that of another."""
+        both = np.arange(len(self.x) + len(other.x))
+        mine, others = np.split(both, [len(self.x)])
+        rows = np.concatenate([mine.reshape(n_clouds, -1), others.reshape(n_clouds, -1)], axis=1).ravel()
+        pairs = ((self.x, other.x), (self.log_prior, other.log_prior))
+        logs = ((self.log_likelihood, other.log_likelihood), (self.log_reference, other.log_reference))
+        return _Cloud(*(np.concatenate(pair)[rows] for pair in (*pairs, *logs)))
+
     @property
     def rise(self) -> FloatArray:
         return self.log_likelihood - self.log_reference
@@ -246,8 +255,13 @@ def climb(
     n_clouds = len(log_z_below)
     n = len(rest) // n_clouds
     log_z = np.array(log_z_below)
-    with np.errstate(invalid="ignore"):
-        now = known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
+    now: _Cloud | None = None
+    for _ in range(_MOST_DRAWS // _DRAWS):
+        with np.errstate(invalid="ignore"):
+            drawn = known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
+        now = drawn if now is None else now.joined(drawn, n_clouds)
+        if n_effective(now.rise) >= _KEPT * len(rest):
+            break
     temperatures, accepted, overlap = [0.0], 0.0, 1.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
         rise = now.rise

@@ -17,6 +17,7 @@ from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
+from probewise.calibration.lone import LoneResponses, light_of
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled
 
@@ -155,13 +156,7 @@ class _Linear:
     def _answer(self, gaussian: FloatArray) -> Answer:
         if not len(gaussian):
             return Answer(np.empty((0, len(self.inverse))), np.empty(0), np.empty(0))
-        recording = self.alone.recording
-        levels = np.broadcast_to([0.0, 1.0], (len(gaussian), 2))
-        lone = np.concatenate([np.ones((len(gaussian), 1)), gaussian[:, 1:], levels], axis=1)
-        change = self.alone.model.predict(lone, recording.plan)
-        if not recording.usable.all():
-            change = change[:, recording.usable]
-        change = change * self.bright
+        change = LoneResponses(self.alone).to(gaussian) * self.bright
         change -= self.dark
         told = np.einsum("ni,ni->n", change, change)
         both = change @ self.response
@@ -213,8 +208,7 @@ class Compensation:
         """Learn from the problem of N - 1 Gaussians and its samples, (n, 6 N - 4); from `n_pool` shapes at most."""
         linear = _Linear.of(below, coordinates, alone, theta)
         prior = coordinates.prior
-        mass = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
-        mass = mass[..., 0] / np.sqrt(mass[..., 3] * mass[..., 4] - mass[..., 5] ** 2)
+        mass = light_of(theta)
         most = float(np.mean(mass.min(axis=1) / (mass.sum(axis=1) + mass.min(axis=1))))
         pools: list[FloatArray] = []
         answers: list[Answer] = []

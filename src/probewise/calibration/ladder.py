@@ -30,6 +30,8 @@ __all__ = ["climb_orders", "next_order"]
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
 _N_CLOUDS = 8
+# Quadrature nodes over curved edges, where a Gaussian more is answered to first order: within 0.001 of the levels' span.
+_FEW_NODES = 8
 _N_PARTICLES = 1000
 # Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
 _NEEDED = 20.0
@@ -188,7 +190,7 @@ def _from_below(
         rest, _ = coordinates.leave(coordinates.enter(start.samples(4 * _N_PARTICLES, rng=rng)))
         log_z, error = np.full(_N_CLOUDS, start.log_z), start.log_z_error
     few = rest[:: len(rest) // _N_PARTICLES]
-    compensation = Compensation.of(problem_below, coordinates, alone, few, rng=rng)
+    compensation = Compensation.of(problem_below, coordinates, posing.problem(1, n_nodes=_FEW_NODES), few, rng=rng)
     reference = Reference(posing.prior_of(n), problem_below, compensation)
     removal = Removal(posing.prior_of(n), alone)
     made = climb(

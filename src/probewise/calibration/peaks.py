@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from probewise._arrays import FloatArray
+from probewise.calibration.lone import LoneResponses, light_of
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
@@ -55,6 +56,7 @@ def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np
         Source of randomness.
     """
     found: dict[int, Peak] = {}
+    responses = LoneResponses(problem(1))
     for n in range(1, highest + 1):
         prior = _prior(problem(n))
         drawn = prior.from_unit_cube(rng.random((_N_DRAWS, len(prior.names))))
@@ -64,11 +66,11 @@ def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np
             below = np.repeat(found[n - 1].theta[None], n_split + n_added, axis=0)
             lone = drawn[:n_added, :6]
             starts += [_split_gaussian(below[:n_split], rng), _with_lone_gaussian(prior, below[n_split:], lone, rng)]
-        found[n] = _local_maxima(problem(n), np.concatenate(starts))
+        found[n] = _local_maxima(problem(n), responses, np.concatenate(starts))
     for n in range(highest - 1, 0, -1):
         above = found[n + 1].theta
         lacking = [np.delete(above, slice(6 * k, 6 * k + 6)) for k in range(n + 1)]
-        again = _local_maxima(problem(n), np.array(lacking))
+        again = _local_maxima(problem(n), responses, np.array(lacking))
         found[n] = max(found[n], again, key=lambda peak: peak.log_likelihood)
     return found
 
@@ -113,7 +115,7 @@ def _with_lone_gaussian(prior: SSFPrior, theta: FloatArray, lone: FloatArray, rn
     return np.concatenate([theta[:, :-2], one, theta[:, -2:]], axis=1)
 
 
-def _local_maxima(problem: SensorProblem, starts: FloatArray) -> Peak:
+def _local_maxima(problem: SensorProblem, responses: LoneResponses, starts: FloatArray) -> Peak:
     """Ascend from each start, (n_starts, n_params); the worse half gives up after some steps."""
     prior, likelihood, recording = _prior(problem), problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):
@@ -138,8 +140,7 @@ def _local_maxima(problem: SensorProblem, starts: FloatArray) -> Peak:
         if not rows.size:
             break
         here, own = z[rows], off[rows]
-        shifted = (here[:, None, :] + _DIFFERENCE * np.eye(d)).reshape(-1, d)
-        slope = (residual(shifted).reshape(len(rows), d, -1) - own[:, None, :]) / -_DIFFERENCE
+        slope = _slopes(prior, responses, here)
         weighted = slope * likelihood.weights(own)[:, None, :]
         curvature = weighted @ slope.transpose(0, 2, 1)
         gradient = np.einsum("ndp,np->nd", weighted, own)
@@ -158,3 +159,36 @@ def _local_maxima(problem: SensorProblem, starts: FloatArray) -> Peak:
         going[rows] = (gain > _SETTLED) | (~better & (damping[rows] < _STUCK))
     best = int(np.argmax(high))
     return Peak(prior.from_unit_cube(expit(z[best : best + 1]))[0], float(high[best]))
+
+
+def _slopes(prior: SSFPrior, responses: LoneResponses, z: FloatArray) -> FloatArray:
+    """Slopes of the predictions by the logits of the prior's cube, (n, d) -> (n, d, n_used).
+
+    A change of one Gaussian leaves the responses to the others as they are, so that one kind of parameter is changed
+    for all Gaussians at once; a change of light asks for no response at all.
+    """
+    n, n_gaussians = len(z), prior.n_gaussians
+    changed = np.repeat(z[None], 7, axis=0)
+    for kind in range(6):
+        changed[1 + kind, :, kind:-2:6] += _DIFFERENCE
+    theta = prior.from_unit_cube(expit(changed.reshape(7 * n, -1)))
+    # The light is the first kind, with the responses of no change.
+    seen = responses.to_each(np.concatenate([theta[:n], theta[2 * n :]])).reshape(6, n, n_gaussians, -1)
+    light = light_of(theta).reshape(7, n, n_gaussians)
+    theta = theta[:n]
+    whole = light[0].sum(axis=1)
+    lit = light[0][..., None] * seen[0]
+    mixed = lit.sum(axis=1) / whole[:, None]
+    span = (theta[:, -1] - theta[:, -2])[:, None, None] / _DIFFERENCE
+    slope = np.empty((*z.shape, seen.shape[-1]))
+    for kind in range(6):
+        more = light[1 + kind] - light[0]
+        each = light[1 + kind][..., None] * seen[kind]
+        each -= lit
+        each -= more[..., None] * mixed[:, None]
+        each *= span / (whole[:, None] + more)[..., None]
+        slope[:, kind:-2:6] = each
+    levels = (prior.from_unit_cube(expit(z + _DIFFERENCE))[:, -2:] - theta[:, -2:]) / _DIFFERENCE
+    slope[:, -2] = levels[:, :1] * (1.0 - mixed)
+    slope[:, -1] = levels[:, 1:] * mixed
+    return slope

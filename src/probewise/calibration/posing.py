@@ -34,12 +34,14 @@ class Posing:
             raise ParameterError("prior", found, "an SSFPrior")
         return found
 
-    def problem(self, n_gaussians: int) -> SensorProblem:
-        """Return the inference problem of an order."""
-        return problem_for(self.recording, self.prior_of(n_gaussians), data_sets=self.data_sets)
+    def problem(self, n_gaussians: int, *, n_nodes: int = FAST_NODES) -> SensorProblem:
+        """Return the inference problem of an order, with so many quadrature nodes over curved edges."""
+        return problem_for(self.recording, self.prior_of(n_gaussians), data_sets=self.data_sets, n_nodes=n_nodes)
 
 
-def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None) -> SensorProblem:
+def problem_for(
+    recording: Recording, prior: SSFPrior, *, data_sets: IntArray | None = None, n_nodes: int = FAST_NODES
+) -> SensorProblem:
     """Make the inference problem of one order: a chain over known patterns, Student-t with one sigma per data set.
 
     Parameters
@@ -50,11 +52,13 @@ def problem_for(recording: Recording, prior: SSFPrior, *, data_sets: IntArray | 
         Prior of the order's parameters.
     data_sets
         Data set of each row, (n_points,) from 0; default: its scan.
+    n_nodes
+        Quadrature nodes over curved edges. By default the error there, 1e-4 of I_max - I_min, is below a tenth of the
+        least noise sd of the prior.
     """
     plan = recording.plan
     groups = plan.scan if data_sets is None else np.asarray(data_sets)
     if groups.shape != (len(plan),):
         raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one per row")
-    # The error at curved edges, 1e-4 of I_max - I_min, is below a tenth of the least noise sd of the prior.
-    chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=FAST_NODES)
+    chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=n_nodes)
     return SensorProblem(prior, DistinctRows(chain, plan), student_t(recording, groups), recording)

@@ -3,8 +3,7 @@
 With one Gaussian's light at nothing, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
 posterior tell of the other's evidence: from N, take one Gaussian away; from N - 1, add one drawn from the prior. Its
 light is integrated out, which one predicted curve allows: residuals are linear in its share of the light. Both kinds
-of samples meet in a bridge (Bennett 1976). The same integral moves a sample far: it exchanges one Gaussian for one of
-several drawn from the prior (Barker's choice among many, Tjelmeland 2004).
+of samples meet in a bridge (Bennett 1976).
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ import numpy as np
 from scipy.special import expit
 
 from probewise._arrays import FloatArray
+from probewise.calibration.lone import LoneResponses, light_of
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT, log_sigma_integral
@@ -27,9 +27,8 @@ __all__ = ["Removal", "bridged"]
 _Sums: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 _AT_ONCE = 400_000
-# Integrals over a light's posterior within 1e-4; to choose among Gaussians, within 1e-3.
-_NODES, _FEW_NODES = np.polynomial.legendre.leggauss(12), np.polynomial.legendre.leggauss(10)
-_N_GRID = 60
+# Integrals over a light's posterior within 1e-4.
+_NODES = np.polynomial.legendre.leggauss(12)
 _REACH = 5.0
 _N_NEWTON = 4
 _N_TABLE = 1024
@@ -67,59 +66,9 @@ class Removal:
         for at in range(0, len(rest), at_once):
             part = rest[at : at + at_once]
             seen, light = self._responses(part)
-            one = self._lone(gaussian[at : at + at_once])
+            one = self._lone.to(gaussian[at : at + at_once])
             found.append(self._log_gain(_mixture_response(seen, light), one, light, part[:, -2:]))
         return np.concatenate(found)
-
-    def exchanged(self, theta: FloatArray, *, n_tries: int, rng: np.random.Generator) -> FloatArray:
-        """Exchange one Gaussian of each sample, for one of so many of the prior, or for itself with other light.
-
-        The posterior of N stays as it is, but for the grid of shares, 0.2 sd apart, that the light is drawn from.
-        Both (n, 6 N + 2); the Gaussians in no order.
-        """
-        n = self.prior.n_gaussians
-        at_once = max(1, _AT_ONCE // ((n + 2 * n_tries) * self._readings.size))
-        blocks = [theta[at : at + at_once] for at in range(0, len(theta), at_once)]
-        return np.concatenate([self._exchanged(block, n_tries, rng) for block in blocks])
-
-    def _exchanged(self, theta: FloatArray, n_tries: int, rng: np.random.Generator) -> FloatArray:
-        n, m = self.prior.n_gaussians, len(theta)
-        rows = np.arange(m)
-        seen, light = self._responses(theta)
-        label = rng.integers(n, size=m)
-        beside = np.arange(n) != label[:, None]
-        others = light[beside].reshape(m, n - 1)
-        rest = _mixture_response(seen[beside].reshape(m, n - 1, -1), others)
-        own = theta[:, :-2].reshape(m, n, 6)[rows, label]
-        drawn = self.prior.from_unit_cube(rng.random((m * n_tries, 6 * n + 2)))[:, :6].reshape(m, n_tries, 6)
-        gaussian = np.concatenate([own[:, None], drawn], axis=1)
-        one = np.concatenate([seen[rows, label][:, None], self._lone(drawn.reshape(-1, 6)).reshape(m, n_tries, -1)], 1)
-        sums = self._sums(rest[:, None], one, theta[:, None, -2:])
-        whole = (others.sum(axis=1) / others.max(axis=1))[:, None]
-        log_gain = self._integrated(*sums, np.broadcast_to(whole, (m, n_tries + 1)), _FEW_NODES)
-        chosen = (log_gain + rng.gumbel(size=log_gain.shape)).argmax(axis=1)
-        square, both, change = (part[rows, chosen] for part in sums)
-        t = self._drawn_light(square, both, change, whole[:, 0], rng)
-        scale = np.minimum(1.0, 1.0 / t) * rng.random(m) ** (1.0 / n)
-        masses = np.empty((m, n))
-        masses[beside] = (others / others.max(axis=1, keepdims=True) * scale[:, None]).ravel()
-        masses[rows, label] = t * scale
-        out = theta.copy()
-        g = out[:, :-2].reshape(m, n, 6)
-        g[rows, label] = gaussian[rows, chosen]
-        g[..., 0] = masses * self.prior.amplitude_scale(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
-        return out
-
-    def _drawn_light(
-        self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray, rng: np.random.Generator
-    ) -> FloatArray:
-        """Draw light over that of the brightest of the others, (n,), by its density on a grid."""
-        low, high = self._bounds(square, both, own)
-        share = low[:, None] + (high - low)[:, None] * (np.arange(_N_GRID) + 0.5) / _N_GRID
-        log_density = self._log_density(square, both, own, whole, share)
-        cell = (log_density + rng.gumbel(size=share.shape)).argmax(axis=1)
-        drawn = (low + (high - low) * (cell + rng.random(len(low))) / _N_GRID).clip(1e-14, 1.0 - 1e-12)
-        return np.asarray(whole * drawn / (1.0 - drawn))
 
     def _taken(self, theta: FloatArray) -> FloatArray:
         seen, light = self._responses(theta)
@@ -133,16 +82,7 @@ class Removal:
 
     def _responses(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Responses to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
-        g = theta[:, :-2].reshape(len(theta), -1, 6)
-        light = g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
-        return self._lone(g.reshape(-1, 6)).reshape(*light.shape, -1), light
-
-    def _lone(self, gaussian: FloatArray) -> FloatArray:
-        levels = np.broadcast_to([0.0, 1.0], (len(gaussian), 2))
-        lone = np.concatenate([np.ones((len(gaussian), 1)), gaussian[:, 1:], levels], axis=1)
-        seen = self.alone.model.predict(lone, self.alone.recording.plan)
-        usable = self.alone.recording.usable
-        return seen if usable.all() else seen[:, usable]
+        return self._lone.to_each(theta), light_of(theta)
 
     def _log_gain(self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray) -> FloatArray:
         """Integrate over the light of one Gaussian beside others.
@@ -151,7 +91,7 @@ class Removal:
         (N - 1) / N times the integral of the likelihood over t from 0, times min(1, t^-N), over that at t = 0.
         """
         sums = self._sums(others, one, levels)
-        return self._integrated(*sums, light.sum(axis=-1) / light.max(axis=-1), _NODES)
+        return self._integrated(*sums, light.sum(axis=-1) / light.max(axis=-1))
 
     def _sums(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> _Sums:
         """Sum residual squared, residual times change, change squared over data sets, (..., n_sets) each.
@@ -167,18 +107,11 @@ class Removal:
         square, both, own = (part.reshape(shape) for part, shape in zip(sums, shapes, strict=True))
         return np.broadcast_to(square, own.shape), both, own
 
-    def _integrated(
-        self,
-        square: FloatArray,
-        both: FloatArray,
-        own: FloatArray,
-        whole: FloatArray,
-        nodes: tuple[FloatArray, FloatArray],
-    ) -> FloatArray:
+    def _integrated(self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray) -> FloatArray:
         """Log of the integral over t, over the likelihood at t = 0; `whole`: the others' light over the brightest's."""
         n = self.prior.n_gaussians
         low, high = self._bounds(square, both, own)
-        place, weight = nodes
+        place, weight = _NODES
         share = (low[..., None] + (high - low)[..., None] * 0.5 * (place + 1.0)).clip(1e-14, 1.0 - 1e-12)
         log_density = self._log_density(square, both, own, whole, share)
         most = log_density.max(axis=-1)
@@ -240,6 +173,10 @@ class Removal:
         grid = np.linspace(low, high, _N_TABLE, axis=1)
         values = log_sigma_integral(np.exp(grid), sizes[:, None], likelihood.sd_floor, likelihood.sd_ceiling)
         return low[of], ((_N_TABLE - 1) / (high - low))[of], values[of].ravel()
+
+    @property
+    def _lone(self) -> LoneResponses:
+        return LoneResponses(self.alone)
 
     @cached_property
     def _readings(self) -> FloatArray:

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
-from probewise.calibration.compensation import Compensation
+from probewise.calibration.compensation import Answer, Compensation
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
@@ -137,25 +137,25 @@ class Reference:
         return out
 
     def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Take away a Gaussian and draw another one, each by one way.
+        """Take away any Gaussian but the first, undo the shift of the others, add another one and shift them for it.
 
-        Returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new, both over
+        The new one may be as heavy as the first, so that all others are moved, not the lightest alone. `here` is sorted;
+        returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new, both over
         the prior's, (n,); -inf where the move is impossible.
         """
-        there, log_drawn = np.full(here.shape, np.nan), np.full(len(here), -np.inf)
-        which = rng.choice(len(self.proposals), size=len(here), p=[proposal.share for proposal in self.proposals])
-        for k, proposal in enumerate(self.proposals):
-            rows = np.flatnonzero(which == k)
-            rest, log_here = proposal.back(here[rows])
-            possible = np.isfinite(log_here)
-            rows, log_here = rows[possible], log_here[possible]
-            if not rows.size:
-                continue
-            there[rows] = proposal.draw(rest[possible], rng=rng)
-            possible = np.isfinite(there[rows]).all(axis=1)
-            rows, log_here = rows[possible], log_here[possible]
-            log_there = proposal.back(there[rows])[1]
-            log_drawn[rows] = np.where(np.isfinite(log_there), log_here - log_there, -np.inf)
+        m, n = len(here), self.prior.n_gaussians
+        g = here[:, :-2].reshape(m, n, 6)
+        label = rng.integers(1, n, size=m)
+        others = g[np.arange(n) != label[:, None]].reshape(m, -1)
+        rest = np.concatenate([others, here[:, -2:]], axis=1)
+        before, log_here = self._uncompensated(rest, g[np.arange(m), label], np.max)
+        there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
+        rows = np.flatnonzero(np.isfinite(log_here))
+        if rows.size:
+            after, last, answer = self._compensated(before[rows], np.max, rng)
+            there[rows] = _insert_gaussian(after, last)
+            log_there = self._log_compensated(before[rows], after, last, answer, np.max)
+            log_drawn[rows] = np.where(np.isfinite(log_there), log_here[rows] - log_there, -np.inf)
         return there, log_drawn
 
     def without_last(self, theta: FloatArray) -> FloatArray:
@@ -182,39 +182,58 @@ class Reference:
 
     def with_compensated(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Add a Gaussian to N - 1 sorted ones and shift these, (n, 6 N - 4) -> (n, 6 N + 2)."""
+        return _insert_gaussian(*self._compensated(rest, np.min, rng)[:2])
+
+    def uncompensated(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Undo `with_compensated`; also the log density as `JumpProposal.back` has it."""
+        return self._uncompensated(self.without_last(theta), theta[:, -8:-2], np.min)
+
+    def _compensated(
+        self, rest: FloatArray, most_of: Callable[..., FloatArray], rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray, Answer]:
+        """Shift N - 1 sorted Gaussians for one of a mass up to `most_of` theirs; that one, (n, 6), and the answer."""
         last, answer = self._compensation.draw(len(rest), rng=rng)
         near = np.flatnonzero(rng.random(len(rest)) < _NEAR)
         last[near] = self._drawn_near_one(rest[near], rng)
         answer = answer.put(near, self._compensation.linear.answer(last[near]))
         masses = self._masses(rest)
-        whole, least = masses.sum(axis=1), masses.min(axis=1)
-        told = answer.draw_share(least / (whole + least), rng=rng)
+        whole, most = masses.sum(axis=1), most_of(masses, axis=1)
+        told = answer.draw_share(most / (whole + most), rng=rng)
         by_share = rng.random(len(rest)) < _TOLD
-        ratio = np.where(by_share, told / (1.0 - told) * whole / least, _drawn_ratio(len(rest), rng))
-        last[:, 0] = ratio * least * self._scale(last)
-        share = ratio * least / (whole + ratio * least)
+        ratio = np.where(by_share, told / (1.0 - told) * whole / most, _drawn_ratio(len(rest), rng))
+        last[:, 0] = ratio * most * self._scale(last)
+        share = ratio * most / (whole + ratio * most)
         coordinates = self._compensation.coordinates
-        return _insert_gaussian(coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)[0], last)
+        return coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)[0], last, answer
 
-    def uncompensated(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Undo `with_compensated`; also the log density as `JumpProposal.back` has it."""
-        last, rest = theta[:, -8:-2], self.without_last(theta)
+    def _uncompensated(
+        self, after: FloatArray, last: FloatArray, most_of: Callable[..., FloatArray]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Undo `_compensated`; also the log of its density over the prior's, but for likelihood and N."""
         answer = self._compensation.linear.answer(last)
-        masses = self._masses(theta)
-        whole, least = masses[:, :-1].sum(axis=1), masses[:, :-1].min(axis=1)
-        share, ratio = masses[:, -1] / (whole + masses[:, -1]), masses[:, -1] / least
+        mass = last[:, 0] / self._scale(last)
+        share = mass / (self._masses(after).sum(axis=1) + mass)
         coordinates = self._compensation.coordinates
-        x = coordinates.enter(rest)
-        before, log_before = coordinates.leave(x - share[:, None] * answer.shift)
-        _, log_after = coordinates.leave(x)
-        log_share = answer.log_share_density(share, least / (whole + least))
-        log_share += np.log(least * whole) - 2.0 * np.log(whole + masses[:, -1])  # d share / d ratio
+        before = coordinates.leave(coordinates.enter(after) - share[:, None] * answer.shift)[0]
+        return before, self._log_compensated(before, after, last, answer, most_of)
+
+    def _log_compensated(
+        self, before: FloatArray, after: FloatArray, last: FloatArray, answer: Answer, most_of: Callable[..., FloatArray]
+    ) -> FloatArray:
+        """Log density of `_compensated` over the prior's, but for likelihood and N, (n,)."""
+        coordinates = self._compensation.coordinates
+        masses, mass = self._masses(after), last[:, 0] / self._scale(last)
+        whole, most = masses.sum(axis=1), most_of(masses, axis=1)
+        share, ratio = mass / (whole + mass), mass / most
+        log_before, log_after = (coordinates.leave(coordinates.enter(rest))[1] for rest in (before, after))
+        log_share = answer.log_share_density(share, most / (whole + most))
+        log_share += np.log(most * whole) - 2.0 * np.log(whole + mass)  # d share / d ratio
         log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_ratio_density(ratio), math.log(_TOLD) + log_share)
-        near = self._log_near_one(last, np.where(np.isfinite(log_before)[:, None], before, rest))
+        near = self._log_near_one(last, np.where(np.isfinite(log_before)[:, None], before, after))
         log_shape = np.logaddexp(math.log(1.0 - _NEAR) + self._compensation.log_tilt(answer), math.log(_NEAR) + near)
         with np.errstate(invalid="ignore"):  # where both are impossible
-            found = log_shape + log_ratio - np.log(least) + log_before - log_after
-        return before, np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
+            found = log_shape + log_ratio - np.log(most) + log_before - log_after
+        return np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
 
     @property
     def _compensation(self) -> Compensation:

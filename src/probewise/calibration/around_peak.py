@@ -10,16 +10,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaln, logsumexp
+from scipy.special import fdtri, gammaln, logsumexp
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested.weights import n_effective
 
-__all__ = ["PeakDensity", "around_peak", "evidence_about"]
+__all__ = ["PeakDensity", "around_peak", "missed_about"]
 
 _DEGREES_OF_FREEDOM = 8.0
 _N_ROUNDS, _N_PILOTS = 4, 1000
@@ -27,6 +27,8 @@ _DIFFERENCE = 1e-5
 # Draws that shape the next density are tempered until they are this many for each coordinate.
 _LEAST_PER_COORDINATE = 6.0
 _WIDENED = 1.1
+# Share of the draws that count as near the peak.
+_NEAR = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,13 @@ class StudentTDensity:
         white = rng.standard_normal((n, len(self.mean)))
         white *= np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, size=(n, 1)))
         return np.asarray(self.mean + white @ self.root.T)
+
+    @property
+    def least_log_density(self) -> float:
+        """Above it lie nearly all of the draws; by Fisher's distribution."""
+        d = len(self.mean)
+        at = self.mean + math.sqrt(d * float(fdtri(d, _DEGREES_OF_FREEDOM, _NEAR))) * self.root[:, 0]
+        return float(self.log_density(at[None])[0])
 
     def log_density(self, y: FloatArray) -> FloatArray:
         nu, d = _DEGREES_OF_FREEDOM, len(self.mean)
@@ -87,6 +96,11 @@ class PeakDensity:
         own = labelled[best, np.arange(len(y))]
         root = np.linalg.cholesky(_WIDENED**2 * np.cov(own, rowvar=False))
         return PeakDensity(self.space, StudentTDensity(own.mean(axis=0), np.asarray(root, dtype=np.float64)))
+
+    def near(self, y: FloatArray) -> BoolArray:
+        """Whether coordinates, with any labels, are among the densest draws; (n, 6 N + 1) -> (n,)."""
+        each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.relabelled]
+        return np.asarray(np.max(each, axis=0) > self.one.least_log_density)
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log density over the prior's, (n, 6 N + 2) -> (n,)."""
@@ -142,13 +156,39 @@ def around_peak(
     return PeakDensity(space, density), n_calls
 
 
-def evidence_about(problem: SensorProblem, density: PeakDensity, *, n_draws: int, rng: np.random.Generator) -> float:
-    """Estimate ln Z of what lies about a peak by importance sampling."""
-    _, theta, log_density = density.drawn(n_draws, rng=rng)
-    log_weight = problem.log_likelihood(theta) - log_density if len(theta) else np.empty(0)
-    if not np.isfinite(log_weight).any():
-        return -math.inf
-    return float(logsumexp(log_weight)) - math.log(n_draws)
+def missed_about(
+    problem: SensorProblem,
+    density: PeakDensity,
+    theta: FloatArray,
+    log_z: float,
+    *,
+    n_draws: int,
+    rng: np.random.Generator,
+) -> float:
+    """Tell which share of the evidence lies about a peak and has no samples, two errors below its estimate.
+
+    Parameters
+    ----------
+    problem
+        With an `SSFPrior` of uniform light.
+    density
+        About the peak.
+    theta
+        Samples of the posterior, (n, 6 N + 2).
+    log_z
+        Natural log of the evidence as they tell it.
+    n_draws
+        Draws by which the peak is weighed.
+    rng
+        Source of randomness.
+    """
+    y, drawn, log_density = density.drawn(n_draws, rng=rng)
+    near = density.near(y)
+    weight = np.exp(problem.log_likelihood(drawn[near]) - log_density[near] - log_z) if near.any() else np.zeros(1)
+    about = float(weight.sum()) / n_draws
+    error = math.sqrt(max(float((weight**2).sum()) / n_draws - about**2, 0.0) / n_draws)
+    missed = max(about - 2.0 * error - float(density.near(density.space.enter(theta)).mean()), 0.0)
+    return missed / (1.0 + missed)
 
 
 def _laplace(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -> StudentTDensity:

@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.around_peak import around_peak, evidence_about
+from probewise.calibration.around_peak import around_peak, missed_about
 from probewise.calibration.climb import N_SNAPSHOTS, Climb, Rung, climb
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_search import Found, Progress, search_order
@@ -237,9 +237,8 @@ def _searched_for_missed_peaks(posing: Posing, n: int, made: Climb, peak: Peak, 
         return made
     problem = posing.problem(n)
     density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_WEIGHED)
-    log_z = evidence_about(problem, density, n_draws=_N_WEIGHED, rng=rng)
-    share = math.exp(min(log_z - made.log_z, 0.0))
+    share = missed_about(problem, density, made.theta, made.log_z, n_draws=_N_WEIGHED, rng=rng)
     if share < _MISSED:
         return made
     higher = peak.log_likelihood - float(made.log_likelihood.max())
-    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {higher:.1f} may hold {share:.0%} of Z"))
+    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {higher:.1f} holds at least {share:.0%} of Z, and no samples"))

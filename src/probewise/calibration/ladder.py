@@ -3,7 +3,7 @@
 Where one Gaussian more raises the likelihood much, its posterior lies about the highest peak, and particles start from
 a density fitted there. Where it does not, they start from the posterior below with one more Gaussian added, and the two
 evidences are bridged by taking Gaussians away and adding them. At every order ascents from all over the prior look for
-a peak that the particles missed.
+a peak that the particles missed; a search of the whole prior vouches for the order that is chosen.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from probewise.calibration.peaks import Peak, find_peaks
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.calibration.removal import Removal, bridged
+from probewise.calibration.vouching import missed
 
 __all__ = ["climb_orders", "next_order"]
 
@@ -79,7 +80,34 @@ def climb_orders(
         found[n] = next_order(
             posing, n, found.get(n - 1), peaks[n], climbing, needed=needed, n_live=n_live, progress=progress
         )
-    return {n: found[n] for n in orders}, ()
+    return _vouched_for(posing, {n: found[n] for n in orders}, climbing, n_live=n_live, progress=progress), ()
+
+
+def _vouched_for(
+    posing: Posing,
+    found: dict[int, Found],
+    rng: np.random.Generator,
+    *,
+    n_live: int,
+    progress: Progress | None,
+) -> dict[int, Found]:
+    """Let a search of the prior vouch for the chosen order; where it does not, search that and those above in full.
+
+    The orders above may have started from its samples. Where another order is then chosen, it is asked about too.
+    """
+    asked: set[int] = set()
+    while True:
+        chosen = max(found, key=lambda n: found[n].evidence.log_z)
+        made = found[chosen].result
+        if chosen in asked or not isinstance(made, Climb):
+            return found
+        asked.add(chosen)
+        why = missed(posing, chosen, made, rng=rng, progress=progress)
+        if why:
+            note = f"searched in full, since the quick way missed a peak of order {chosen}: {why}"
+            for n in (n for n in found if n >= chosen):
+                full = search_order(posing, n, rng, n_live=n_live, progress=progress)
+                found[n] = replace(full, notes=(*full.notes, f"order {n} was {note}"))
 
 
 def _why_not_climbable(posing: Posing, highest: int) -> str:

@@ -12,7 +12,7 @@ from probewise.calibration.climb import Climb, Rung
 from probewise.calibration.posing import Posing
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 
-__all__ = ["Found", "Progress", "search_order"]
+__all__ = ["Found", "Progress", "report_of", "search_order"]
 
 Progress = Callable[[int, RoundSummary | Rung], None]
 
@@ -50,7 +50,7 @@ def search_order(
 ) -> Found:
     """Search the prior of an order by nested sampling, and refine the evidence unless asked not to."""
     problem = posing.problem(n_gaussians)
-    report = None if progress is None else _for_order(progress, n_gaussians)
+    report = None if progress is None else report_of(progress, n_gaussians)
     result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)
     if not refined:
         note = f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}"
@@ -70,5 +70,6 @@ def _disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> 
     )
 
 
-def _for_order(progress: Progress, n_gaussians: int) -> Callable[[RoundSummary], None]:
+def report_of(progress: Progress, n_gaussians: int) -> Callable[[RoundSummary], None]:
+    """Tell `progress` of the rounds of an order's nested sampling."""
     return lambda state: progress(n_gaussians, state)

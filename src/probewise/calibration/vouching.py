@@ -1,0 +1,87 @@
+"""Let one search of the whole prior vouch that a climb missed no peak: nested sampling with few live points.
+
+A climb starts at the peaks that least squares found, so a peak with a small basin may be missed. A search needs no
+start. With few live points its evidence is rough, but its samples tell where the posterior lies: where many of them
+are far from all samples of the climb, or its evidence is higher than the errors allow, the climb missed a part.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.distance import cdist
+
+from probewise._arrays import FloatArray
+from probewise.calibration.climb import Climb
+from probewise.calibration.order_search import Progress, report_of
+from probewise.calibration.posing import Posing
+from probewise.nested import NestedResult, run
+
+__all__ = ["missed", "share_apart"]
+
+_LEAST_LIVE, _LIVE_PER_PARAM = 50, 4
+# One false alarm in 30,000 where the errors are normal.
+_N_ERRORS = 4.0
+# A part is missed where it holds this share of the search's samples.
+_MISSED = 0.2
+_N_SAMPLES, _N_OWN, _N_OTHERS = 300, 500, 2000
+
+
+def missed(
+    posing: Posing, n: int, climbed: Climb, *, rng: np.random.Generator, progress: Progress | None = None
+) -> str:
+    """Say in words what a climb missed; empty where a search of the prior vouches for it.
+
+    Parameters
+    ----------
+    posing
+        Of the recording.
+    n
+        Number of Gaussians.
+    climbed
+        Posterior samples and evidence as the climb has them.
+    rng
+        Source of randomness.
+    progress
+        Told of each round.
+    """
+    problem = posing.problem(n)
+    n_live = max(_LEAST_LIVE, _LIVE_PER_PARAM * len(problem.prior.names))
+    report = None if progress is None else report_of(progress, n)
+    found = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
+    return _missed_part(posing, n, climbed, found, rng)
+
+
+def _missed_part(posing: Posing, n: int, climbed: Climb, found: NestedResult, rng: np.random.Generator) -> str:
+    error = float(np.hypot(found.log_z_error, climbed.log_z_error))
+    if found.log_z - climbed.log_z > _N_ERRORS * error:
+        return (
+            f"ln Z is {found.log_z:.2f} ± {found.log_z_error:.2f} by a search of the whole prior, "
+            f"{climbed.log_z:.2f} ± {climbed.log_z_error:.2f} by the quick way"
+        )
+    coordinates = posing.prior_of(n).coordinates
+    share = share_apart(
+        coordinates.enter(climbed.theta), coordinates.enter(found.samples(_N_SAMPLES, rng=rng)), rng=rng
+    )
+    if share > _MISSED:
+        return f"{share:.0%} of the samples of a search of the whole prior lie apart from those of the quick way"
+    return ""
+
+
+def share_apart(known: FloatArray, asked: FloatArray, *, rng: np.random.Generator) -> float:
+    """Tell which share of samples lies further from known ones than these from each other.
+
+    Parameters
+    ----------
+    known
+        Samples in coordinates, (n, d), cloud after cloud: the first tenth or so is independent of the rest.
+    asked
+        Those that are asked about, (m, d).
+    rng
+        Source of randomness.
+    """
+    own, others = known[:_N_OWN], known[_N_OWN:]
+    others = others[rng.permutation(len(others))[:_N_OTHERS]]
+    root = np.linalg.cholesky(np.cov(known, rowvar=False))
+    own, others, asked = (np.linalg.solve(root, part.T).T for part in (own, others, asked))
+    furthest = cdist(own, others).min(axis=1).max()
+    return float((cdist(asked, others).min(axis=1) > furthest).mean())

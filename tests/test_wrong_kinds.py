@@ -238,7 +238,7 @@ MISTAKES = {
     ),
     "another calibration": (
         lambda: probewise.calibrate(RECORDING, method="paper's", rng=RNG),
-        "method is .*; allowed: 'refined', 'quick' or 'paper'",
+        "method is .*; allowed: 'quick', 'full' or 'paper'",
     ),
     "a stop for nobody": (
         lambda: probewise.calibrate(RECORDING, nested_stop="change", rng=RNG),

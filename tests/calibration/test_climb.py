@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import cast
 
@@ -9,6 +10,7 @@ import pytest
 from probewise._arrays import FloatArray
 from probewise.calibration import Climb, Rung, calibrate, default_prior
 from probewise.calibration.climb import climb
+from probewise.calibration.compensation import Compensation
 from probewise.calibration.ladder import climb_orders
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference
@@ -19,6 +21,11 @@ from probewise.priors import Uniform
 from probewise.recordings import Recording
 
 
+@pytest.fixture(scope="module")
+def compensation(make_compensation: Callable[..., Compensation]) -> Compensation:
+    return make_compensation(2, np.random.default_rng(40), spread=1e-3)
+
+
 class _Levels:
     """Readings that fix the levels alone, as well with any Gaussians: the evidence is that of the levels."""
 
@@ -26,7 +33,7 @@ class _Levels:
         return np.asarray(-0.5 * (((theta[:, -2] - 11.0) / 2.0) ** 2 + ((theta[:, -1] - 58.0) / 2.0) ** 2))
 
 
-def _climbed(recording: Recording, seed: int) -> tuple[Climb, list[Rung]]:
+def _climbed(recording: Recording, compensation: Compensation, seed: int) -> tuple[Climb, list[Rung]]:
     rng = np.random.default_rng(seed)
     below, prior = default_prior(recording, 1), default_prior(recording, 2)
     rest = below.from_unit_cube(rng.random((400, 8)))
@@ -35,7 +42,7 @@ def _climbed(recording: Recording, seed: int) -> tuple[Climb, list[Rung]]:
     rungs: list[Rung] = []
     found = climb(
         problem,
-        Reference(prior, problem),
+        Reference(prior, problem, compensation),
         rest,
         log_z_below=np.full(8, -3.0),
         error_below=0.0,
@@ -46,9 +53,9 @@ def _climbed(recording: Recording, seed: int) -> tuple[Climb, list[Rung]]:
     return found, rungs
 
 
-def test_a_climb_finds_no_gain_where_there_is_none(recording: Recording) -> None:
+def test_a_climb_finds_no_gain_where_there_is_none(recording: Recording, compensation: Compensation) -> None:
     """The likelihood does not ask for the Gaussians: both orders' evidence is that of the levels. Four errors."""
-    found, rungs = _climbed(recording, 41)
+    found, rungs = _climbed(recording, compensation, 41)
     assert abs(found.log_z + 3.0) < 4 * found.log_z_error < 1.0
     assert not found.warnings
     assert found.weight.sum() == pytest.approx(1.0)
@@ -59,9 +66,9 @@ def test_a_climb_finds_no_gain_where_there_is_none(recording: Recording) -> None
     assert found.samples(500, rng=np.random.default_rng(1)).shape == (500, 14)
 
 
-def test_moves_leave_the_posterior_as_it_is(recording: Recording) -> None:
+def test_moves_leave_the_posterior_as_it_is(recording: Recording, compensation: Compensation) -> None:
     """The levels stay normal, the Gaussians as in the prior: means within five errors of independent clouds."""
-    found, _ = _climbed(recording, 42)
+    found, _ = _climbed(recording, compensation, 42)
     prior = default_prior(recording, 2)
     u = prior.to_unit_cube(found.theta)
     # Centres of all Gaussians are uniform, whichever is the heavier.
@@ -70,8 +77,8 @@ def test_moves_leave_the_posterior_as_it_is(recording: Recording) -> None:
     assert (np.abs(clouds.mean(axis=0)) < 5 * clouds.std(axis=0, ddof=1) / np.sqrt(8)).all()
 
 
-def test_a_climb_that_clouds_disagree_on_is_doubtful(recording: Recording) -> None:
-    found, _ = _climbed(recording, 43)
+def test_a_climb_that_clouds_disagree_on_is_doubtful(recording: Recording, compensation: Compensation) -> None:
+    found, _ = _climbed(recording, compensation, 43)
     apart = replace(found, log_z_of_clouds=np.array([5.0, *np.zeros(7)]))
     assert any("clouds are worth" in note for note in apart.warnings)
     assert "doubtful" in apart.summary()

@@ -50,29 +50,6 @@ def test_adding_is_taking_away_seen_from_below(recording: Recording, truth: Floa
     np.testing.assert_allclose(added, removal.taken(theta)[:, 2], atol=1e-9)
 
 
-class _Silent(Removal):
-    """A recording that says nothing."""
-
-    def _log_likelihood(self, square: FloatArray) -> FloatArray:
-        return np.zeros(square.shape[:-1])
-
-    def _bounds(self, square: FloatArray, both: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return np.zeros(square.shape[:-1]), np.ones(square.shape[:-1])
-
-
-def test_exchanges_leave_the_prior_as_it_is_where_the_recording_says_nothing(recording: Recording) -> None:
-    """Means and mean squares in the prior's cube, each within five standard errors of uniform ones."""
-    prior, rng = default_prior(recording, 2), np.random.default_rng(6)
-    removal = _Silent(prior, Posing(recording, default_prior).problem(1))
-    start = prior.from_unit_cube(rng.random((3000, 14)))
-    moved = removal.exchanged(start, n_tries=3, rng=rng)
-    assert (moved != start).any(axis=1).mean() > 0.9
-    u = prior.to_unit_cube(moved)
-    root = np.sqrt(len(u))
-    assert (np.abs(u.mean(axis=0) - 1 / 2) < 5 * np.sqrt(1 / 12) / root).all()
-    assert (np.abs((u**2).mean(axis=0) - 1 / 3) < 5 * np.sqrt(4 / 45) / root).all()
-
-
 def test_a_bridge_finds_the_ratio_of_two_normal_densities() -> None:
     """One above the other by e^2.5, a standard deviation apart; four errors of a bridge between 20,000 draws each."""
     rng = np.random.default_rng(7)

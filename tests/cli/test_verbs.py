@@ -97,8 +97,11 @@ def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_p
     assert not (out / "report.html").exists()
 
 
-@pytest.mark.parametrize(("option", "quick"), [((), False), (("--method", "quick"), True)])
-def test_a_calibration_is_quick_where_asked(option, quick, recording_file, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("option", "quick"),
+    [((), True), (("--full",), False), (("--method", "refined"), False), (("--method", "quick"), True)],
+)
+def test_a_calibration_is_quick_unless_asked_otherwise(option, quick, recording_file, tmp_path, monkeypatch):
     asked = []
 
     def stop(*_, **options):

@@ -255,13 +255,14 @@ def climb(
     n_clouds = len(log_z_below)
     n = len(rest) // n_clouds
     log_z = np.array(log_z_below)
-    now: _Cloud | None = None
-    for _ in range(_MOST_DRAWS // _DRAWS):
+
+    def drawn() -> _Cloud:
         with np.errstate(invalid="ignore"):
-            drawn = known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
-        now = drawn if now is None else now.joined(drawn, n_clouds)
-        if n_effective(now.rise) >= _KEPT * len(rest):
-            break
+            return known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
+
+    now = drawn()
+    while n_effective(now.rise) < _KEPT * len(rest) and len(now.x) < _MOST_DRAWS * len(rest):
+        now = now.joined(drawn(), n_clouds)
     temperatures, accepted, overlap = [0.0], 0.0, 1.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
         rise = now.rise

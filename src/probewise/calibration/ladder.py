@@ -31,7 +31,7 @@ __all__ = ["climb_orders", "next_order"]
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
 _N_CLOUDS = 8
-# Quadrature nodes over curved edges, where a Gaussian more is answered to first order: within 0.001 of the levels' span.
+# Quadrature nodes over curved edges where a Gaussian more is answered to first order: mostly within 0.001 of the span.
 _FEW_NODES = 8
 _N_PARTICLES = 1000
 # Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
@@ -269,4 +269,5 @@ def _searched_for_missed_peaks(posing: Posing, n: int, made: Climb, peak: Peak, 
     if share < _MISSED:
         return made
     higher = peak.log_likelihood - float(made.log_likelihood.max())
-    return replace(made, doubts=(*made.doubts, f"a peak with ln L higher by {higher:.1f} holds at least {share:.0%} of Z, and no samples"))
+    words = f"a peak with ln L higher by {higher:.1f} holds at least {share:.0%} of Z, and no samples"
+    return replace(made, doubts=(*made.doubts, words))

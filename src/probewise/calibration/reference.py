@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
@@ -34,8 +34,8 @@ _LEAST_WIDTH, _MOST_WIDTH = 0.005, 1.0
 _EVEN_MASS = 0.3
 _LEAST_RATIO = 1e-4
 _SHAPE = slice(1, 6)
-# Shares of the draws, with a compensation and without: added as is, split, compensated for.
-_WITH, _WITHOUT = (0.05, 0.15, 0.8), (0.7, 0.3, 0.0)
+# Shares of the draws that are added as they are, and that are split; the others are compensated for.
+_ADDED, _SPLIT = 0.05, 0.15
 # Share of the compensated ones whose light follows the first-order posterior.
 _TOLD = 0.7
 _TINY = float(np.finfo(float).tiny)
@@ -44,6 +44,10 @@ _TINY = float(np.finfo(float).tiny)
 def has_reference(prior: SSFPrior) -> bool:
     """Whether the light that a Gaussian holds is uniform from nothing: what `Reference` is made for."""
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
+
+
+# The mass that a new Gaussian may have at most, by those of the others: `np.min`, so that it is the last, or `np.max`.
+_MassOf: TypeAlias = Callable[..., FloatArray]
 
 
 class _Draw(Protocol):
@@ -95,12 +99,12 @@ class Reference:
     below
         Problem of N - 1 Gaussians.
     compensation
-        How the others shift; None: nothing is compensated for.
+        How the others shift.
     """
 
     prior: SSFPrior
     below: SensorProblem
-    compensation: Compensation | None = None
+    compensation: Compensation
 
     def __post_init__(self) -> None:
         if self.prior.n_gaussians < 2 or not has_reference(self.prior):
@@ -109,14 +113,11 @@ class Reference:
     @cached_property
     def proposals(self) -> tuple[JumpProposal, ...]:
         """The ways that are mixed."""
-        added, split, compensated = _WITHOUT if self.compensation is None else _WITH
-        plain = (
-            JumpProposal(added, self.with_last, lambda theta: (self.without_last(theta), self.log_added(theta))),
-            JumpProposal(split, self.split, lambda theta: (self.merged(theta), self.log_split(theta))),
+        return (
+            JumpProposal(_ADDED, self.with_last, lambda theta: (self.without_last(theta), self.log_added(theta))),
+            JumpProposal(_SPLIT, self.split, lambda theta: (self.merged(theta), self.log_split(theta))),
+            JumpProposal(1.0 - _ADDED - _SPLIT, self.with_compensated, self.uncompensated),
         )
-        if self.compensation is None:
-            return plain
-        return (*plain, JumpProposal(compensated, self.with_compensated, self.uncompensated))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
@@ -139,9 +140,9 @@ class Reference:
     def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Take away any Gaussian but the first, undo the shift of the others, add another one and shift them for it.
 
-        The new one may be as heavy as the first, so that all others are moved, not the lightest alone. `here` is sorted;
-        returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new, both over
-        the prior's, (n,); -inf where the move is impossible.
+        The new one may be as heavy as the first, so that all others are moved, not the lightest alone. `here` is
+        sorted; returns the new parameters, (n, 6 N + 2), and the log of the density of the old over that of the new,
+        both over the prior's, (n,); -inf where the move is impossible.
         """
         m, n = len(here), self.prior.n_gaussians
         g = here[:, :-2].reshape(m, n, 6)
@@ -189,13 +190,13 @@ class Reference:
         return self._uncompensated(self.without_last(theta), theta[:, -8:-2], np.min)
 
     def _compensated(
-        self, rest: FloatArray, most_of: Callable[..., FloatArray], rng: np.random.Generator
+        self, rest: FloatArray, most_of: _MassOf, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, Answer]:
         """Shift N - 1 sorted Gaussians for one of a mass up to `most_of` theirs; that one, (n, 6), and the answer."""
-        last, answer = self._compensation.draw(len(rest), rng=rng)
+        last, answer = self.compensation.draw(len(rest), rng=rng)
         near = np.flatnonzero(rng.random(len(rest)) < _NEAR)
         last[near] = self._drawn_near_one(rest[near], rng)
-        answer = answer.put(near, self._compensation.linear.answer(last[near]))
+        answer = answer.put(near, self.compensation.linear.answer(last[near]))
         masses = self._masses(rest)
         whole, most = masses.sum(axis=1), most_of(masses, axis=1)
         told = answer.draw_share(most / (whole + most), rng=rng)
@@ -203,25 +204,28 @@ class Reference:
         ratio = np.where(by_share, told / (1.0 - told) * whole / most, _drawn_ratio(len(rest), rng))
         last[:, 0] = ratio * most * self._scale(last)
         share = ratio * most / (whole + ratio * most)
-        coordinates = self._compensation.coordinates
+        coordinates = self.compensation.coordinates
         return coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)[0], last, answer
 
-    def _uncompensated(
-        self, after: FloatArray, last: FloatArray, most_of: Callable[..., FloatArray]
-    ) -> tuple[FloatArray, FloatArray]:
+    def _uncompensated(self, after: FloatArray, last: FloatArray, most_of: _MassOf) -> tuple[FloatArray, FloatArray]:
         """Undo `_compensated`; also the log of its density over the prior's, but for likelihood and N."""
-        answer = self._compensation.linear.answer(last)
+        answer = self.compensation.linear.answer(last)
         mass = last[:, 0] / self._scale(last)
         share = mass / (self._masses(after).sum(axis=1) + mass)
-        coordinates = self._compensation.coordinates
+        coordinates = self.compensation.coordinates
         before = coordinates.leave(coordinates.enter(after) - share[:, None] * answer.shift)[0]
         return before, self._log_compensated(before, after, last, answer, most_of)
 
     def _log_compensated(
-        self, before: FloatArray, after: FloatArray, last: FloatArray, answer: Answer, most_of: Callable[..., FloatArray]
+        self,
+        before: FloatArray,
+        after: FloatArray,
+        last: FloatArray,
+        answer: Answer,
+        most_of: _MassOf,
     ) -> FloatArray:
         """Log density of `_compensated` over the prior's, but for likelihood and N, (n,)."""
-        coordinates = self._compensation.coordinates
+        coordinates = self.compensation.coordinates
         masses, mass = self._masses(after), last[:, 0] / self._scale(last)
         whole, most = masses.sum(axis=1), most_of(masses, axis=1)
         share, ratio = mass / (whole + mass), mass / most
@@ -230,16 +234,10 @@ class Reference:
         log_share += np.log(most * whole) - 2.0 * np.log(whole + mass)  # d share / d ratio
         log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_ratio_density(ratio), math.log(_TOLD) + log_share)
         near = self._log_near_one(last, np.where(np.isfinite(log_before)[:, None], before, after))
-        log_shape = np.logaddexp(math.log(1.0 - _NEAR) + self._compensation.log_tilt(answer), math.log(_NEAR) + near)
+        log_shape = np.logaddexp(math.log(1.0 - _NEAR) + self.compensation.log_tilt(answer), math.log(_NEAR) + near)
         with np.errstate(invalid="ignore"):  # where both are impossible
             found = log_shape + log_ratio - np.log(most) + log_before - log_after
         return np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
-
-    @property
-    def _compensation(self) -> Compensation:
-        if self.compensation is None:
-            raise ParameterError("compensation", None, "a Compensation; give one to the reference")
-        return self.compensation
 
     def _drawn_near_one(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draw Gaussians of no certain mass near one of the others, (n, 6 N - 4) -> (n, 6)."""

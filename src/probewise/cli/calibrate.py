@@ -27,14 +27,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"numbers of Gaussians to compare (default {' '.join(map(str, ORDERS))})",
     )
-    add_count(parser, "--live", f"live points of nested sampling (default {N_LIVE})", default=N_LIVE)
-    parser.add_argument(
-        "--method",
-        choices=("refined", "quick", "paper"),
+    add_count(
+        parser,
+        "--live",
+        f"live points where a number of Gaussians is searched in full (default {N_LIVE})",
+        default=N_LIVE,
+    )
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument(
+        "--full",
+        dest="method",
+        action="store_const",
+        const="full",
         default=CALIBRATION,
-        help="refined (default): log-uniform priors of widths, each evidence refined by importance sampling; quick: "
-        "the same priors, sequential Monte Carlo from the peaks of the likelihood; paper: uniform "
-        "priors, evidence by nested sampling alone",
+        help="search the whole prior of every number of Gaussians by nested sampling, and refine each evidence by "
+        "importance sampling; the same as --method full",
+    )
+    way.add_argument(
+        "--method",
+        choices=("quick", "full", "paper", "refined"),
+        default=CALIBRATION,
+        help="quick (default): sequential Monte Carlo from the peaks of the likelihood, vouched for by one search of "
+        "the prior; full: see --full (refined is its former name); paper: uniform priors, evidence by nested sampling "
+        "alone",
     )
     parser.add_argument(
         "--nested-stop",

@@ -6,6 +6,9 @@ python benchmarks/quick_calibration.py --seeds 12 --sensors 2 --seed 28 --out do
 the scatter: chi-square a run, about the log of the mean evidence. `--sensors` concealed sensors of one Gaussian, and
 as many of two, are calibrated both ways: differences in units of both errors, the chosen orders, cpu seconds, and how
 many 95 % intervals of the sensors of one Gaussian hold the truth. A run that was stopped resumes from `--out`.
+
+`--reference` runs of nested sampling with `--live` live points of each order, of the same recording, are what the
+evidences are held against; runs that are there already are kept.
 """
 
 from __future__ import annotations
@@ -21,8 +24,10 @@ import numpy as np
 from tqdm import tqdm
 
 from probewise import __version__
-from probewise.calibration import Calibration, calibrate
+from probewise.calibration import Calibration, calibrate, default_prior
 from probewise.calibration.coverage import Truth, draw_truth, intervals_that_hold, simulate_truth
+from probewise.calibration.order_search import search_order
+from probewise.calibration.posing import Posing
 from probewise.errors import DoubtfulResultWarning
 from probewise.recordings import Recording, paper_plan, read_recording, shipped, two_way_plan, write_text_atomically
 from probewise.world import Blob, World, gaussian_spot
@@ -60,6 +65,27 @@ def two_lobes(rng: np.random.Generator) -> Recording:
     return World(spot, noise_sd=0.4).simulate(paper_plan(), rng=rng)
 
 
+def reference_runs(
+    recording: Recording, orders: tuple[int, ...], *, n_runs: int, n_live: int, seed: int, out: Path
+) -> None:
+    """Search each order so many times, order after order, and write every run."""
+    posing = Posing(recording, default_prior)
+    streams = {n: np.random.default_rng([seed, n]).spawn(n_runs) for n in orders}
+    document: dict[str, object] = {"n_live": n_live, "seed": seed, "date": datetime.date.today().isoformat()}
+    rows: list[dict[str, object]] = json.loads(out.read_text())["runs"] if out.exists() else []
+    done = {(row["run"], row["order"]) for row in rows}
+    for run, n in tqdm([(run, n) for run in range(n_runs) for n in orders if (run, n) not in done], desc="reference"):
+        began = time.process_time()
+        found = search_order(posing, n, streams[n][run], n_live=n_live)
+        result, refined = found.result, found.refined
+        row: dict[str, object] = {"run": run, "order": n, "log_z": result.log_z, "log_z_error": result.log_z_error}
+        if refined is not None:
+            row |= {"refined": refined.log_z, "refined_error": refined.log_z_error, "sound": refined.sound}
+        rows.append({**row, "cpu_s": round(time.process_time() - began, 1)})
+        document["runs"] = rows
+        write_text_atomically(out, json.dumps(document, indent=1) + "\n")
+
+
 def main() -> None:
     """Run, print and write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -67,6 +93,8 @@ def main() -> None:
     parser.add_argument("--sensors", type=int, default=2)
     parser.add_argument("--orders", type=int, nargs="+", default=[1, 2, 3, 4], help="of the sensors")
     parser.add_argument("--seed", type=int, default=28)
+    parser.add_argument("--reference", type=int, default=0, help="runs of nested sampling, and nothing else")
+    parser.add_argument("--live", type=int, default=3000, help="live points of these")
     parser.add_argument("--recording", type=Path, help="CSV file in place of the shipped one")
     parser.add_argument("--two-way", action="store_true", help="961 simulated readings in place of the shipped ones")
     parser.add_argument("--out", type=Path, required=True)
@@ -78,6 +106,9 @@ def main() -> None:
         spot = gaussian_spot([Blob(1.0, (0.5, 1.5), (4.0, 2.5), 0.1)])
         paper = World(spot, noise_sd=0.5).simulate(two_way_plan(), rng=rng)
     orders = tuple(asked.orders)
+    if asked.reference:
+        reference_runs(paper, orders, n_runs=asked.reference, n_live=asked.live, seed=asked.seed, out=asked.out)
+        return
     document: dict[str, object] = {
         "command": f"benchmarks/quick_calibration.py --seeds {asked.seeds} --sensors {asked.sensors} "
         f"--orders {' '.join(map(str, orders))} --seed {asked.seed}"

@@ -111,7 +111,7 @@ def calibrate(
     >>> import probewise
     >>> from probewise.recordings import shipped
     >>> recording = probewise.read_recording(shipped("paper"))
-    >>> calibration = probewise.calibrate(recording, orders=[1], n_live=20, rng=np.random.default_rng(1))
+    >>> calibration = probewise.calibrate(recording, orders=[1], rng=np.random.default_rng(1))
     >>> calibration.sensor.n_gaussians
     1
     """

@@ -146,7 +146,8 @@ def calibrate(
         Source of randomness; spawned for each order.
     quick
         Whether to reach each order by sequential Monte Carlo, from the peak of its likelihood or from the order
-        below. An order whose climb is doubtful is searched by nested sampling, and a note says so.
+        below; one search of the prior vouches for the chosen order. An order whose climb is doubtful is searched by
+        nested sampling, and a note says so. `probewise.calibrate` does this by default.
     progress
         Called with the order and a `RoundSummary` after every round, or a `Rung` after every temperature of a climb;
         not with a process pool.

@@ -133,7 +133,9 @@ def main() -> None:
     pairs: list[dict[str, object]] = before.get("sensors", [])
     if runs:
         document["paper"] = {"runs": runs, **scatter(runs)}
-    for stream in tqdm(rng.spawn(asked.sensors)[len(pairs) // 2 :], desc="sensors"):
+    done = {pair["sensor"] for pair in pairs}
+    left = [(k, stream) for k, stream in enumerate(rng.spawn(asked.sensors)) if k not in done]
+    for k, stream in tqdm(left, desc="sensors"):
         truth = draw_truth(rng=stream)
         for recording, known in ((simulate_truth(truth, rng=stream), truth), (two_lobes(stream), None)):
             quick, full = (timed(recording, stream, quick=way, orders=orders, truth=known) for way in (True, False))
@@ -141,6 +143,7 @@ def main() -> None:
             error = np.hypot(quick["log_z_error"], full["log_z_error"])  # type: ignore[call-overload]
             pairs.append(
                 {
+                    "sensor": k,
                     "gaussians": "two" if known is None else "one",
                     "quick": quick,
                     "full": full,

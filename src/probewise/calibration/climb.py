@@ -31,7 +31,7 @@ _N_STEPS = 3
 _BISECTIONS = 40
 _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: so many at a time, until enough are effective, and at most.
-_DRAWS, _MOST_DRAWS = 2, 4
+_DRAWS, _MOST_DRAWS = 2, 16
 # Times that the posterior's samples are kept; moves of each particle once it is reached, and between two afresh.
 N_SNAPSHOTS = 4
 _N_MORE, _AFRESH = 24, 2
@@ -292,6 +292,8 @@ def climb(
         if told is not None:
             told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
     kept = []
+    # A reference that is far from the posterior is forgotten late.
+    n_more *= len(temperatures) - 1
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     if temperatures[-1] == 1.0:
         for k in range(1, n_more + 1):

@@ -24,6 +24,7 @@ from probewise.calibration.peaks import Peak, find_peaks
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.calibration.removal import Removal, bridged
+from probewise.calibration.seeded import SeededReference
 from probewise.calibration.vouching import missed
 
 __all__ = ["climb_orders", "next_order"]
@@ -48,7 +49,7 @@ _N_FITTED = 6000
 _DISAGREE, _APART = 4.0, 1.0
 # A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
 _HIGHER, _MISSED = 2.0, 0.2
-_N_WEIGHED = 400
+_N_PILOTS, _N_WEIGHED = 400, 2000
 
 
 def climb_orders(
@@ -154,7 +155,7 @@ def next_order(
     """
     told: Callable[[Rung], None] | None = None if progress is None else partial(progress, n)
     about = partial(_about_peak, posing, n, peak, rng, told)
-    from_below = None if below is None else partial(_from_below, posing, n, below, rng, told)
+    from_below = None if below is None else partial(_from_below, posing, n, below, peak, rng, told)
     ways = [about, from_below] if needed else [from_below, about]
     notes: list[str] = []
     for way in ways:
@@ -206,9 +207,9 @@ def _about_peak(
 
 
 def _from_below(
-    posing: Posing, n: int, below: Found, rng: np.random.Generator, told: Callable[[Rung], None] | None
+    posing: Posing, n: int, below: Found, peak: Peak, rng: np.random.Generator, told: Callable[[Rung], None] | None
 ) -> Climb:
-    """Carry particles from the posterior of n - 1 to that of n, and bridge the two."""
+    """Carry particles from the posterior of n - 1, and some from the peak, to that of n; bridge the two posteriors."""
     problem_below, alone = posing.problem(n - 1), posing.problem(1)
     coordinates = posing.prior_of(n - 1).coordinates
     start = below.evidence
@@ -219,7 +220,10 @@ def _from_below(
         log_z, error = np.full(_N_CLOUDS, start.log_z), start.log_z_error
     few = rest[:: len(rest) // _N_PARTICLES]
     compensation = Compensation.of(problem_below, coordinates, posing.problem(1, n_nodes=_FEW_NODES), few, rng=rng)
-    reference = Reference(posing.prior_of(n), problem_below, compensation)
+    about = tuple(
+        around_peak(posing.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in (peak.theta, *peak.others)
+    )
+    reference = SeededReference(Reference(posing.prior_of(n), problem_below, compensation), about, start.log_z)
     removal = Removal(posing.prior_of(n), alone)
     made = climb(
         posing.problem(n),
@@ -264,7 +268,7 @@ def _searched_for_missed_peaks(posing: Posing, n: int, made: Climb, peak: Peak, 
     if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:
         return made
     problem = posing.problem(n)
-    density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_WEIGHED)
+    density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_PILOTS)
     share = missed_about(problem, density, made.theta, made.log_z, n_draws=_N_WEIGHED, rng=rng)
     if share < _MISSED:
         return made

@@ -33,14 +33,17 @@ _PRIOR_CURVATURE = 0.1
 _EDGE = 1e-6
 _STUCK = 1e6
 _SETTLED = 1e-3
+# Other peaks: ln L differs by so much from the next higher one, and is lower than the highest by so much at most.
+_SAME, _HARDLY_LOWER, _N_OTHERS = 0.05, 6.0, 3
 
 
 @dataclass(frozen=True, eq=False)
 class Peak:
-    """The highest place found, (n_params,), and ln L there."""
+    """The highest place found, (n_params,), ln L there, and other peaks that are hardly lower, (n_others, n_params)."""
 
     theta: FloatArray
     log_likelihood: float
+    others: FloatArray
 
 
 def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np.random.Generator) -> dict[int, Peak]:
@@ -157,8 +160,11 @@ def _local_maxima(problem: SensorProblem, responses: LoneResponses, starts: Floa
         z[up], off[up], high[up] = to[better], there[better], reached[better]
         damping[rows] = (damping[rows] * np.where(better, _LOOSER, _TIGHTER)).clip(1e-9, 1e9)
         going[rows] = (gain > _SETTLED) | (~better & (damping[rows] < _STUCK))
-    best = int(np.argmax(high))
-    return Peak(prior.from_unit_cube(expit(z[best : best + 1]))[0], float(high[best]))
+    order = np.argsort(-high)
+    theta, high = prior.from_unit_cube(expit(z[order])), high[order]
+    lower = -np.diff(high, prepend=high[0] + 1.0)
+    others = np.flatnonzero((lower > _SAME) & (high > high[0] - _HARDLY_LOWER))[1 : 1 + _N_OTHERS]
+    return Peak(theta[0], float(high[0]), theta[others])
 
 
 def _slopes(prior: SSFPrior, responses: LoneResponses, z: FloatArray) -> FloatArray:

@@ -1,0 +1,71 @@
+"""A density to start from in two parts: from the order below, and about the highest peak.
+
+The order below tells of most of a posterior, but its draws may leave out a peak that is narrow. A part of the
+particles starts about the peaks that least squares found, so that each is seen where it holds a part of the evidence.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.calibration.around_peak import PeakDensity
+from probewise.calibration.priors import SSFPrior
+from probewise.calibration.reference import Reference
+
+__all__ = ["SeededReference"]
+
+_SHARE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class SeededReference:
+    """A reference mixed with densities about peaks: a `KnownDensity`.
+
+    Parameters
+    ----------
+    reference
+        Made from the posterior of N - 1 Gaussians.
+    peaks
+        Densities about the highest peaks of N, one or more.
+    log_z_below
+        Natural log of the evidence of N - 1.
+    """
+
+    reference: Reference
+    peaks: tuple[PeakDensity, ...]
+    log_z_below: float
+
+    @property
+    def prior(self) -> SSFPrior:
+        """Of N Gaussians."""
+        return self.reference.prior
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
+        each = math.log(_SHARE / len(self.peaks)) + self.log_z_below
+        parts = [each + peak.log_likelihood(theta) for peak in self.peaks]
+        return np.asarray(logsumexp([math.log(1.0 - _SHARE) + self.reference.log_likelihood(theta), *parts], axis=0))
+
+    def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw one for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
+        out = np.empty((len(rest), rest.shape[1] + 6))
+        for density, rows in self._shared_out(len(rest), rng):
+            out[rows] = density.draw(rest[rows], rng=rng)
+        return out
+
+    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Propose afresh by either, as `KnownDensity.redrawn` says."""
+        there, log_drawn = np.empty(here.shape), np.empty(len(here))
+        for density, rows in self._shared_out(len(here), rng):
+            there[rows], log_drawn[rows] = density.redrawn(here[rows], rng=rng)
+        return there, log_drawn
+
+    def _shared_out(self, n: int, rng: np.random.Generator) -> list[tuple[PeakDensity | Reference, IntArray]]:
+        """Share out rows at random: to the peaks, then to the reference."""
+        which = np.minimum((rng.random(n) * len(self.peaks) / _SHARE).astype(np.int64), len(self.peaks))
+        return [(density, np.flatnonzero(which == k)) for k, density in enumerate((*self.peaks, self.reference))]

@@ -8,9 +8,12 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SSFPrior, default_prior
+from probewise.calibration.around_peak import PeakDensity, StudentTDensity
 from probewise.calibration.compensation import Compensation
+from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
+from probewise.calibration.seeded import SeededReference
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective
@@ -61,6 +64,29 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
     found[alive] = weight[alive] * asked(drawn[alive])
     error = np.hypot(found.std(), asked(plain).std()) / np.sqrt(len(drawn))
     assert abs(found.mean() - asked(plain).mean()) < 4 * error
+
+
+def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
+    references: dict[int, Reference], recording: Recording
+) -> None:
+    """Where the recording says nothing and both evidences are one: mean weight one within four errors."""
+    rng, space = np.random.default_rng(36), PeakCoordinates(references[2].prior)
+    y = space.enter(space.prior.from_unit_cube(rng.random((2000, 14))))
+    peaks = tuple(
+        PeakDensity(space, StudentTDensity(y.mean(axis=0), width * np.linalg.cholesky(np.cov(y, rowvar=False))))
+        for width in (0.4, 0.9)
+    )
+    seeded = SeededReference(references[2], peaks, 0.0)
+    drawn = seeded.draw(_sorted_draws(default_prior(recording, 1), 10_000, rng), rng=rng)
+    weight = np.zeros(len(drawn))
+    alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
+    alive = alive[np.isfinite(seeded.prior.log_prob(drawn[alive]))]
+    coordinates = seeded.prior.coordinates
+    weight[alive] = np.exp(-seeded.log_likelihood(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
+    assert abs(weight.mean() - 1.0) < 4 * weight.std() / np.sqrt(len(weight)) < 0.4
+    there, log_drawn = seeded.redrawn(drawn[alive], rng=rng)
+    assert there.shape == (len(alive), 14)
+    assert np.isfinite(log_drawn).mean() > 0.1
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -68,4 +68,5 @@ class SeededReference:
     def _shared_out(self, n: int, rng: np.random.Generator) -> list[tuple[PeakDensity | Reference, IntArray]]:
         """Share out rows at random: to the peaks, then to the reference."""
         which = np.minimum((rng.random(n) * len(self.peaks) / _SHARE).astype(np.int64), len(self.peaks))
-        return [(density, np.flatnonzero(which == k)) for k, density in enumerate((*self.peaks, self.reference))]
+        densities: tuple[PeakDensity | Reference, ...] = (*self.peaks, self.reference)
+        return [(density, np.flatnonzero(which == k)) for k, density in enumerate(densities)]

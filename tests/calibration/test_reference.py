@@ -87,6 +87,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
     there, log_drawn = seeded.redrawn(drawn[alive], rng=rng)
     assert there.shape == (len(alive), 14)
     assert np.isfinite(log_drawn).mean() > 0.1
+    assert seeded.redrawn(drawn[:0], rng=rng)[0].shape == (0, 14)
 
 
 @pytest.mark.parametrize("n", [2, 3])

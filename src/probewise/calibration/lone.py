@@ -37,7 +37,8 @@ class LoneResponses:
     def to_each(self, theta: FloatArray) -> FloatArray:
         """Respond to each Gaussian of mixtures, (n, 6 N + 2) -> (n, N, n_used)."""
         n_gaussians = theta.shape[1] // 6
-        return self.to(theta[:, :-2].reshape(-1, 6)).reshape(len(theta), n_gaussians, -1)
+        seen = self.to(theta[:, :-2].reshape(-1, 6))
+        return seen.reshape(len(theta), n_gaussians, seen.shape[1])
 
 
 def light_of(theta: FloatArray) -> FloatArray:

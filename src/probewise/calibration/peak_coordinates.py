@@ -62,7 +62,7 @@ class PeakCoordinates:
         shape[..., 2] = np.log(0.5 * g[..., 4] / det)
         shape[..., 3] = np.log(0.5 * g[..., 3] / det)
         shape[..., 4] = np.arctanh(-g[..., 5] / np.sqrt(g[..., 3] * g[..., 4]))
-        return np.concatenate([log_light @ self._contrasts.T, shape.reshape(len(theta), -1), theta[:, -2:]], axis=1)
+        return np.concatenate([log_light @ self._contrasts.T, shape.reshape(len(theta), 5 * n), theta[:, -2:]], axis=1)
 
     def leave(self, y: FloatArray, sum_of_logs: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
         """Map coordinates to parameters; also return the prior's log density there, labels counted apart.

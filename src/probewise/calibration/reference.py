@@ -147,7 +147,7 @@ class Reference:
         m, n = len(here), self.prior.n_gaussians
         g = here[:, :-2].reshape(m, n, 6)
         label = rng.integers(1, n, size=m)
-        others = g[np.arange(n) != label[:, None]].reshape(m, -1)
+        others = g[np.arange(n) != label[:, None]].reshape(m, 6 * (n - 1))
         rest = np.concatenate([others, here[:, -2:]], axis=1)
         before, log_here = self._uncompensated(rest, g[np.arange(m), label], np.max)
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)

@@ -7,6 +7,8 @@ are far from all samples of the climb, or its evidence is higher than the errors
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from scipy.spatial.distance import cdist
 
@@ -14,6 +16,7 @@ from probewise._arrays import FloatArray
 from probewise.calibration.climb import Climb
 from probewise.calibration.order_search import Progress, report_of
 from probewise.calibration.posing import Posing
+from probewise.errors import DoubtfulResultWarning
 from probewise.nested import NestedResult, run
 
 __all__ = ["missed", "share_apart"]
@@ -47,7 +50,10 @@ def missed(
     problem = posing.problem(n)
     n_live = max(_LEAST_LIVE, _LIVE_PER_PARAM * len(problem.prior.names))
     report = None if progress is None else report_of(progress, n)
-    found = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
+    with warnings.catch_warnings():
+        # So few live points are rough, which is known; nobody sees this run.
+        warnings.simplefilter("ignore", DoubtfulResultWarning)
+        found = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
     return _missed_part(posing, n, climbed, found, rng)
 
 

@@ -85,6 +85,20 @@ def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_en
     np.testing.assert_allclose(found[after], 1.2 * np.exp(-0.5 * (times[after] - 5)), atol=1e-3)
 
 
+def test_what_a_tank_spills_into_the_next_one_is_there():
+    """Closed forms: full from ln 2 / .5 on, it spills 1 - .5 * 1 of its inflow, of which the next one takes up .6.
+
+    Beside it nothing flows out of the next one, so what both hold, and what went to waste, is what has flown in.
+    """
+    law = Law({"upper": 0.0, "lower": 0.0}, lambda s, p, u: {"upper": 1 - 0.5 * s["upper"], "lower": 0.5 * s["upper"]})
+    table = _table(np.linspace(0, 6, 121))
+    bound = Limit("upper", np.full((1, 1), 1.0), spilt={"lower": np.full((1, 1), 0.6)})
+    found = _states(Motion(law).with_limit(bound), table, {}, 0.05)
+    spilt = 0.5 * np.maximum(table.time_s - 2 * np.log(2), 0)
+    np.testing.assert_allclose(found["upper"], np.minimum(2 * (1 - np.exp(-0.5 * table.time_s)), 1), atol=1e-3)
+    np.testing.assert_allclose(found["upper"] + found["lower"] + 0.4 * spilt, table.time_s, atol=1e-3)
+
+
 def test_time_that_falls_within_a_run_is_refused_with_the_row():
     with pytest.raises(ParameterError, match=r"row 4.*allowed: a time that does not fall"):
         _ = RowsInRuns(_table([0.0, 1.0, 0.5])).rows

@@ -36,11 +36,15 @@ Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 
 @dataclass(frozen=True, eq=False)
 class Limit:
-    """A bound of a state: `level` (n_samples, 1), an upper bound if `upper`, else a lower bound."""
+    """A bound of a state: `level` (n_samples, 1), an upper bound if `upper`, else a lower bound.
+
+    What it stops goes nowhere, but for the shares `spilt` (n_samples, 1), by state, that other states take up.
+    """
 
     state: str
     level: FloatArray
     upper: bool = True
+    spilt: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +106,8 @@ class Motion:
             rate, at = out[limit.state], s[limit.state]
             stopped = (at >= limit.level) & (rate > 0) if limit.upper else (at <= limit.level) & (rate < 0)
             out[limit.state] = np.where(stopped, 0.0, rate)
+            for other, share in limit.spilt.items():
+                out[other] = out[other] + share * np.where(stopped, rate, 0.0)
         return out
 
     def at_end_of_step(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
@@ -109,8 +115,10 @@ class Motion:
         for state, way in ways.items():
             after[state] = np.where(way * after[state] < 0, 0.0, after[state])
         for limit in self.limits:
-            bound = np.minimum if limit.upper else np.maximum
-            after[limit.state] = bound(after[limit.state], limit.level)
+            bound, before = np.minimum if limit.upper else np.maximum, after[limit.state]
+            after[limit.state] = bound(before, limit.level)
+            for other, share in limit.spilt.items():
+                after[other] = after[other] + share * (before - after[limit.state])
         return after
 
 

@@ -8,6 +8,7 @@ from probewise.effects import is_out_of_vocabulary
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.proposals import proposals
+from probewise.systems.motion import Motion
 
 SD = 0.01
 N_ROWS = 60
@@ -224,3 +225,29 @@ def test_no_form_has_the_name_of_an_effect_out_of_vocabulary():
     """Such a name would count as unknown however sure it is: `gain_step` did, as a light sensor's jump of the gain."""
     assert "gain_step" in FORMS
     assert not any(is_out_of_vocabulary(name) for name in FORMS)
+
+
+def test_an_overflow_goes_to_waste_or_into_a_state_that_it_drives():
+    """Of two tanks in a row the upper one may overflow into the lower one, the lower one to waste only."""
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"rate": (0.0, 2.0)},
+        law=Law({"lower": 0.0, "upper": 0.0}, lambda s, p, u: {
+            "upper": p["rate"] - 0.5 * s["upper"], "lower": 0.5 * s["upper"] - 0.3 * s["lower"],
+        }, max_step_s=0.02),
+        time="t_s", run="run", noise=Noise(sd=SD),
+    )  # fmt: skip
+    forms = forms_of(_about(simulator))
+    wasted, taken = forms["limit:upper"].variants()
+    assert (wasted.fixed, taken.fixed) == (("share[lower]",), ())
+    assert [variant.fixed for variant in forms["limit:lower"].variants()] == [("share[upper]",)]
+    level = forms["limit:upper"].bank()[3, 0, 0]
+    theta = np.array([[level, 0.0], [level, 0.5], [level, 1.0]])
+    law = simulator.law
+    motions = [wasted.apply(Motion(law), theta[k : k + 1], TABLE) for k in range(3)]
+    full = {"upper": np.full((1, 1), level), "lower": np.full((1, 1), 0.1)}
+    given = {"rate": np.full((1, 1), 2.0)}
+    into_lower = [float(motion.rates(full, given, {}, {})["lower"][0, 0]) for motion in motions]
+    over = 2.0 - 0.5 * level
+    np.testing.assert_allclose(np.diff(into_lower), 0.5 * over)
+    assert "lower takes up 0.50" in taken.sentence(np.array([level, 0.5]), np.array([0.01, 0.01]))
+    assert "takes up" not in wasted.sentence(np.array([level, 5e-10]), np.array([0.01, 3e-10]))

@@ -41,6 +41,7 @@ MOST_OUT_OF_VOCABULARY = 3  # combinations of one size that are refitted with so
 # (495 concealed recordings of seed 9203); the threshold was not varied.
 FAINT = 0.35
 ABSORBED = 0.01  # of a trace; of what a null takes up all but so little no refit shows more
+FEW_VARIANTS = 2  # of an effect, which are all refitted: screening is no judge of a bound
 VARIANTS_TRIED = 0.05  # of the leading variant's weight: the next, of an effect bound to scans, is refitted too
 
 # Backward elimination.

@@ -20,7 +20,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.search.constants import ALIASED_NATS, SAME_MODE, STEERING, VARIANTS_TRIED
+from probewise.diagnosis.search.constants import ALIASED_NATS, FEW_VARIANTS, SAME_MODE, STEERING, VARIANTS_TRIED
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.twins import Swap, are_proportional
 from probewise.diagnosis.search.weighed_fit import WeighedFit
@@ -256,8 +256,11 @@ def _gains(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
 def _worth_trying(templates: EffectTemplates, weights: FloatArray) -> list[int]:
     """Choose the variants of an effect to refit: the leading one, and the next if they are bound to scans.
 
-    Two scans of opposite direction are aliased to first order; a refit shows which one was turned by 30 degrees.
+    Two scans of opposite direction are aliased to first order; a refit shows which one was turned by 30 degrees. Of few
+    variants, as of a tank that overflows to waste or into the next one, all are refitted.
     """
+    if len(weights) <= FEW_VARIANTS:
+        return np.argsort(-weights).tolist()
     first, *others = np.argsort(-weights)[:2].tolist()
     bound = templates.variants[first].scans or templates.variants[first].patterns
     return [first, *(k for k in others if bound and weights[k] > VARIANTS_TRIED * weights[first])]

@@ -202,9 +202,11 @@ def noise_found(searched: Searched, best: Best, samples: ModelSamples, *, rng: n
 
 def parameters_of(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
     """Describe samples of an effect's parameters, (n_samples, n_params); `unit` is that of a reading."""
+    fixed = getattr(effect, "fixed", ())
     return tuple(
         _parameter(name, unit_in_words(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
+        if name not in fixed
     )
 
 

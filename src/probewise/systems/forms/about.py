@@ -21,6 +21,7 @@ _ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
 _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none
 _TYPICAL = 1.0  # rms change of the readings by an effect of typical size, in noise sds
+_NUDGE = 1e-3  # of a state's range
 _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without an amplitude are searched
 
 
@@ -59,6 +60,19 @@ class About:
             system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step
         )
         return {state: values[0] for state, values in found.items()}
+
+    def drives(self, state: str, other: str) -> bool:
+        """Return whether the rate of another state depends on a state, somewhere in this table."""
+        law = self.system.simulator.law
+        if law is None:
+            return False
+        parameters = self.system.parameters(self.theta, self.table)
+        columns = given_columns(self.system.simulator, self.table)
+        there = {name: values[None, :] for name, values in self.states.items()}
+        nudged = there | {state: there[state] + _NUDGE * np.ptp(there[state])}
+        with np.errstate(all="ignore"):
+            apart = np.subtract(*(law.rates(s, parameters, columns)[other] for s in (nudged, there)))
+        return bool(np.any(np.abs(apart) > 0))
 
     @property
     def tells_runs_apart(self) -> bool:

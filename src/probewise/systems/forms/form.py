@@ -83,6 +83,10 @@ class Form:
         Converts an entry and the fitted amounts of its columns to a setting, if amplitudes do not scale independently.
     expression
         Formula of a proposal, which has no name in the vocabulary; otherwise empty.
+    alternatives
+        The same form with other priors and entries, of which one holds: variants beside this one.
+    fixed
+        Names of parameters that this one of several alternatives has at zero; reports leave them out.
     """
 
     name: str
@@ -98,6 +102,8 @@ class Form:
     moments: Moments | None = None
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     expression: str = ""
+    alternatives: tuple[Form, ...] = ()
+    fixed: tuple[str, ...] = ()
 
     @cached_property
     def prior(self) -> Product:
@@ -151,9 +157,9 @@ class Form:
         return ()
 
     def variants(self) -> tuple[Form, ...]:
-        """Return one variant for each interval between two readings in which the change point may lie."""
+        """Return its alternatives, or a variant for each interval between readings in which a change point may lie."""
         if self.moments is None:
-            return (self,)
+            return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
         last = list(self.marginals)[-1]
         out = []
         for low, high in pairwise(self.moments.at):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = ["forms_on_rates"]
 
 _MOST_WAVES = 64
 _N_SIZES = 9
+_NO_SHARE = 1e-9  # of what a bound stops: none
 
 Of = Callable[[Any, Any], Any]
 """Function of the state whose rate it is in and another state; returns a term of unit amplitude."""
@@ -152,32 +154,59 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
 
 
 def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
+    """Bind a bound of a state; what it stops is lost, or a state that it drives takes up a share, as of an overflow."""
     ends = ends_of(float(np.nanmin(values)), float(np.nanmax(values)))
     if ends is None:
         return
+    others = [other for other in about.states if other != state]
 
     def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
         level = theta[:, :1]
         above = level > ends.middle
-        ceiling = Limit(state, np.where(above, level, np.inf))
-        return value.with_limit(ceiling).with_limit(Limit(state, np.where(above, -np.inf, level), upper=False))
+        spilt = {other: theta[:, k : k + 1] for k, other in enumerate(others, 1) if theta[:, k].any()}
+        ceiling = Limit(state, np.where(above, level, np.inf), spilt=spilt)
+        floor = Limit(state, np.where(above, -np.inf, level), upper=False, spilt=spilt)
+        return value.with_limit(ceiling).with_limit(floor)
 
-    if np.nanmax(about.rms(Stage.RATE, act, ends.levels[:, None]), initial=0.0) > 0.05:
-        yield Form(
-            f"limit:{state}",
-            Stage.RATE,
-            {"level": ends.prior},
-            (state,),
-            (f"state:{state}", "level"),
-            act,
-            ends.levels[:, None, None],
-            (),
-            lambda mean, sd: (
-                f"{state} {'rises' if mean[0] > ends.middle else 'falls'} no further than "
-                f"{with_unit(mean[0], sd[0], '')}"
-            ),
-            absent={0: ends.nowhere},
-        )
+    def entries(taking: str | None) -> FloatArray:
+        shares = np.array([0.5 * (other == taking) for other in others])
+        return np.concatenate([ends.levels[:, None], np.tile(shares, (len(ends.levels), 1))], axis=1)[:, None, :]
+
+    def marginals(taking: str | None) -> dict[str, Any]:
+        shares = {f"share[{other}]": Uniform(0.0, 1.0 if other == taking else _NO_SHARE) for other in others}
+        return {"level": ends.prior, **shares}
+
+    def fixed(taking: str | None) -> tuple[str, ...]:
+        return tuple(f"share[{other}]" for other in others if other != taking)
+
+    def says(mean: FloatArray, sd: FloatArray) -> str:
+        way = "rises" if mean[0] > ends.middle else "falls"
+        taken = [
+            f"; {other} takes up {with_unit(mean[k], sd[k], '')} of the rest"
+            for k, other in enumerate(others, 1)
+            if mean[k] > _NO_SHARE
+        ]
+        return f"{state} {way} no further than {with_unit(mean[0], sd[0], '')}" + "".join(taken)
+
+    alone = Form(
+        f"limit:{state}",
+        Stage.RATE,
+        marginals(None),
+        (state, *("1" for _ in others)),
+        (f"state:{state}", "level"),
+        act,
+        entries(None),
+        (),
+        says,
+        absent={0: ends.nowhere},
+        fixed=fixed(None),
+    )
+    if np.nanmax(about.rms(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
+        into = [other for other in others if about.drives(state, other)]
+        spilling = [
+            replace(alone, marginals=marginals(other), entries=entries(other), fixed=fixed(other)) for other in into
+        ]
+        yield replace(alone, alternatives=tuple(spilling))
 
 
 def _rate_scale(about: About, state: str) -> float:

@@ -23,7 +23,8 @@ class PriorOdds:
     the effects of `UNNAMED`; the rest has no formula. Noise: `white`, and the rest divided among noise models by size,
     then equally. `complexity_penalty` (nats) is the prior penalty of an effect per Gaussian of the SSF that it makes
     superfluous, since physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is the same for an unknown
-    effect, which can imitate any shape.
+    effect, which can imitate any shape. `twice` is the probability that an effect that may occur twice does, of it
+    alone: who finds one cycle left out expects another one more readily than any other second effect; None: no more.
     """
 
     n_named: int = 24
@@ -39,6 +40,7 @@ class PriorOdds:
     complexity_penalty: float = 8.0
     unknown_complexity_penalty: float = 24.0
     unknown_explains_most: bool = False
+    twice: float | None = None
 
     @classmethod
     def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
@@ -51,7 +53,8 @@ class PriorOdds:
     def log_mean(self, names: Names) -> float:
         """Return the log prior of a combination of effects on the mean."""
         named = [name for name in names if not is_out_of_vocabulary(name)]
-        log_p = self._log_of_named(len(named))
+        again = [name for name in named if first_of(name) in named] if self.twice is not None else []
+        log_p = self._log_of_named(len(named) - len(again)) + len(again) * math.log(self.twice or 1.0)
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
             log_p += math.log(share * self.out_of_vocabulary / (self.n_unnamed - k))

@@ -57,6 +57,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
             chosen = _refitted_alone(state, null, proposals)
         else:
             chosen = promising(state, proposals, width=beam, behind=STEERING)
+            chosen += [names for names in _both_copies(state, null) if names in proposals and names not in chosen]
         asked = [proposals[names] for names in chosen]
         if size == 1:
             asked = [*asked[:1], *_plainly(state, null), *asked[1:]]
@@ -145,6 +146,20 @@ def _refitted_alone(state: SearchState, null: WeighedFit, proposals: Mapping[Nam
     always = state.tried_always | faint | twice
     chosen = promising(state, proposals, width=SINGLES, behind=REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
+
+
+def _both_copies(state: SearchState, null: WeighedFit) -> list[Names]:
+    """Return the pairs of an effect with itself, if one alone explains something under plain noise.
+
+    To either of two waves the other is noise with memory, and may make it look like no more than that.
+    """
+    plain = state.noises.certain
+    pairs = [(first, name) for name in state.effects if (first := first_of(name)) is not None]
+    return [
+        (first, again)
+        for first, again in pairs
+        if any(c.evidence[plain].log_z > null.evidence[plain].log_z + PAIRED_FROM for c in state.of((first,)))
+    ]
 
 
 def _plainly(state: SearchState, null: WeighedFit) -> list[Proposal]:

@@ -20,9 +20,10 @@ from probewise.diagnosis.search.constants import MOST_FAULTS, NOISE_PAIR_WITHIN
 from probewise.effects import CorrelatedNoise, NoiseEffect, Quantisation, RandomWalk, lattice_step
 from probewise.recordings.plan import Recording
 
-__all__ = ["Noises"]
+__all__ = ["WITH_MEMORY", "Noises"]
 
-_TWO_MEMORIES = {CorrelatedNoise.name, RandomWalk.name}  # a noise distribution can contain only one of them
+WITH_MEMORY = frozenset({CorrelatedNoise.name, RandomWalk.name})
+"""Effects on the noise of which a noise distribution can contain only one."""
 
 
 @dataclass(eq=False)
@@ -95,7 +96,7 @@ class Noises:
             best = max(e.log_z + self.log_prior(names) for names, e in known.items())
             for other in singles:
                 both = tuple(sorted({*first, *other}))
-                if len(self._without_certain(both)) != size + 1 or set(both) >= _TWO_MEMORIES:
+                if len(self._without_certain(both)) != size + 1 or set(both) >= WITH_MEMORY:
                     continue
                 model = self._model(both, likely | self.models[other].every_third())
                 own = weigh(found, model)

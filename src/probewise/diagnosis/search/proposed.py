@@ -1,4 +1,4 @@
-"""Propose formulas for what has no name, where something unknown is likely or several names may stand in for one."""
+"""Propose formulas for what has no name, wherever more than noise may be left: a name may stand in for what has none."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_effects
 from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.search.noises import WITH_MEMORY
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
 from probewise.effects import NamedEffect
@@ -17,8 +18,7 @@ from probewise.progress import Progress, silent
 
 __all__ = ["with_proposals"]
 
-_UNKNOWN_FROM = 0.1  # probability of an unknown effect from which formulas are proposed for it
-_SEVERAL_FROM = 0.3  # the same, of two effects or more
+_LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
 _MOST = 8  # formulas that are refitted
 _WITHIN = 12.0  # nats behind the best of what was refitted, within which screening must see a formula
 
@@ -26,8 +26,8 @@ _WITHIN = 12.0  # nats behind the best of what was refitted, within which screen
 def with_proposals(searched: Searched, *, progress: Progress = silent) -> Searched:
     """Search again with the formulas that screening favours; return the search unchanged if there are none.
 
-    Formulas of two names explain what one formula does, a product as a step beside a sensitivity, a square wave as two
-    sinusoids, and predict other runs badly.
+    Names explain in part what one formula does, an exponential leak as a square law, a product as a step beside a
+    sensitivity, and predict other runs badly. Noise with a memory takes up what changes slowly, and predicts nothing.
     """
     prepared = searched.prepared
     if not _may_explain(searched) or prepared.apparatus.refits_are_over():
@@ -51,9 +51,8 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
 
 
 def _may_explain(searched: Searched) -> bool:
-    by_mean = searched.posterior.by_mean
-    several = sum(p for names, p in by_mean.items() if len(names) > 1)
-    return by_mean.get(("unknown",), 0.0) > _UNKNOWN_FROM or several > _SEVERAL_FROM
+    plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
+    return 1.0 - sum(plain) > _LEFT_FROM
 
 
 def _log_evidences(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:

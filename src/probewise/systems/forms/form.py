@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects import first_of
 from probewise.effects.vocabulary import Gates, give_or_take
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
@@ -138,8 +139,10 @@ class Form:
 
     @property
     def n_peaks(self) -> int:
-        """Number of equivalent modes: phases span two turns, so each wave has two."""
-        return 2 if self.joined is not None else 1
+        """Number of equivalent modes: phases span two turns, so each wave has two, and of two either may be first."""
+        if self.joined is None:
+            return 1
+        return 2 if first_of(self.name) is None else 4
 
     @property
     def scans(self) -> tuple[str, ...]:

@@ -41,3 +41,16 @@ def test_two_effects_of_a_simulator_are_no_less_likely_than_one_beside_a_fault_o
     assert odds.clean_mean + odds.unknown + sum(odds.by_size) == pytest.approx(1.0)
     one_and_noise = odds.by_size[0] * odds.noise_by_size[0]
     assert odds.by_size[1] * odds.white >= one_and_noise
+
+
+def test_of_one_wave_two_are_likelier_than_it_beside_another_effect_and_all_sums_to_one():
+    """Of three effects of which one may occur twice, that is counted by hand: seven sets, four of them with the wave."""
+    odds = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twice=0.1, twofold=frozenset({"wave"}))
+    names = ["drift", "wave", "lag"]
+    sets = [of for k in range(1, 4) for of in combinations(names, k)]
+    twice = [(*of, "wave~again") for of in sets if "wave" in of]
+    assert sum(math.exp(odds.log_mean(of)) for of in [*sets, *twice]) == pytest.approx(0.34)
+    assert math.exp(odds.log_mean(("wave", "wave~again"))) == pytest.approx(0.1 * 0.1)
+    assert odds.log_mean(("wave", "wave~again")) > odds.log_mean(("drift", "wave"))
+    as_any = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twofold=frozenset({"wave"}))
+    assert as_any.log_mean(("wave", "wave~again")) == as_any.log_mean(("drift", "wave"))

@@ -23,8 +23,9 @@ class PriorOdds:
     the effects of `UNNAMED`; the rest has no formula. Noise: `white`, and the rest divided among noise models by size,
     then equally. `complexity_penalty` (nats) is the prior penalty of an effect per Gaussian of the SSF that it makes
     superfluous, since physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is the same for an unknown
-    effect, which can imitate any shape. `twice` is the probability that an effect that may occur twice does, of it
-    alone: who finds one cycle left out expects another one more readily than any other second effect; None: no more.
+    effect, which can imitate any shape. `twice` is the probability that one of the effects `twofold`, which may occur
+    twice, does if it occurs: who finds one cycle left out expects another one sooner than any other second effect. With
+    None it does as often as any other effect occurs beside it.
     """
 
     n_named: int = 24
@@ -41,20 +42,27 @@ class PriorOdds:
     unknown_complexity_penalty: float = 24.0
     unknown_explains_most: bool = False
     twice: float | None = None
+    twofold: frozenset[str] = frozenset()
 
     @classmethod
     def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
         """Divide the odds among these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
         unnamed = sum(is_out_of_vocabulary(name) for name in effects)
-        again = sum(first_of(name) is not None for name in effects)
-        return cls(len(effects) - len(on_noise) - unnamed - again, unnamed, len(on_noise))
+        twofold = frozenset(first for name in effects if (first := first_of(name)) is not None)
+        n_named = len(effects) - len(on_noise) - unnamed - len(twofold)
+        return cls(n_named, unnamed, len(on_noise), twofold=twofold)
 
     def log_mean(self, names: Names) -> float:
         """Return the log prior of a combination of effects on the mean."""
         named = [name for name in names if not is_out_of_vocabulary(name)]
-        again = [name for name in named if first_of(name) in named] if self.twice is not None else []
-        log_p = self._log_of_named(len(named) - len(again)) + len(again) * math.log(self.twice or 1.0)
+        if self.twice is None:
+            log_p = self._log_of_named(len(named))
+        else:
+            once = self.twofold.intersection(named)
+            n_again = sum(first_of(name) is not None for name in named)
+            log_p = self._log_of_named(len(named) - n_again)
+            log_p += n_again * math.log(self.twice) + (len(once) - n_again) * math.log1p(-self.twice)
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
             log_p += math.log(share * self.out_of_vocabulary / (self.n_unnamed - k))

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.convergence import require_finite
-from probewise.diagnosis.evidence.laplace import Linearised
+from probewise.diagnosis.evidence.laplace import SCALES, Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_effects
 from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateMemory
 from probewise.diagnosis.evidence.visible import log_visible
@@ -209,7 +209,7 @@ class Refits:
         starts: list[FloatArray] = []
         for about, at in chosen:
             columns = templates.columns[at]
-            amount = np.asarray(np.linalg.lstsq(about.project(columns), about.residual)[0], dtype=np.float64)
+            amount = _amounts(about.project(columns), about.residual)
             setting = effect.start(templates.settings[at], amount)
             # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
             # one.
@@ -234,6 +234,19 @@ class Refits:
         """Linearise a fit under the simplest noise distribution too, if it is a different one."""
         plain = parent.evidence[self.noises.certain].law
         return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
+
+
+def _amounts(projected: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return the amounts (n_columns,) of projected columns (n_rows, n_columns) in a residual, within their prior.
+
+    One value for each run leaves next to nothing of what all runs have in common, since a parameter takes that up: by
+    least squares alone all runs begin far off, with the parameter as far on the other side, and the fit stays there.
+    """
+    n = projected.shape[1]
+    if n == 1:
+        return np.asarray(np.linalg.lstsq(projected, residual)[0], dtype=np.float64)
+    prior = np.eye(n) / SCALES[-1]
+    return np.asarray(np.linalg.lstsq(np.concatenate([projected, prior]), np.append(residual, np.zeros(n)))[0])
 
 
 def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:

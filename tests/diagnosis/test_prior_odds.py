@@ -44,7 +44,7 @@ def test_two_effects_of_a_simulator_are_no_less_likely_than_one_beside_a_fault_o
 
 
 def test_of_one_wave_two_are_likelier_than_it_beside_another_effect_and_all_sums_to_one():
-    """Of three effects of which one may occur twice, that is counted by hand: seven sets, four of them with the wave."""
+    """Of three effects of which one may occur twice, counted by hand: seven sets, four of them with the wave."""
     odds = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twice=0.1, twofold=frozenset({"wave"}))
     names = ["drift", "wave", "lag"]
     sets = [of for k in range(1, 4) for of in combinations(names, k)]

@@ -1,4 +1,4 @@
-"""Propose formulas for what has no name, wherever more than noise may be left: a name may stand in for what has none."""
+"""Propose formulas for what has no name, wherever more than noise may be left, since a name may stand in for it."""
 
 from __future__ import annotations
 

@@ -273,7 +273,7 @@ def _worth_trying(templates: EffectTemplates, weights: FloatArray) -> list[int]:
     variants, as of a tank that overflows to waste or into the next one, all are refitted.
     """
     if len(weights) <= FEW_VARIANTS:
-        return np.argsort(-weights).tolist()
+        return [int(k) for k in np.argsort(-weights)]
     first, *others = np.argsort(-weights)[:2].tolist()
     bound = templates.variants[first].scans or templates.variants[first].patterns
     return [first, *(k for k in others if bound and weights[k] > VARIANTS_TRIED * weights[first])]

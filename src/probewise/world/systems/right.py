@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.cases import SystemCase
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.fit import Beside, Model, free_numbers
+from probewise.world.systems.forms.form import Numbers
 
 __all__ = ["right_predictions"]
 
@@ -47,13 +50,20 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     ]
     parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
     there = np.concatenate(parts, axis=1)
-    # Effects per run are at the mean of the others for a held-out run.
     effects = [
-        (form, {k: np.zeros((1, 1)) if k.startswith("values[") and k not in b.free else v for k, v in numbers.items()})
-        for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
+        (form, _as_others(numbers, b.free)) for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
     ]
     with np.errstate(all="ignore"):
         return simulate(kind, later, ahead.parameters(there), effects).readings
+
+
+def _as_others(numbers: Numbers, free: Sequence[str]) -> Numbers:
+    """Give a held-out run the mean of the fitted runs' values: a parameter takes up what they have in common."""
+    fitted = [numbers[name] for name in free if name.startswith("values[")]
+    if not fitted:
+        return numbers
+    typical = np.mean(fitted, axis=0)
+    return {k: typical if k.startswith("values[") and k not in free else v for k, v in numbers.items()}
 
 
 def _to_quantiles(values: FloatArray) -> FloatArray:

@@ -11,11 +11,12 @@ from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.search import search as searching
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.refits import Refits, is_significant
+from probewise.diagnosis.search.refits import Refits, _amounts, is_significant
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.twins import are_proportional
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.effects import CorrelatedNoise, Extent, RandomWalk
+from probewise.priors import LogUniform, Uniform
 from probewise.systems import RunTable, Simulator
 
 _N = 120
@@ -37,6 +38,10 @@ def prepared():
 
 @pytest.fixture(scope="module")
 def state(prepared):
+    return _state(prepared)
+
+
+def _state(prepared):
     prior = prepared.apparatus.prior_odds(prepared.effects)
     extent = Extent.of(prepared.recording)
     on_noise = {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)}
@@ -92,3 +97,45 @@ def test_a_second_search_makes_hardly_a_refit_again(prepared, monkeypatch):
     assert {len(names) for names in refitted} <= {1}
     assert len(refitted) < len([names for names in made if names]) / 2
     assert again.posterior.by_mean == pytest.approx(first.posterior.by_mean, abs=1e-6)
+
+
+def test_amounts_of_one_value_for_each_run_leave_what_they_have_in_common_to_the_parameter():
+    """Of four runs a parameter takes up the mean all but a ten-thousandth; route two: differences from the mean.
+
+    By least squares alone the trace that is left gets any size: here the noise along it makes all values 30 off.
+    """
+    runs = np.repeat(np.eye(4), 25, axis=0)
+    common = np.full(4, 0.5)
+    projected = runs - (1 - 1e-4) * (runs @ common)[:, None] * common[None, :]
+    values = np.array([0.4, -0.3, 0.2, -0.3])
+    trace = projected @ common
+    residual = runs @ values + 6e-3 * trace / np.linalg.norm(trace)
+    plain = np.linalg.lstsq(projected, residual)[0]
+    assert np.abs(plain - values).max() > 3.0
+    np.testing.assert_allclose(_amounts(projected, residual), values, atol=0.02)
+
+
+def test_of_one_column_the_amount_is_that_of_least_squares():
+    rng = np.random.default_rng(1)
+    column, residual = rng.normal(size=(20, 1)), rng.normal(size=20)
+    exact = float(column[:, 0] @ residual / (column[:, 0] @ column[:, 0]))
+    np.testing.assert_allclose(_amounts(column, residual), [exact])
+
+
+def test_a_slope_that_differs_from_run_to_run_is_fitted_as_well_as_one_straight_line_for_each():
+    """Route two: least squares with a slope of its own for each of six runs."""
+    rng = np.random.default_rng(3)
+    force, run = 10 * rng.random(_N), np.repeat(np.arange(6.0), _N // 6)
+    slope = 0.5 + np.array([0.006, -0.008, 0.003, -0.005, 0.008, -0.004])[run.astype(int)]
+    y = 2.0 + slope * force + 0.05 * rng.normal(size=_N)
+    table = RunTable({"force": force, "run": run, "y": y}, time=None, run="run")
+    simulator = Simulator(
+        "y", "V", {"zero": Uniform(-10, 10), "slope": LogUniform(0.01, 10)},
+        simulate=lambda p, u: p["zero"] + p["slope"] * u["force"], run="run",
+    )  # fmt: skip
+    state = _state(prepare_system(simulator, table))
+    found = state.refits.extended(state.null, state.effects["differs:slope"])[0].found
+    lines = np.column_stack([np.ones(_N), force[:, None] * (run[:, None] == np.arange(6.0))])
+    best = y - lines @ np.linalg.lstsq(lines, y)[0]
+    assert np.sum(found.residuals**2) == pytest.approx(np.sum(best**2), rel=0.02)
+    assert np.abs(found.z).max() < 3.0

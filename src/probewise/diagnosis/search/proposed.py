@@ -16,7 +16,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
 
-__all__ = ["with_proposals"]
+__all__ = ["may_be_left", "with_proposals"]
 
 _LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
 _MOST = 8  # formulas that are refitted
@@ -30,7 +30,7 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
     sensitivity, and predict other runs badly. Noise with a memory takes up what changes slowly, and predicts nothing.
     """
     prepared = searched.prepared
-    if not _may_explain(searched) or prepared.apparatus.refits_are_over():
+    if not may_be_left(searched) or prepared.apparatus.refits_are_over():
         return searched
     proposals = prepared.apparatus.proposals()
     if not proposals:
@@ -50,7 +50,8 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
     return searched if prepared.apparatus.refits_are_over() else again
 
 
-def _may_explain(searched: Searched) -> bool:
+def may_be_left(searched: Searched) -> bool:
+    """Tell whether more may be left than noise without a memory."""
     plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
     return 1.0 - sum(plain) > _LEFT_FROM
 

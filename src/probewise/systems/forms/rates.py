@@ -202,7 +202,8 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
         fixed=fixed(None),
     )
     if np.nanmax(about.rms(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
-        into = [other for other in others if about.drives(state, other)]
+        # Downstream only: states that drive each other, as an angle and its rate, are no vessels.
+        into = [other for other in others if about.drives(state, other) and not about.drives(other, state)]
         spilling = [
             replace(alone, marginals=marginals(other), entries=entries(other), fixed=fixed(other)) for other in into
         ]

@@ -9,7 +9,7 @@ about the rival's own samples, is the density of an importance sample.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.special import logsumexp
@@ -102,14 +102,13 @@ def fits(
     # Half of the starts hold their effect and fit the shape alone, so that fits lie along a ridge, not at its top only.
     of_effect = np.arange(n_params) >= n_shape
     held = (np.arange(n) >= n // 2)[:, None, None] * np.diag(_HELD * of_effect / scale**2)
+    slope = np.empty((n, residual.shape[1], n_params))
+    moved = np.arange(n)
     for _ in range(_STEPS):
-        slope = np.empty((n, residual.shape[1], n_params))
-        for j in range(n_params):
-            nudged = theta.copy()
-            nudged[:, j] += _NUDGE * scale[j]
-            slope[:, :, j] = (predict(nudged) - (readings[usable] - noise_sd * residual)) / (_NUDGE * scale[j])
-        slope /= noise_sd
-        normal = slope.transpose(0, 2, 1) @ slope + ridge
+        # A start that no step has moved keeps its slopes.
+        own = _slopes(predict, theta[moved], readings[usable] - noise_sd * residual[moved], _NUDGE * scale) / noise_sd
+        normal[moved] = own.transpose(0, 2, 1) @ own + ridge
+        slope[moved] = own
         pull = (slope.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
         damped = normal + damping[:, None, None] * ridge * 10.0 + held
         tried = theta + np.linalg.solve(damped, pull[:, :, None])[:, :, 0]
@@ -122,11 +121,22 @@ def fits(
         residual = np.where(better[:, None], at, residual)
         cost = np.where(better, found, cost)
         damping = np.clip(np.where(better, damping / 5.0, damping * 5.0), 1e-4, 1e8)
+        moved = np.flatnonzero(better)
     score = np.full(n, -np.inf)
     alive = np.isfinite(cost)
     if alive.any():
         score[alive] = problem.log_likelihood(theta[alive]) + kind.prior.log_prob(theta[alive])
     return theta, score, normal
+
+
+def _slopes(
+    predict: Callable[[FloatArray], FloatArray], theta: FloatArray, at_theta: FloatArray, nudge: FloatArray
+) -> FloatArray:
+    """Differentiate predictions at theta, (n, n_points), by forward differences: (n, n_points, n_params)."""
+    n, n_params = theta.shape
+    nudged = theta + (np.eye(n_params) * nudge)[:, None]
+    there = predict(nudged.reshape(-1, n_params)).reshape(n_params, n, -1)
+    return np.ascontiguousarray(((there - at_theta) / nudge[:, None, None]).transpose(1, 2, 0))
 
 
 def refitted(

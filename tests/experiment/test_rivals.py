@@ -27,13 +27,14 @@ from probewise.experiment import (
     step,
     with_arm_error,
 )
+from probewise.experiment import posterior
 from probewise.experiment.acquisition import ArmOverGrid, inquire
 from probewise.experiment.arm_error import arm_error
 from probewise.experiment.checking import ENOUGH_BITS, NAMES, bits_of_names, far_side
 from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
-from probewise.experiment.posterior import prior_posterior, updated
-from probewise.experiment.refitted import refitted
+from probewise.experiment.posterior import prior_posterior, reconsidered, updated
+from probewise.experiment.refitted import fits, refitted
 from probewise.experiment.rivals import rivals_of
 from probewise.inquiry import prior_entropy
 from probewise.recordings import Instrumentation
@@ -407,18 +408,45 @@ def test_a_rival_whose_samples_went_astray_is_found_from_what_others_believe(dou
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     lost = replace(prior_posterior([kind], 500, rng=rng).particles[0].weighted, log_z=-1000.0)
-    found = refitted(kind, problem, lost, [donor], noise_sd=1.0, n_draws=2000, hopeless=-60.0, rng=rng)
+    fitted = fits(kind, problem, [donor], noise_sd=1.0, rng=rng)
+    found = refitted(fitted, problem, lost, n_draws=2000, with_own=False, rng=rng)
     assert found is not None
     assert found.log_z == pytest.approx(right.log_z, abs=4 * math.hypot(found.log_z_error, right.log_z_error))
     assert found.mean()[3] == pytest.approx(6.0, abs=4 * found.sd()[3])
 
 
-def test_a_rival_without_hope_is_not_sampled(doubting):
+def test_what_fits_promise_is_the_evidence(doubting):
+    """Two routes: Gaussians about fits, and nested sampling. Gear play of 6 mm is known to a few tenths."""
     kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
-    recording = played(doubting, kind, 6.0)
-    rng = np.random.default_rng(0)
-    own = prior_posterior([kind], 500, rng=rng).particles[0].weighted
-    assert refitted(kind, kind.problem(recording), own, [own], noise_sd=1.0, n_draws=500, hopeless=0.0, rng=rng) is None
+    problem, rng = kind.problem(played(doubting, kind, 6.0)), np.random.default_rng(5)
+    right = from_scratch(problem, 200, rng)
+    plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
+    donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
+    assert fits(kind, problem, [donor], noise_sd=1.0, rng=rng).highest == pytest.approx(right.log_z, abs=3.0)
+
+
+def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch):
+    """What fits have found, or ruled out, stays so where no reading came in between."""
+    kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "backlash", "nonlinearity")]
+    recording, rng = played(doubting, kinds[-1], 12.0), np.random.default_rng(1)
+    now = prior_posterior(kinds, 3000, rng=rng)
+    for n in range(1, len(recording) + 1):
+        part = recording.take(np.arange(n))
+        now = updated(now, part, 3000, rng=rng, from_scratch=lambda problem: from_scratch(problem, 100, rng))
+    once = reconsidered(now, recording, 3000, rng=rng)
+    done = [kind for kind, p in zip(kinds, once.particles, strict=True) if p.refitted]
+    ruled_out = {kind: p for kind, p in zip(kinds, once.particles, strict=True) if math.isfinite(p.ceiling)}
+    assert done
+    assert ruled_out
+    assert all(p.ceiling >= p.log_z for p in ruled_out.values())
+
+    def fitted(kind, *args, **options):
+        assert kind not in done
+        assert kind not in ruled_out
+        return fits(kind, *args, **options)
+
+    monkeypatch.setattr(posterior, "fits", fitted)
+    reconsidered(once, recording, 3000, rng=rng)
 
 
 def test_gear_play_may_spare_the_first_reading(doubting):

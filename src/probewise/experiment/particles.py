@@ -73,6 +73,10 @@ class Particles:
     hurried
         Whether, since then, a reading needed many temperatures: then few samples were near the new posterior, and the
         product of mean weights is nearly always too small.
+    refitted
+        Whether the samples were found by fits to all readings, and have followed those since with ease.
+    ceiling
+        Log evidence that such fits rule out to be exceeded; infinite where they do not.
     """
 
     weighted: Weighted
@@ -81,6 +85,8 @@ class Particles:
     n_resampled: int = 0
     strained: bool = False
     hurried: bool = False
+    refitted: bool = False
+    ceiling: float = math.inf
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -148,13 +154,14 @@ def update(
         As many samples as before; `run` is the run from scratch, if one was needed. If no sample could have given the
         reading, the evidence is zero and the samples are unchanged.
     """
+    bridge = _Bridge(problem)
+    previous = replace(previous, ceiling=previous.ceiling + bridge.perfect)
     before = previous.weighted
     n = len(before.theta)
     effort = THOROUGH if effort is None else effort
     least = effort.keep * n
     if before.log_z == -math.inf:
         return previous
-    bridge = _Bridge(problem)
     predicted = problem.model.predict(before.theta, problem.recording.plan)
     strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
     if bridge.misfit_nats(predicted) > SURPRISED:
@@ -204,8 +211,18 @@ def update(
         before.n_calls + n_calls,
         tail,
     )
-    hurried = previous.hurried or n_resampled - previous.n_resampled >= MANY_DEGREES
-    return Particles(found, ancestor, previous.start_variance, n_resampled, strained, hurried)
+    degrees = n_resampled - previous.n_resampled
+    hurried, with_ease = previous.hurried or degrees >= MANY_DEGREES, degrees <= 1 and not strained
+    return Particles(
+        found,
+        ancestor,
+        previous.start_variance,
+        n_resampled,
+        strained,
+        hurried,
+        previous.refitted and with_ease,
+        previous.ceiling,
+    )
 
 
 def resized(
@@ -283,9 +300,15 @@ class _Bridge:
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0
+        best = scores(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
+        return float(self.perfect - best)
+
+    @property
+    def perfect(self) -> float:
+        """Log likelihood of the last reading under a perfect prediction; zero if it is missing."""
+        recording = self.problem.recording
         reading = recording.readings[-1:]
-        best = scores(self.problem.likelihood, reading, predicted[:, -1:]).max()
-        return float(self.problem.likelihood.log_prob(reading, reading[None])[0] - best)
+        return float(self.problem.likelihood.log_prob(reading, reading[None])[0]) if recording.usable[-1] else 0.0
 
     def weigh(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""

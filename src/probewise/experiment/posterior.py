@@ -30,7 +30,7 @@ from probewise.experiment.particles import (
     sampled,
     update,
 )
-from probewise.experiment.refitted import refitted
+from probewise.experiment.refitted import fits, refitted
 from probewise.experiment.rivals import declared_noise
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
@@ -56,6 +56,8 @@ _NESTED = 6.0  # nats by which a rival may be less likely than the plain model, 
 _BEHIND = 9.0  # nats behind the best kind, from which on a rival is not sampled anew
 _FEWEST = 4.0  # effective draws below which a sample replaces none
 _LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
+_WELL_FOUND = 100.0  # effective draws from which on samples need not be taken anew until a reading strains them
+_RULED_OUT = 10.0  # nats by which fits and a kind's own samples may miss its evidence, where both are behind
 _LOST = 0.01  # probability of a kind that must not be missed
 
 WARY = 12.0
@@ -221,7 +223,7 @@ def _taken_in(
 def reconsidered(
     posterior: Posterior, recording: Recording, n_particles: int, *, rng: np.random.Generator
 ) -> Posterior:
-    """Sample every rival anew that might matter, whatever its history: to be asked before a run ends."""
+    """Sample every rival anew that might matter, but for those that were before: to be asked before a run ends."""
     problems = [kind.problem(recording) for kind in posterior.kinds]
     return replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
 
@@ -232,7 +234,9 @@ def _sampled_from_others(
     """Sample a rival anew, from what other kinds believe, where its own samples may have lost the truth.
 
     They may have after a reading that few of them were near. And a rival whose effect can be negligible cannot be much
-    less likely than the plain model: if it claims to be, its samples are elsewhere. With `each`, every rival.
+    less likely than the plain model: if it claims to be, its samples are elsewhere. With `each`, every rival, but for
+    those whose samples were found in this way and have followed the readings since. A rival that no fit brought near
+    the best kind is fitted again when the readings since could have made good what it lacked.
     """
     particles, log_odds = list(now.particles), now.log_odds
     for k, (kind, problem) in enumerate(zip(now.kinds, problems, strict=True)):
@@ -242,19 +246,24 @@ def _sampled_from_others(
         plain = next(j for j in alike if not now.kinds[j].left_out)
         own = particles[k]
         beyond = own.log_z < particles[plain].log_z - _NESTED
-        if not (each or beyond or own.strained or own.hurried):
+        hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
+        wanted = (each and not own.refitted) or beyond or own.strained or own.hurried
+        if not wanted or own.ceiling < hopeless:
             continue
         best = max(alike, key=lambda j: log_odds[j])
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
-        hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
         n = max(len(own.ancestor), _size(kind, 0.0, n_particles))
         found = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
-        if found is None or found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
+        if isinstance(found, float):
+            particles[k] = replace(own, ceiling=max(found, own.log_z) + _RULED_OUT)
             continue
-        if found.n_eff < _FEWEST:
+        if found is None or found.n_eff < _FEWEST:
+            continue
+        if found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
             continue
         fresh = sampled(found, n, problem, rng=rng, effort=BRIEF)
-        particles[k] = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
+        fresh = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
+        particles[k] = replace(fresh, refitted=found.n_eff >= _WELL_FOUND)
     return particles
 
 
@@ -266,14 +275,21 @@ def _from_others(
     n: int,
     hopeless: float,
     rng: np.random.Generator,
-) -> Weighted | None:
-    """Sample a kind's posterior with what others believe: refits of it, or the samples themselves for a noise law."""
+) -> Weighted | float | None:
+    """Sample a kind's posterior with what others believe: refits of it, or the samples themselves for a noise law.
+
+    Returns a number, the log evidence that the fits promise, where that is below `hopeless`, and None where no sample
+    was found.
+    """
     noise = declared_noise(kind.likelihood)
     if kind.effect is not None:
         if noise is None:
             return None
         sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
-        return refitted(kind, problem, own, donors, noise_sd=sd, n_draws=2 * n, hopeless=hopeless, rng=rng)
+        found = fits(kind, problem, donors, noise_sd=sd, rng=rng)
+        if found.highest < hopeless:
+            return found.highest
+        return refitted(found, problem, own, n_draws=2 * n, with_own=own.log_z > hopeless, rng=rng)
     n_own = len(kind.prior.names)
     points = [donor.samples(n // 2, rng=rng)[:, :n_own] for donor in donors]
     if own.log_z > hopeless:
@@ -353,4 +369,5 @@ def _from_here(particles: Particles, found: Bridged) -> Particles:
     """Return the samples with a new evidence as an independent start."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
-    return Particles(weighted, np.arange(len(had.theta)), found.error**2)
+    start = Particles(weighted, np.arange(len(had.theta)), found.error**2)
+    return replace(start, refitted=particles.refitted, ceiling=particles.ceiling)

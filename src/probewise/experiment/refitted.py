@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
@@ -22,7 +24,7 @@ from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["fits", "refitted"]
+__all__ = ["Fits", "fits", "refitted"]
 
 _STARTS = 90
 _STEPS = 8
@@ -38,6 +40,45 @@ _FAR = 2.5  # factor on the width of some kernels, so that draws extend beyond w
 _LEAST = 10  # possible draws from which on they are weighed
 
 
+@dataclass(frozen=True, eq=False)
+class Fits:
+    """Fits of a kind to all readings, from several starts.
+
+    Attributes
+    ----------
+    theta
+        The fits, (n_starts, n_params).
+    score
+        Log likelihood plus log prior of each, (n_starts,); minus infinity where a start led nowhere.
+    precision
+        Inverse covariances about them, (n_starts, n_params, n_params).
+    """
+
+    theta: FloatArray
+    score: FloatArray
+    precision: FloatArray
+
+    @cached_property
+    def good(self) -> IntArray:
+        """The fits that are not much worse than the best, best first; empty where no start led anywhere."""
+        order = np.argsort(-self.score)
+        return (
+            order[self.score[order] > self.score[order[0]] - _WORSE] if math.isfinite(self.score.max()) else order[:0]
+        )
+
+    @cached_property
+    def log_z(self) -> FloatArray:
+        """Log evidence by the Gaussian about each good fit, (n_good,)."""
+        log_det = np.linalg.slogdet(self.precision[self.good])[1]
+        log_volume = 0.5 * self.theta.shape[1] * math.log(2 * math.pi) - 0.5 * log_det
+        return np.asarray(self.score[self.good] + log_volume)
+
+    @property
+    def highest(self) -> float:
+        """The largest of these; minus infinity where there is none."""
+        return float(self.log_z.max(initial=-math.inf))
+
+
 def fits(
     kind: HypothesisKind,
     problem: SensorProblem,
@@ -45,7 +86,7 @@ def fits(
     *,
     noise_sd: float,
     rng: np.random.Generator,
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> Fits:
     """Fit a kind with an effect on the mean to all readings, from the samples of other kinds.
 
     Parameters
@@ -58,15 +99,6 @@ def fits(
         Sd of a reading's noise.
     rng
         Source of randomness.
-
-    Returns
-    -------
-    theta
-        The fits, (n_starts, n_params).
-    score
-        Log likelihood plus log prior of each, (n_starts,).
-    precision
-        Inverse covariances about them, (n_starts, n_params, n_params).
     """
     recording = problem.recording
     usable = recording.usable
@@ -126,59 +158,56 @@ def fits(
     alive = np.isfinite(cost)
     if alive.any():
         score[alive] = problem.log_likelihood(theta[alive]) + kind.prior.log_prob(theta[alive])
-    return theta, score, normal
+    return Fits(theta, np.where(np.isfinite(normal).all(axis=(1, 2)), score, -np.inf), normal)
 
 
 def _slopes(
     predict: Callable[[FloatArray], FloatArray], theta: FloatArray, at_theta: FloatArray, nudge: FloatArray
 ) -> FloatArray:
     """Differentiate predictions at theta, (n, n_points), by forward differences: (n, n_points, n_params)."""
-    n, n_params = theta.shape
+    n_params = theta.shape[1]
     nudged = theta + (np.eye(n_params) * nudge)[:, None]
-    there = predict(nudged.reshape(-1, n_params)).reshape(n_params, n, -1)
+    there = predict(nudged.reshape(-1, n_params)).reshape(n_params, *at_theta.shape)
     return np.ascontiguousarray(((there - at_theta) / nudge[:, None, None]).transpose(1, 2, 0))
 
 
 def refitted(
-    kind: HypothesisKind,
+    found: Fits,
     problem: SensorProblem,
     own: Weighted,
-    donors: Sequence[Weighted],
     *,
-    noise_sd: float,
     n_draws: int,
-    hopeless: float,
+    with_own: bool = True,
     rng: np.random.Generator,
 ) -> Weighted | None:
-    """Sample a kind's posterior by importance sampling about refits and about its own samples.
+    """Sample a kind's posterior by importance sampling about fits and about its own samples.
 
     Parameters
     ----------
-    kind, problem, donors, noise_sd, rng
-        As for `fits`.
+    found
+        Fits of the kind, at least one of them good.
+    problem
+        The kind's problem.
     own
         The kind's own samples.
     n_draws
         Number of draws.
-    hopeless
-        Log evidence below which it is not worth sampling: None is returned where no fit can reach it.
+    with_own
+        Whether to draw about the kind's own samples too.
+    rng
+        Source of randomness.
+
+    Returns
+    -------
+    The samples; None where hardly a draw is possible.
     """
-    theta, score, precision = fits(kind, problem, donors, noise_sd=noise_sd, rng=rng)
-    score = np.where(np.isfinite(precision).all(axis=(1, 2)), score, -np.inf)
-    order = np.argsort(-score)
-    order = order[score[order] > score[order[0]] - _WORSE] if math.isfinite(score[order[0]]) else order[:0]
-    if not len(order):
-        return None
-    log_volume = 0.5 * theta.shape[1] * math.log(2 * math.pi) - 0.5 * np.linalg.slogdet(precision[order])[1]
-    laplace = score[order] + log_volume
-    if laplace.max() < hopeless:
-        return None
-    best = order[np.argsort(-laplace)][:_KEPT]
-    densities = [LocalKernels.from_moments(theta[best], _WIDER**2 * _inverse(precision[best]))]
-    if own.log_z > hopeless and len(rows := _distinct(own, theta.shape[1], rng)):
+    n_params = found.theta.shape[1]
+    best = found.good[np.argsort(-found.log_z)][:_KEPT]
+    densities = [LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse(found.precision[best]))]
+    if with_own and len(rows := _distinct(own, n_params, rng)):
         densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
     first = _weighed(own, problem, densities, n_draws // 2, rng)
-    if first is None or not len(rows := _distinct(first, theta.shape[1], rng)):
+    if first is None or not len(rows := _distinct(first, n_params, rng)):
         return first
     # A posterior is more curved than the Gaussians about its fits: once more, about what these have found.
     near = LocalKernels.about(first.theta[rows], rng=rng, most=_KERNELS)

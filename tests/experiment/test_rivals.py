@@ -22,12 +22,12 @@ from probewise.experiment import (
     begin,
     experiment_for,
     left_out_of,
+    posterior,
     repaired,
     result_json,
     step,
     with_arm_error,
 )
-from probewise.experiment import posterior
 from probewise.experiment.acquisition import ArmOverGrid, inquire
 from probewise.experiment.arm_error import arm_error
 from probewise.experiment.checking import ENOUGH_BITS, NAMES, bits_of_names, far_side

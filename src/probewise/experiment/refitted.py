@@ -138,9 +138,11 @@ def fits(
     moved = np.arange(n)
     for _ in range(_STEPS):
         # A start that no step has moved keeps its slopes.
-        own = _slopes(predict, theta[moved], readings[usable] - noise_sd * residual[moved], _NUDGE * scale) / noise_sd
-        normal[moved] = own.transpose(0, 2, 1) @ own + ridge
-        slope[moved] = own
+        if len(moved):
+            at_theta = readings[usable] - noise_sd * residual[moved]
+            own = _slopes(predict, theta[moved], at_theta, _NUDGE * scale) / noise_sd
+            normal[moved] = own.transpose(0, 2, 1) @ own + ridge
+            slope[moved] = own
         pull = (slope.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
         damped = normal + damping[:, None, None] * ridge * 10.0 + held
         tried = theta + np.linalg.solve(damped, pull[:, :, None])[:, :, 0]

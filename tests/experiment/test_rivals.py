@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -430,10 +431,10 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
     kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "backlash", "nonlinearity")]
     recording, rng = played(doubting, kinds[-1], 12.0), np.random.default_rng(1)
     now = prior_posterior(kinds, 3000, rng=rng)
+    solved = partial(from_scratch, n_live=100, rng=rng)
     for n in range(1, len(recording) + 1):
-        part = recording.take(np.arange(n))
-        now = updated(now, part, 3000, rng=rng, from_scratch=lambda problem: from_scratch(problem, 100, rng))
-    once = reconsidered(now, recording, 3000, rng=rng)
+        now = updated(now, recording.take(np.arange(n)), 3000, rng=rng, from_scratch=solved)
+    once = reconsidered(now, recording, 3000, rng=rng, from_scratch=solved)
     done = [kind for kind, p in zip(kinds, once.particles, strict=True) if p.refitted]
     ruled_out = {kind: p for kind, p in zip(kinds, once.particles, strict=True) if math.isfinite(p.ceiling)}
     assert done
@@ -446,7 +447,7 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
         return fits(kind, *args, **options)
 
     monkeypatch.setattr(posterior, "fits", fitted)
-    reconsidered(once, recording, 3000, rng=rng)
+    reconsidered(once, recording, 3000, rng=rng, from_scratch=solved)
 
 
 def test_gear_play_may_spare_the_first_reading(doubting):

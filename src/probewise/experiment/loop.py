@@ -32,7 +32,7 @@ from probewise.experiment.journal import (
     require_same_settings,
 )
 from probewise.experiment.pace import Pace
-from probewise.experiment.posterior import prior_posterior, reconsidered
+from probewise.experiment.posterior import prior_posterior
 from probewise.experiment.settling import settling
 from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
 from probewise.experiment.stopping_rule import (
@@ -129,7 +129,7 @@ def step(
     wary = carried.wary
     posterior = wary.joined(rng=rng)
     if experiment.trust < 1 and _is_known(experiment, posterior, None, "", rng)[0]:
-        carried = reconsidered(carried, problem.recording, experiment.n_particles, rng=rng)
+        carried = experiment.learning.reconsidered(carried, problem.recording, rng=rng)
         wary = carried.wary
         posterior = wary.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.experiment.posterior import Posterior, updated
+from probewise.experiment.posterior import Posterior, reconsidered, updated
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.kernels import KernelMove
@@ -39,6 +40,10 @@ class Method(Protocol):
         NotConvergedError
             If no hypothesis of any kind could have given the readings.
         """
+        ...
+
+    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """Sample anew what earlier readings may have led astray, before a run with doubt in its sensor ends."""
         ...
 
     def drawn(
@@ -73,13 +78,14 @@ class SequentialMonteCarlo:
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.updated`."""
-        return updated(
-            previous,
-            recording,
-            self.n_particles,
-            rng=rng,
-            from_scratch=lambda problem: from_scratch(problem, self.n_live, rng),
-        )
+        return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._solved(rng))
+
+    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """See `Method.reconsidered`."""
+        return reconsidered(posterior, recording, self.n_particles, rng=rng, from_scratch=self._solved(rng))
+
+    def _solved(self, rng: np.random.Generator) -> Callable[[SensorProblem], NestedResult]:
+        return lambda problem: from_scratch(problem, self.n_live, rng)
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator

@@ -101,6 +101,10 @@ class NestedSampling:
             raise NotConvergedError("no hypothesis of any kind could have given these readings")
         return now
 
+    def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
+        """See `Method.reconsidered`; nothing is carried that could be led astray."""
+        return posterior
+
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:

@@ -46,6 +46,8 @@ _FEWER = 3  # times
 _SUSPECTED = ((0.2, 2), (0.02, 4), (0.0, 6))  # probability from which on a rival has which fraction of the samples
 _MOST_OFF = 0.02  # by which a kind's probability may be wrong
 _DOUBTED_OFF = 0.06  # the same in a run that doubts its sensor, where no decision hangs on less
+_OFF_AT_THE_END = 0.5  # the same where samples have just been taken anew
+_HAS_A_SAY = 0.02  # probability of a kind in doubt that is solved from scratch; others are fitted anew
 _CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
 _STRAINED = 6.0  # nats, where samples could not follow
 _TOLD_APART = 1.5  # nats between an evidence carried and one taken anew, from which on the samples are in doubt
@@ -191,12 +193,9 @@ def updated(
             for p, problem, odds in zip(particles, problems, now.log_odds, strict=True)
         ]
         now = replace(previous, particles=tuple(particles))
-    settled: set[int] = set()
-    while (k := _most_doubtful(now, settled, _DOUBTED_OFF if doubted else _MOST_OFF)) is not None:
-        settled.add(k)
-        n = min(n_particles, _MOST_DRAWS) if doubted else n_particles
-        particles[k] = _reestimated(particles[k], problems[k], n, from_scratch, rng)
-        now = replace(now, particles=tuple(particles))
+    n = min(n_particles, _MOST_DRAWS) if doubted else n_particles
+    now = _without_doubt(now, problems, n, from_scratch, rng, most_off=_DOUBTED_OFF if doubted else _MOST_OFF)
+    particles = list(now.particles)
     if not np.isfinite(now.log_odds).any():
         raise NotConvergedError("no hypothesis of any kind could have given these readings")
     for k, p in enumerate(now.probability):
@@ -221,11 +220,17 @@ def _taken_in(
 
 
 def reconsidered(
-    posterior: Posterior, recording: Recording, n_particles: int, *, rng: np.random.Generator
+    posterior: Posterior,
+    recording: Recording,
+    n_particles: int,
+    *,
+    rng: np.random.Generator,
+    from_scratch: FromScratch,
 ) -> Posterior:
     """Sample every rival anew that might matter, but for those that were before: to be asked before a run ends."""
     problems = [kind.problem(recording) for kind in posterior.kinds]
-    return replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
+    now = replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
+    return _without_doubt(now, problems, min(n_particles, _MOST_DRAWS), from_scratch, rng, most_off=_OFF_AT_THE_END)
 
 
 def _sampled_from_others(
@@ -252,18 +257,20 @@ def _sampled_from_others(
             continue
         best = max(alike, key=lambda j: log_odds[j])
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
+        donors += [own.weighted] if own.log_z > hopeless else []
         n = max(len(own.ancestor), _size(kind, 0.0, n_particles))
         found = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
         if isinstance(found, float):
             particles[k] = replace(own, ceiling=max(found, own.log_z) + _RULED_OUT)
             continue
         if found is None or found.n_eff < _FEWEST:
+            particles[k] = replace(own, strained=own.strained or own.hurried)
             continue
         if found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
             continue
         fresh = sampled(found, n, problem, rng=rng, effort=BRIEF)
         fresh = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
-        particles[k] = replace(fresh, refitted=found.n_eff >= _WELL_FOUND)
+        particles[k] = replace(fresh, refitted=found.n_eff >= _WELL_FOUND, strained=found.n_eff < _LEAST_FOUND)
     return particles
 
 
@@ -312,9 +319,31 @@ def _shares(log_odds: FloatArray) -> FloatArray:
     return np.asarray(share / share.sum())
 
 
+def _without_doubt(
+    now: Posterior,
+    problems: list[SensorProblem],
+    n: int,
+    from_scratch: FromScratch,
+    rng: np.random.Generator,
+    *,
+    most_off: float,
+) -> Posterior:
+    """Re-estimate kinds until none has an evidence whose error could change its probability by more than `most_off`."""
+    particles, settled = list(now.particles), set[int]()
+    while (k := _most_doubtful(now, settled, most_off)) is not None:
+        settled.add(k)
+        particles[k] = _reestimated(particles[k], problems[k], n, from_scratch, rng)
+        now = replace(now, particles=tuple(particles))
+    return now
+
+
 def _most_doubtful(now: Posterior, settled: set[int], most_off: float) -> int | None:
-    """Return the kind whose evidence error has the largest effect on its probability; None if all are negligible."""
+    """Return the kind whose evidence error has the largest effect on its probability; None if all are negligible.
+
+    In a run that doubts its sensor, a kind whose samples are in doubt counts where it has a say in the shape.
+    """
     log_odds = now.log_odds
+    doubted = any(kind.left_out for kind in now.kinds)
     off = np.zeros(len(log_odds))
     for k, particles in enumerate(now.particles):
         if k in settled:
@@ -326,7 +355,8 @@ def _most_doubtful(now: Posterior, settled: set[int], most_off: float) -> int | 
         odds = log_odds[k] - float(logsumexp(others))
         doubt = 2 * particles.log_z_error + (_CARRIED if particles.n_resampled else 0.0)
         off[k] = max(abs(_share(odds + way * doubt) - _share(odds)) for way in (-1, 1))
-        if particles.strained and _share(odds + _STRAINED) > _LOST and _share(odds - _STRAINED) < 1 - _LOST:
+        may_be_right = _share(odds + _STRAINED) > _LOST and _share(odds - _STRAINED) < 1 - _LOST
+        if particles.strained and (_share(odds) > _HAS_A_SAY if doubted else may_be_right):
             off[k] = 1.0
     return int(off.argmax()) if off.max() > most_off else None
 

@@ -150,15 +150,15 @@ def step(
         return arm_error(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
 
     arm = arms() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
+    known, off = _is_known(experiment, posterior, arm, likely, rng)
     prospect, utilities = inquire(experiment, posterior, drawn, field, at=reading, goal=_remaining_sd(experiment, arm))
     asks = False
     if experiment.trust < 1:
-        known, _ = _is_known(experiment, posterior, arm, likely, rng)
         utilities, asks = settling(experiment, wary, prospect, utilities, readings, rng=rng, known=known)
         asks = asks and (max_readings is None or len(readings) < max_readings)
     if arm is None and (utilities.flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = arms()
-    known, off = _is_known(experiment, posterior, arm, likely, rng)
+        known, off = _is_known(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
     reason = stop_reason(experiment, sd, known and not asks, p_value, utilities, len(readings), max_readings, arm_sd)
     pose, *planned = state.planned or next_poses(experiment, prospect, utilities, rng=rng)

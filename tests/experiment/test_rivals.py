@@ -450,6 +450,32 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
     reconsidered(once, recording, 3000, rng=rng, from_scratch=solved)
 
 
+def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch(doubting, monkeypatch):
+    """Fits may miss most of a posterior: a few draws then hold all of the weight, and the samples are too narrow."""
+    kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "backlash")][:2]
+    recording, rng = played(doubting, kinds[-1], 12.0), np.random.default_rng(1)
+    now = prior_posterior(kinds, 3000, rng=rng)
+    solved = []
+
+    def from_nothing(problem):
+        solved.append(problem)
+        return from_scratch(problem, 100, rng)
+
+    def by_few(found, problem, own, *, n_draws, with_own, rng):
+        weighted = refitted(found, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
+        return replace(weighted, n_eff=7.0)
+
+    monkeypatch.setattr(posterior, "refitted", by_few)
+    plain, lost = (replace(p, weighted=replace(p.weighted, log_z=-1000.0)) for p in now.particles)
+    now = replace(now, particles=(plain, lost))
+    found = reconsidered(now, recording, 3000, rng=rng, from_scratch=from_nothing)
+    assert len(solved) >= 1
+    assert solved[0].prior.names == kinds[1].prior.names
+    assert not found.particles[1].strained
+    assert found.left_out["backlash"] > 0.99
+    assert found.particles[1].weighted.mean()[3] == pytest.approx(12.0, abs=4 * found.particles[1].weighted.sd()[3])
+
+
 def test_gear_play_may_spare_the_first_reading(doubting):
     """Nobody knows whence the arm came to its first place: two kinds, which agree on all other readings."""
     kinds = [kind for kind in doubting.kinds if kind.left_out == "backlash"]

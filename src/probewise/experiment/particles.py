@@ -74,7 +74,7 @@ class Particles:
         Whether, since then, a reading needed many temperatures: then few samples were near the new posterior, and the
         product of mean weights is nearly always too small.
     refitted
-        Whether the samples were found by fits to all readings, and have followed those since with ease.
+        Whether the samples were found by fits to all readings or from scratch, and have followed those since with ease.
     ceiling
         Log evidence that such fits rule out to be exceeded; infinite where they do not.
     """

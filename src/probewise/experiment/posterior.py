@@ -384,7 +384,7 @@ def _reestimated(
     drawn = redrawn(points, problem.prior.names, problem, rng=rng, n_draws=2 * n)
     fresh = sampled(replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng)
     fresh = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=n))
-    return replace(fresh, weighted=replace(fresh.weighted, run=run))
+    return replace(fresh, weighted=replace(fresh.weighted, run=run), refitted=True)
 
 
 def _weighed_again(particles: Particles, problem: SensorProblem, rng: np.random.Generator) -> Particles:

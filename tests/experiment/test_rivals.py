@@ -37,6 +37,7 @@ from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLa
 from probewise.experiment.posterior import prior_posterior, reconsidered, updated
 from probewise.experiment.refitted import fits, refitted
 from probewise.experiment.rivals import rivals_of
+from probewise.inference import Rounded
 from probewise.inquiry import prior_entropy
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
@@ -357,6 +358,26 @@ def test_readings_on_a_lattice_are_no_chance():
     smooth = level[0] + np.array([0.31, -0.72, 1.13, 0.05, -1.41, 0.93, 0.27, -0.68])
     assert law.log_prob(coarse, level)[0] > plain.log_prob(coarse, level)[0] + 5.0
     assert law.log_prob(smooth, level)[0] == pytest.approx(plain.log_prob(smooth, level)[0])
+
+
+@pytest.mark.parametrize("read", [[10.0, 10.0, 10.0, 10.0], [10.0, 5.0, 10.0, 10.0, 5.0]])
+def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
+    """Before a shape is seen all is black: readings of 10.0 and 5.0 are no lost ones, and places without a shape."""
+    readings, level = np.array(read), np.full((1, len(read)), 9.0)
+    rounded, lost = OnLattice(1.0, 0.0), laws(Lost)[0]
+    assert rounded.log_prob(readings, level)[0] > lost.log_prob(readings, level)[0] + 2.0
+    shared = np.array([10.0, 9.31, 10.72, 8.4, 10.0])  # two were lost, the others were read
+    level = np.full((1, 5), 9.6)
+    assert lost.log_prob(shared, level)[0] > rounded.log_prob(shared, level)[0] + 2.0
+
+
+def test_readings_that_are_rounded_as_declared_recur_by_nature():
+    law, level = OnLattice(0.6, 1.0), np.full((1, 6), 10.2)
+    plain = Rounded(sd=0.6, step=1.0, low=1.0, high=100.0)
+    for read in ([10.0] * 6, [10.0, 11.0, 10.0, 10.0, 11.0, 10.0]):
+        assert law.log_prob(np.array(read), level)[0] == pytest.approx(
+            plain.log_prob(np.array(read), level)[0], abs=1e-3
+        )
 
 
 def test_noise_that_grows_with_the_light_is_heard():

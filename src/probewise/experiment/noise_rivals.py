@@ -21,11 +21,11 @@ __all__ = ["Correlated", "Flickering", "Lost", "OnLattice", "Tailed", "WithSigna
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
-_EXACT = 1e-3  # of the noise sd: tolerance of a lost reading's value
+_EXACT = 1e-3  # of the noise sd: within which a value counts as the same, lost to black or rounded
 _PHASES = 7
 _PER_PHASE = 0.16  # of the amplitude: width of each phase's component, about the spacing of neighbouring phases
 _COARSE = 0.3  # noise sds from which rounding of the readings matters
-_PRINTED = 0.05  # noise sds: smallest lattice that is not likely by chance for unrounded readings
+_STEPS = (1.0, 2.0, 4.0, 8.0)  # noise sds: possible steps of a lattice of which one value has been seen
 _LEAST = -1e300  # log of a probability of zero, for differences
 _FREE = 2  # readings that determine the lattice
 
@@ -158,18 +158,37 @@ class Flickering:
 
 @dataclass(frozen=True, eq=False)
 class OnLattice:
-    """Likelihood with coarser rounding than declared; without a lattice, the same as the declared noise."""
+    """Likelihood with coarser rounding than declared; without a lattice, the same as the declared noise.
+
+    Three values or more show their lattice. Of readings that should not be rounded at all, two values that recur do,
+    and one value that recurs shows that there is one, of a step to be marginalised over.
+    """
 
     sd: float
     step: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """See `Likelihood.log_prob`."""
-        coarse = lattice_step(readings)
-        if coarse <= max(_COARSE * self.sd, 1.5 * self.step):
+        least = max(_COARSE * self.sd, 1.5 * self.step)
+        steps, n_free = self._steps(readings)
+        nodes = [self._rounded_to(coarse, n_free, readings, predicted) for coarse in steps if coarse > least]
+        if not nodes:
             return np.asarray(_log_density_of_each(readings, predicted, self.sd, self.step).sum(axis=1))
-        fine = self.step or _PRINTED * self.sd
-        surprise = (len(readings) - _FREE) * math.log(coarse / fine)
+        return _mean_over(nodes)
+
+    def _steps(self, readings: FloatArray) -> tuple[list[float], int]:
+        """Return possible steps of a lattice, equally weighted, and how many readings determine it."""
+        values = np.unique(readings)
+        recur = not self.step and len(values) < len(readings)
+        if recur and len(values) == 1:
+            return [times * self.sd for times in _STEPS], 1
+        if recur and len(values) == 2:
+            return [float(values[1] - values[0])], _FREE
+        return [lattice_step(readings)], _FREE
+
+    def _rounded_to(self, coarse: float, n_free: int, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        fine = self.step or _EXACT * self.sd
+        surprise = (len(readings) - n_free) * math.log(coarse / fine)
         density = _log_density_of_each(readings, predicted, self.sd, coarse) - math.log(coarse)
         return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(self.step) if self.step else 0.0))
 

@@ -7,7 +7,9 @@ posterior that the first run found (`repartition`). Where the posterior fills so
 nothing, a small run of the same problem is used. The jump distance of the chains, in units of the live points' spread,
 is no substitute: it is smallest for many modes or a thin shell, where the evidence is right.
 
-Neither estimate sees a narrow peak that begins above where both end; `beyond` looks for one.
+Neither estimate sees a narrow peak that begins above where both end, which `beyond` looks for, or a mode that died out
+among the live points, which `lost` looks for: where it holds a part of the evidence that matters, the run is repeated
+with hops between the modes that are then known.
 """
 
 from __future__ import annotations
@@ -22,10 +24,14 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.beyond import NOTHING, Beyond, look_beyond
+from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
+from probewise.nested.hops import HoppingMove
+from probewise.nested.lost import NOTHING_LOST, Lost, look_for_lost
 from probewise.nested.moves import Move, SliceMove
-from probewise.nested.repartition import Repartitioned, repartitioned
+from probewise.nested.repartition import Repartitioned, groups_of, repartitioned
 from probewise.nested.result import Check, NestedResult, few_lineages, few_possible
+from probewise.nested.space import space_of
 
 __all__ = ["DISAGREE", "SingleRun", "checked", "weighted_mean"]
 
@@ -44,6 +50,7 @@ _AGAIN = 2.2  # times the first run's evaluations: what it costs to repeat it wi
 _ALIKE = 2.0  # errors within which two runs agree, against a second pass that lies below both
 _SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
+_MATTERS = 0.25  # errors by which a lost mode raises log Z, above which the run is repeated
 
 
 class SingleRun(Protocol):
@@ -58,18 +65,25 @@ class SingleRun(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Route:
-    """A second estimate of the evidence: a problem of the same evidence, the number of live points and the move.
+    """A second estimate of the evidence: a problem of the same evidence, the number of live points and the chains.
 
+    Before each chain there are hops between `modes`, where they are given.
     It takes at most `most_calls` evaluations. Where the mean of its log likelihood over the posterior is not
     `expected` to within `_SAME_MEAN`, it has found another posterior than the run and is no estimate.
     """
 
     problem: Samplable
     n_live: int
-    move: SliceMove
+    chain: SliceMove
     name: str
     most_calls: float = math.inf
     expected: float | None = None
+    modes: Clusters | None = None
+
+    @property
+    def move(self) -> Move:
+        """The move."""
+        return self.chain if self.modes is None else HoppingMove(self.chain, self.modes)
 
     def confirmed(self, found: NestedResult) -> bool:
         """Whether the estimate found the posterior that was expected; its information is the mean less log Z."""
@@ -78,8 +92,8 @@ class _Route:
     @property
     def least_calls(self) -> int:
         """Evaluations of the first live points and of one round, with a margin of two: fewer are not worth a start."""
-        n_steps = max(self.move.fewest_steps, math.ceil(self.move.steps_per_param * len(self.problem.prior.names)))
-        return math.ceil(self.n_live * (1 + n_steps * self.move.target))
+        n_steps = max(self.chain.fewest_steps, math.ceil(self.chain.steps_per_param * len(self.problem.prior.names)))
+        return math.ceil(self.n_live * (1 + n_steps * self.chain.target))
 
 
 def checked(
@@ -137,9 +151,16 @@ def checked(
         spent += found.n_calls
         return found if found.complete else None
 
-    now, above, estimates = first, NOTHING, list[NestedResult]()
+    now, lost, above, estimates, modes = first, NOTHING_LOST, NOTHING, list[NestedResult](), None
     try:
-        above = _search_above(first, problem, int(budget - spent), rng)
+        lost = _search_lost(first, problem, int(budget - spent), rng)
+        spent += lost.n_calls
+        if _raised(first, lost.not_in(first)) > _MATTERS:
+            modes = _modes(first, lost, problem, rng)
+            chain = move if isinstance(move, SliceMove) else SliceMove()
+            again = estimated(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
+            now = first if again is None else again
+        above = _search_above(now, problem, int(budget - spent), rng)
         spent += above.n_calls
         curved = False
         for route in _second_routes(now, problem, move, least_live, rng):
@@ -153,7 +174,7 @@ def checked(
                 f"{route.name}, which checks the evidence, did not end within max_cost and max_calls "
                 f"({int(budget)} evaluations in all); use a greater limit, or max_cost=1 for no check"
             )
-            return _with_peak(replace(first, n_calls=spent, warnings=(*first.warnings, note)), above)
+            return _with_peaks(replace(now, n_calls=spent, warnings=(*now.warnings, note)), lost, above)
         name = route.name
         if _is_suspicious(now, estimates, _APART):
             left, again_costs = budget - spent, _AGAIN * first.n_calls
@@ -162,9 +183,9 @@ def checked(
             sharper = replace(route, n_live=n_live, most_calls=math.inf)
             if n_live > route.n_live and (found := estimated(sharper)) is not None:
                 estimates = [found] if estimates[0].warnings else [*estimates, found]
-        n_check = sum(each.n_calls for each in estimates) + above.n_calls
+        n_check = sum(each.n_calls for each in estimates) + lost.n_calls + above.n_calls
         if _is_suspicious(now, estimates, DISAGREE):
-            again = estimated(_Route(problem, now.n_live, _with_longer_chains(move), "the run again"))
+            again = estimated(_Route(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes))
             if again is not None and not again.warnings:
                 if not _is_suspicious(again, estimates, DISAGREE):
                     now = again
@@ -172,13 +193,23 @@ def checked(
                     now, estimates, name = again, [now], "the same run with shorter chains"
     except _FailedError as error:
         note = f"the second pass, which checks the evidence, failed: {error}"
-        return _with_peak(replace(now, n_calls=spent, warnings=(*now.warnings, note)), above)
-    return _with_peak(_with_check(now, name, estimates, n_check, spent), above)
+        return _with_peaks(replace(now, n_calls=spent, warnings=(*now.warnings, note)), lost, above)
+    return _with_peaks(_with_check(now, name, estimates, n_check, spent), lost, above)
+
+
+def _search_lost(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Lost:
+    """Look for modes that died out, where the prior's coordinates allow it."""
+    if not _has_coordinates(problem):
+        return NOTHING_LOST
+    try:
+        return look_for_lost(first, problem, max_calls=max_calls, rng=rng)
+    except NotConvergedError as error:
+        raise _FailedError(str(error)) from error
 
 
 def _search_above(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Beyond:
     """Look for a higher peak, where the prior's coordinates allow it."""
-    if not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
+    if not _has_coordinates(problem):
         return NOTHING
     try:
         return look_beyond(first, problem, max_calls=max_calls, rng=rng)
@@ -186,16 +217,38 @@ def _search_above(first: NestedResult, problem: Samplable, max_calls: int, rng: 
         raise _FailedError(str(error)) from error
 
 
-def _with_peak(run: NestedResult, above: Beyond) -> NestedResult:
-    """Add a warning where a higher peak raises log Z by more errors than two right estimates would differ."""
-    raised = float(np.logaddexp(run.log_z, above.log_z)) - run.log_z
-    if raised <= DISAGREE * run.log_z_error:
-        return run
-    note = (
-        f"a narrow peak that no live point met lies above the run's end: its log Z is about {above.log_z:.1f}, this "
-        f"run's {run.log_z:.2f} ± {run.log_z_error:.2f}; use more n_live or a prior about the peak"
-    )
-    return replace(run, warnings=(*run.warnings, note))
+def _has_coordinates(problem: Samplable) -> bool:
+    return hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")
+
+
+def _modes(first: NestedResult, lost: Lost, problem: Samplable, rng: np.random.Generator) -> Clusters:
+    """Return the clusters of a run's posterior and the modes it lost, in the sampling coordinates."""
+    space = space_of(problem.prior, getattr(problem, "periodic", ()))
+    met = groups_of(space.enter(first.samples(_N_SAMPLES, rng=rng)))
+    return Clusters.of([*met, *(space.enter(hill.theta) for hill in lost.hills)])
+
+
+def _raised(run: NestedResult, log_z: float) -> float:
+    """By how many errors the evidence of a part that the run has not met raises log Z."""
+    return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / run.log_z_error
+
+
+def _with_peaks(run: NestedResult, lost: Lost, above: Beyond) -> NestedResult:
+    """Add a warning for each part of the posterior that is known to be missing and matters."""
+    notes, log_z = list[str](), lost.not_in(run)
+    mine = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}"
+    if _raised(run, log_z) > _MATTERS:
+        notes.append(
+            f"a mode that died out among the live points has a log Z of about {log_z:.2f}, {mine}; "
+            "use more n_live or a greater max_cost"
+        )
+    # By more errors than two right estimates would differ: the evidence of a peak above the end is a rough estimate.
+    if _raised(run, above.log_z) > DISAGREE:
+        notes.append(
+            f"a narrow peak that no live point met lies above the run's end: its log Z is about {above.log_z:.1f}, "
+            f"{mine}; use more n_live or a prior about the peak"
+        )
+    return replace(run, warnings=(*run.warnings, *notes))
 
 
 class _FailedError(Exception):
@@ -207,11 +260,11 @@ def _second_routes(
 ) -> Iterator[_Route]:
     """Yield the routes to a second estimate, the cheapest first; the last one is an estimate whatever it finds."""
 
-    def from_near(near: Repartitioned, nats: float, **limits: float) -> _Route:
+    def from_near(near: Repartitioned, nats: float) -> _Route:
         wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
         enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
         n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
-        return _Route(near, n_live, _with_longer_chains(move), "a second pass from near the posterior", **limits)
+        return _Route(near, n_live, _with_longer_chains(move), "a second pass from near the posterior")
 
     if first.information > 0:
         theta = first.samples(_N_SAMPLES, rng=rng)
@@ -220,7 +273,8 @@ def _second_routes(
         if clustered is not None and len(clustered.prior.parts) == 1:
             clustered = None  # the single prior below
         if clustered is not None and (nats := _nats(first, clustered)) < _FEW_NATS < _GAIN * first.information:
-            yield from_near(clustered, nats, most_calls=_MOST_COST * first.n_calls, expected=nats + first.log_z)
+            most, expected = _MOST_COST * first.n_calls, nats + first.log_z
+            yield replace(from_near(clustered, nats), most_calls=most, expected=expected)
         single = _repartitioned_near(problem, theta, clustered=False)
         # With a log Z that is far too large the nats come out too few, or negative.
         if single is not None and (nats := _nats(first, single)) < _GAIN * first.information:

@@ -162,7 +162,7 @@ def _thread(
     end = (float(result.log_likelihood[last]), float(result.label[last]))
     bound = Bound(float(result.log_likelihood[first]), float(result.label[first]))
     above = _alive(result, first)
-    known = _points(result, evaluate, above)
+    known = evaluate.known(result.theta[above], result.log_likelihood[above], result.label[above])
     log_volume = float(result.log_volume[first])
     begin = np.concatenate([rng.permutation(len(above)) for _ in range(math.ceil(n_live / len(above)))])[:n_live]
     now = move_at(move, log_volume)
@@ -198,13 +198,6 @@ def _alive(result: NestedResult, row: int) -> IntArray:
     level = (result.log_likelihood[row], result.label[row])
     born = (result.log_birth < level[0]) | ((result.log_birth == level[0]) & (result.birth_label <= level[1]))
     return np.flatnonzero(born & (np.arange(result.n_dead) > row))
-
-
-def _points(result: NestedResult, evaluate: Evaluator, rows: IntArray) -> Points:
-    """Rows of a run as points from which chains can start."""
-    theta = result.theta[rows]
-    u = evaluate.space.enter(theta)
-    return Points(u, theta, evaluate.space.leave(u)[1], result.log_likelihood[rows], result.label[rows])
 
 
 def _joined(

@@ -131,6 +131,11 @@ class Evaluator:
         """Draw from the prior and evaluate."""
         return self(self.space.draw(n, rng=rng), rng)
 
+    def known(self, theta: FloatArray, log_likelihood: FloatArray, label: FloatArray) -> Points:
+        """Make points of hypotheses (n, n_params) that were evaluated before."""
+        u = self.space.enter(theta)
+        return Points(u, theta, self.space.leave(u)[1], log_likelihood, label)
+
     def __call__(self, u: FloatArray, rng: np.random.Generator) -> Points:
         """Evaluate `u`, (n, n_params), inside the space, and give every point a new label.
 

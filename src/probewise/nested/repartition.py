@@ -25,7 +25,7 @@ from probewise.nested.evaluate import Samplable
 from probewise.nested.space import Space, unbounded
 from probewise.priors import Prior
 
-__all__ = ["Repartitioned", "principal_root", "repartitioned"]
+__all__ = ["Repartitioned", "groups_of", "principal_root", "repartitioned"]
 
 _DEGREES_OF_FREEDOM = 5.0
 _FLATTEST = 1e-12  # least variance along an axis, relative to the greatest
@@ -213,11 +213,11 @@ def repartitioned(
     space = unbounded(problem.prior)
     x = space.enter(theta)
     whole = _Parts.of([x], widening)
-    parts = _Parts.of(_groups(x), widening) if clustered else whole
+    parts = _Parts.of(groups_of(x), widening) if clustered else whole
     return Repartitioned(problem, _Near(problem.prior, space, whole, parts))
 
 
-def _groups(x: FloatArray) -> list[FloatArray]:
+def groups_of(x: FloatArray) -> list[FloatArray]:
     """Divide samples (n, n_params) into clusters, each with enough samples for its axes."""
     least = _SAMPLES_IN_CLUSTER * x.shape[1]
     clusters = find_clusters(x, least=least)

@@ -1,0 +1,64 @@
+"""A move that hops between known modes before each chain, so that none of them dies out among the live points."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.nested.clusters import Clusters
+from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.moves import SliceMove, Tally
+
+__all__ = ["HoppingMove"]
+
+_HOPS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class HoppingMove:
+    """Hops between modes, then the chains of `then`.
+
+    A hop takes a point to its counterpart in another mode, by the affine map between their covariances, and is accepted
+    with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes in which there are enough live
+    points for a covariance; here `modes` are those of the posterior, in the sampling coordinates. Level sets of a mode
+    have about its shape far below its top too, so the maps serve from where modes separate.
+    """
+
+    then: SliceMove
+    modes: Clusters
+
+    def draw(
+        self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
+    ) -> tuple[Points, Tally]:
+        """Return the ends of one chain from each start; see `Move`."""
+        n_before, now = evaluate.n_calls, start.copy()
+        for _ in range(_HOPS):
+            self._hop(now, bound, evaluate, rng)
+        n_hops = evaluate.n_calls - n_before
+        new, tally = self.then.draw(now, bound, live, evaluate, rng)
+        return new, Tally(tally.n_evaluated + n_hops, tally.n_accepted, tally.n_stuck, tally.n_tried)
+
+    def _hop(self, now: Points, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
+        """Try one hop of each point to another mode, chosen at random; those that succeed are overwritten."""
+        modes, space = self.modes, evaluate.space
+        home = modes.assign(now.u)
+        goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
+        z = np.einsum("nij,nj->ni", modes.inverse_root[home], now.u - modes.mean[home])
+        u = modes.mean[goal] + np.einsum("nij,nj->ni", modes.root[goal], z)
+        log_growth = modes.log_det[goal] - modes.log_det[home]
+        # The way back must be the same map.
+        able = ((u > space.low) & (u < space.high)).all(axis=1) & (modes.assign(u) == goal)
+        level = now.log_density - log_growth - rng.standard_exponential(len(home))
+        rows = able.nonzero()[0]
+        theta, log_density = space.leave(u[rows])
+        dense = (log_density >= level[rows]).nonzero()[0]
+        rows = rows[dense]
+        tried = evaluate.weigh(u[rows], theta[dense], log_density[dense], rng)
+        won = bound.admits(tried.log_likelihood, tried.label).nonzero()[0]
+        now.put(rows[won], tried, won)
+
+    def adapted(self, tally: Tally) -> HoppingMove:
+        """Adapt the chains; see `SliceMove`."""
+        return HoppingMove(self.then.adapted(tally), self.modes)

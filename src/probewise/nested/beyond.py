@@ -3,8 +3,9 @@
 A run ends where its live points can no longer raise log Z, if the likelihood goes on as it did. A narrow peak on a
 broad one (a change of phase, Skilling 2006) can hold most of the posterior and begin tens of nats further up, where no
 live point has been. Draws from ever narrower normal distributions about the last live points cost no chains and reach
-the top of the broad peak. A draw that lies higher than this top belongs to another peak, whose mass is estimated in
-the same way.
+the top of the broad peak. There most draws are spent: where the broad peak is level, a direction towards a narrow one
+suffices to meet it. A draw that lies higher than the top belongs to another peak, whose mass is estimated in the same
+way.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ __all__ = ["NOTHING", "Beyond", "look_beyond"]
 
 _FLAT = 0.2  # nats between the best draw and the worst of the best tenth: the top of a peak
 _NARROWER = 0.8  # sd of a distribution over that of the one before
-_DRAWS_PER_LIVE = 20
+_PER_LIVE = 5  # draws of a distribution on the way to the top of the known peak
+_PER_LIVE_BEYOND = 20  # on the way to that of another, which they also weigh
+_AT_TOP = (1.25, 1.0, 0.8)  # scales of those at the top, which get as many draws a live point as there are parameters
 _SHARE = 1 / 5  # of the run's evaluations, spent where there is no higher peak
 _MOST_LEVELS = 60
 _MOST_PEAKS = 5
@@ -45,10 +48,14 @@ NOTHING = Beyond(-math.inf, 0)
 
 @dataclass(frozen=True, eq=False)
 class _Level:
-    """Draws from a normal distribution about `centre` (n_params,), its sds `scale` times those of the live points."""
+    """Draws from a normal distribution about `centre` (n_params,), its sds `scale` times those of the live points.
+
+    Of `n_draws` draws those inside the space are `points`.
+    """
 
     centre: FloatArray
     scale: float
+    n_draws: int
     points: Points
 
     @property
@@ -72,21 +79,27 @@ def look_beyond(first: NestedResult, problem: Samplable, *, max_calls: int, rng:
         Source of randomness.
     """
     evaluate = Evaluator(problem)
-    n_draws = _DRAWS_PER_LIVE * first.n_live
     most = min(max_calls, int(_SHARE * first.n_calls))
-    if most < n_draws:
+    if most < _PER_LIVE * first.n_live:
         return NOTHING
     u = evaluate.space.enter(first.theta[-first.n_live :])
     root, centre, scale, log_z = principal_root(u), u.mean(axis=0), 1.0, -math.inf
     lowest = float(first.log_likelihood[-first.n_live])
+    known = -math.inf
     for peak in range(_MOST_PEAKS):
+        n_draws = first.n_live * (_PER_LIVE_BEYOND if peak else _PER_LIVE)
         levels = _climb(
-            evaluate, centre, scale, root, lowest, n_draws=n_draws, max_calls=max_calls if peak else most, rng=rng
+            evaluate, centre, scale, root, (lowest, known), n_draws=n_draws, max_calls=max_calls if peak else most, rng=rng
         )
+        top = levels[-1]
         if peak:
-            log_z = max(log_z, _evidence(levels, root, n_draws))
+            log_z = max(log_z, _evidence(levels, root))
+        else:
+            n_draws = int(min(first.n_live * len(evaluate.names), (most - evaluate.n_calls) / len(_AT_TOP)))
+            levels += [_drawn(evaluate, top.centre, wide * top.scale, root, n_draws, rng) for wide in _AT_TOP]
         highest = max(levels, key=lambda level: level.top)
-        if not highest.top > levels[-1].top + _FLAT:
+        known = top.top + _FLAT
+        if not highest.top > known:
             break
         centre, scale = highest.points.u[int(highest.points.log_likelihood.argmax())], highest.scale
     return Beyond(log_z, evaluate.n_calls)
@@ -97,7 +110,7 @@ def _climb(
     centre: FloatArray,
     scale: float,
     root: FloatArray,
-    lowest: float,
+    heights: tuple[float, float],
     *,
     n_draws: int,
     max_calls: int,
@@ -105,31 +118,44 @@ def _climb(
 ) -> list[_Level]:
     """Draw from ever narrower distributions, each about the best tenth of the one before, until these are level.
 
-    `lowest` is the log likelihood of the worst live point.
+    `heights` are log likelihoods: of the worst live point, and of the top of the peaks that are known. Only draws above
+    that top count among the best: near a narrow peak most belong to the broad one.
     """
-    space, levels = evaluate.space, list[_Level]()
+    lowest, known = heights
+    levels = list[_Level]()
     while True:
-        tried = centre + scale * rng.standard_normal((n_draws, len(centre))) @ root.T
-        found = evaluate(tried[((tried > space.low) & (tried < space.high)).all(axis=1)], rng)
-        levels.append(_Level(centre, scale, found))
+        levels.append(_drawn(evaluate, centre, scale, root, n_draws, rng))
+        found = levels[-1].points
         best = found.order()[-n_draws // 10 :]
         height = found.log_likelihood[best]
-        if not len(best) or float(np.ptp(height)) < _FLAT:
+        above = height > known
+        if not len(best) or (above.all() and float(np.ptp(height)) < _FLAT):
             return levels
         if len(levels) >= _LEVELS_TO_MEET and float(np.median(height)) < lowest:
             return levels
         if len(levels) == _MOST_LEVELS or evaluate.n_calls + n_draws > max_calls:
             return levels
-        centre, scale = found.u[best].mean(axis=0), scale * _NARROWER
+        centre = found.u[best[above]].mean(axis=0) if above.any() else centre
+        scale *= _NARROWER
 
 
-def _evidence(levels: list[_Level], root: FloatArray, n_draws: int) -> float:
+def _drawn(
+    evaluate: Evaluator, centre: FloatArray, scale: float, root: FloatArray, n_draws: int, rng: np.random.Generator
+) -> _Level:
+    """Draw and evaluate; draws outside the space count without points."""
+    space = evaluate.space
+    tried = centre + scale * rng.standard_normal((n_draws, len(centre))) @ root.T
+    inside = ((tried > space.low) & (tried < space.high)).all(axis=1)
+    return _Level(centre, scale, n_draws, evaluate(tried[inside], rng))
+
+
+def _evidence(levels: list[_Level], root: FloatArray) -> float:
     """Estimate log Z by importance sampling: all draws together come from a mixture of normal distributions."""
     drawn = Points.join(*(level.points for level in levels))
     inverse, n_params = np.linalg.inv(root), root.shape[0]
     log_q = np.full(len(drawn), -np.inf)
     for level in levels:
         square = (((drawn.u - level.centre) @ inverse.T / level.scale) ** 2).sum(axis=1)
-        log_q = np.logaddexp(log_q, -0.5 * square - n_params * math.log(level.scale))
+        log_q = np.logaddexp(log_q, math.log(level.n_draws) - 0.5 * square - n_params * math.log(level.scale))
     log_q -= float(np.linalg.slogdet(root)[1]) + 0.5 * n_params * math.log(2 * math.pi)
-    return float(logsumexp(drawn.log_density + drawn.log_likelihood - log_q)) - math.log(n_draws)
+    return float(logsumexp(drawn.log_density + drawn.log_likelihood - log_q))

@@ -28,7 +28,7 @@ _NARROWER = 0.8  # sd of a distribution over that of the one before
 _PER_LIVE = 5  # draws of a distribution on the way to the top of the known peak
 _PER_LIVE_BEYOND = 20  # on the way to that of another, which they also weigh
 _AT_TOP = (1.25, 1.0, 0.8)  # scales of those at the top, which get as many draws a live point as there are parameters
-_SHARE = 1 / 5  # of the run's evaluations, spent where there is no higher peak
+_SHARE = 1 / 8  # of the run's evaluations, spent where there is no higher peak
 _MOST_LEVELS = 60
 _MOST_PEAKS = 5
 _LEVELS_TO_MEET = 3  # after which the draws must lie where the live points do: they do not about a curved ridge
@@ -74,7 +74,7 @@ def look_beyond(first: NestedResult, problem: Samplable, *, max_calls: int, rng:
     problem
         Its problem, whose prior has `to_unit_cube` or coordinates of its own.
     max_calls
-        Limit of evaluations; without a higher peak at most a fifth of the run's are used.
+        Limit of evaluations; without a higher peak at most an eighth of the run's are used.
     rng
         Source of randomness.
     """
@@ -88,9 +88,8 @@ def look_beyond(first: NestedResult, problem: Samplable, *, max_calls: int, rng:
     known = -math.inf
     for peak in range(_MOST_PEAKS):
         n_draws = first.n_live * (_PER_LIVE_BEYOND if peak else _PER_LIVE)
-        levels = _climb(
-            evaluate, centre, scale, root, (lowest, known), n_draws=n_draws, max_calls=max_calls if peak else most, rng=rng
-        )
+        limit = max_calls if peak else most
+        levels = _climb(evaluate, centre, scale, root, (lowest, known), n_draws=n_draws, max_calls=limit, rng=rng)
         top = levels[-1]
         if peak:
             log_z = max(log_z, _evidence(levels, root))

@@ -458,7 +458,8 @@ def pareto_k(log_weight: FloatArray, tail: float = 3.0) -> float:
         return math.inf
     weight = np.sort(np.exp(log_weight - log_weight.max()))
     excess = weight[-n_tail:] - weight[-n_tail - 1]
-    excess = excess[excess > 0]
+    # The shape does not depend on the scale; below 1e-100 of the greatest, one over an excess would overflow.
+    excess = excess[excess > 1e-100 * excess[-1]] / max(excess[-1], 1e-300)
     if excess.size < 5:
         return -math.inf
     n_grid = 30 + int(math.sqrt(excess.size))

@@ -29,7 +29,7 @@ from probewise.nested.weights import n_effective
 __all__ = ["NOTHING_LOST", "Hill", "Lost", "look_for_lost"]
 
 _SHARE = 1 / 20  # of the run's evaluations, for the first lines
-_MOST_SHARE = 1 / 10  # up to which another hill is weighed
+_MOST_SHARE = 1 / 8  # up to which another hill is weighed
 _FEWEST_STEPS = 6
 _TRIES = 2  # candidates in a step of a climb
 _WIDTH = 3.0  # of a step, in sds of the points that died next
@@ -40,7 +40,8 @@ _BULK = 0.1  # of the posterior's mass, up to which points count as early
 _N_KNOWN = 200  # samples of the posterior: so few that a mode of which it has nearly nothing is not among them
 _N_SAMPLES = 1000  # of a lost mode
 _MOST_HILLS = 8
-_SWEEPS = 12  # to the top
+_SWEEPS = 12  # of a climb
+_FROM_TOP = 3.0  # nats a parameter, within which a climb comes of the top
 _NEAREST = 3
 _ROUNDS = 6
 _SETTLED = 0.5  # nats
@@ -115,12 +116,15 @@ def look_for_lost(first: NestedResult, problem: Samplable, *, max_calls: int, rn
     apart = np.flatnonzero(_apart(start, known, scale, 1, evaluate, rng))
     if not apart.size:
         return Lost((), evaluate.n_calls)
-    few = apart[_far_from_each_other(start.u[apart] / scale, start.log_likelihood[apart])]
-    roots = np.stack([principal_root(u[row : row + _BLOCK]) for row in rows[few]])
-    few = _Climbers(start.take(few), roots, np.ones(len(few))).climbed(evaluate, rng)
+    chosen = apart[_far_from_each_other(start.u[apart] / scale, start.log_likelihood[apart])]
+    roots = np.stack([principal_root(u[row : row + _BLOCK]) for row in rows[chosen]])
+    few = _Climbers(start.take(chosen), roots, np.ones(len(chosen))).climbed(evaluate, rng)
+    # Of the evidence below a level a lost mode holds no more than its share of live points there.
+    enough = first.log_likelihood[last] - _FROM_TOP * len(evaluate.names)
+    few = few.take(np.flatnonzero(few.now.log_likelihood > enough))
     few = few.take(np.flatnonzero(_apart(few.now, known, scale, _NEAREST, evaluate, rng)))
     space, hills = unbounded(problem.prior), list[Hill]()
-    while len(few) and evaluate.n_calls < _MOST_SHARE * first.n_calls:
+    while len(few) and evaluate.n_calls + _hill_calls(len(evaluate.names)) < _MOST_SHARE * first.n_calls:
         best = int(few.now.log_likelihood.argmax())
         top = _settled(few.now.take(slice(best, best + 1)), few.root[best] * few.scale[best], evaluate, rng)
         few = few.take(np.delete(np.arange(len(few)), best))
@@ -202,10 +206,19 @@ def _far_from_each_other(x: FloatArray, height: FloatArray) -> IntArray:
     return np.array(chosen)
 
 
+def _points_on_hill(n_params: int) -> int:
+    return max(_PER_PARAM * n_params, 20)
+
+
+def _hill_calls(n_params: int) -> float:
+    """About as many evaluations as it takes to weigh a hill: two or three rounds of chains."""
+    return 2.5 * _points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
+
+
 def _settled(top: Points, root: FloatArray, evaluate: Evaluator, rng: np.random.Generator) -> Points:
     """Draw points uniformly from the top of a hill, down to where they have the covariance of a normal posterior."""
     n_params = root.shape[0]
-    n = max(_PER_PARAM * n_params, 20)
+    n = _points_on_hill(n_params)
     below = (n_params + 2) / 2
     move = SliceMove(hops=0)
     live, starts = top.u + rng.standard_normal((n, n_params)) @ root.T, top.take(np.zeros(n, dtype=np.int64))
@@ -224,7 +237,7 @@ def _settled(top: Points, root: FloatArray, evaluate: Evaluator, rng: np.random.
 
 
 def _weighed(x: FloatArray, space: Space, evaluate: Evaluator, rng: np.random.Generator) -> Weighted | None:
-    """Weigh a hill by draws from a Student t about points on it, (n, n_params), fitted again to the draws if need be."""
+    """Weigh a hill by draws from a Student t about points on it, (n, n_params), fitted anew if need be."""
     n_params = x.shape[1]
     mean, covariance = x.mean(axis=0), np.atleast_2d(np.cov(x, rowvar=False))
     n_draws, enough = max(_DRAWS_PER_PARAM * n_params, 200), _ENOUGH * n_params

@@ -62,7 +62,8 @@ class _Parts:
 
     def along(self, x: FloatArray, part: int) -> FloatArray:
         """Return the coordinates along the axes of a part, (n, n_params) -> (n, n_params)."""
-        return np.asarray((x - self.center[part]) @ self.inverse_root[part].T)
+        # A matrix product would depend, in the last bit, on the batch, which an executor divides.
+        return np.asarray(np.einsum("nj,ij->ni", x - self.center[part], self.inverse_root[part]))
 
     def log_densities(self, x: FloatArray) -> FloatArray:
         """Return each part's log density times its share, (n, n_params) -> (n_parts, n)."""

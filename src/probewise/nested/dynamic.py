@@ -23,7 +23,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.nested.checkpoint import Live, Origin
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integrate
-from probewise.nested.merging import alive_at_death, combined_p_value, seeds_of
+from probewise.nested.merging import JoinedRecord, combined_p_value, seeds_of
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, versions
 from probewise.nested.sampler import least_live, move_at, plain_state, step
@@ -213,17 +213,18 @@ def _joined(
     row_of = np.empty(len(points), dtype=np.int64)
     row_of[origin.ident] = n_old + np.arange(len(points))
     parents = np.where(origin.parent >= 0, row_of[origin.parent], thread.started)
-    log_likelihood = np.concatenate([result.log_likelihood, points.log_likelihood])
-    label = np.concatenate([result.label, points.label])
-    order = np.lexsort((label, log_likelihood))
-    place = np.argsort(order)
-    every_parent = np.concatenate([result.parent, parents])
-    log_birth = np.concatenate([result.log_birth, origin.log_birth])[order]
-    birth_label = np.concatenate([result.birth_label, origin.birth_label])[order]
-    log_likelihood, label = log_likelihood[order], label[order]
-    n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
+    record = JoinedRecord.of(
+        [
+            (result.log_likelihood, result.label, result.log_birth, result.birth_label),
+            (points.log_likelihood, points.label, origin.log_birth, origin.birth_label),
+        ]
+    )
     evidence = integrate(
-        log_likelihood, n_at_death, rng=rng, log_start=result.log_start, log_start_error=result.log_start_error
+        record.log_likelihood,
+        record.n_at_death,
+        rng=rng,
+        log_start=result.log_start,
+        log_start_error=result.log_start_error,
     )
     error = evidence.error(result.memory)
     check = result.check
@@ -238,14 +239,14 @@ def _joined(
         notes = (*notes, doubt)
     return replace(
         result,
-        theta=np.concatenate([result.theta, points.theta])[order],
-        log_likelihood=log_likelihood,
-        label=label,
+        theta=np.concatenate([result.theta, points.theta])[record.order],
+        log_likelihood=record.log_likelihood,
+        label=record.label,
         log_weight=evidence.log_weight,
-        log_birth=log_birth,
-        birth_label=birth_label,
-        parent=np.where(every_parent >= 0, place[every_parent], -1)[order],
-        n_at_death=n_at_death,
+        log_birth=record.log_birth,
+        birth_label=record.birth_label,
+        parent=record.parents(np.concatenate([result.parent, parents])),
+        n_at_death=record.n_at_death,
         log_z=evidence.log_z,
         log_z_error=error,
         information=evidence.information,

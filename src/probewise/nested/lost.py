@@ -29,7 +29,7 @@ from probewise.nested.weights import n_effective
 __all__ = ["NOTHING_LOST", "Hill", "Lost", "look_for_lost"]
 
 _SHARE = 1 / 20  # of the run's evaluations, for the first lines
-_MOST_SHARE = 1 / 8  # up to which another hill is weighed
+_MOST_SHARE = 1 / 6  # up to which another hill is weighed
 _FEWEST_STEPS = 6
 _TRIES = 2  # candidates in a step of a climb
 _WIDTH = 3.0  # of a step, in sds of the points that died next

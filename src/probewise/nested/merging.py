@@ -6,6 +6,7 @@ import json
 import math
 import warnings
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
@@ -16,7 +17,7 @@ from probewise.nested.check import DISAGREE, weighted_mean
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
 from probewise.nested.result import Agreement, Check, NestedResult, versions
 
-__all__ = ["agreement_of", "alive_at_death", "combined_p_value", "merge", "seeds_of"]
+__all__ = ["JoinedRecord", "agreement_of", "alive_at_death", "combined_p_value", "merge", "seeds_of"]
 
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
@@ -53,18 +54,15 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     """
     parts = tuple(results)
     seeds = _check(parts)
-    log_likelihood = np.concatenate([r.log_likelihood for r in parts])
-    label = np.concatenate([r.label for r in parts])
-    order = np.lexsort((label, log_likelihood))
-    log_likelihood, label = log_likelihood[order], label[order]
-    log_birth = np.concatenate([r.log_birth for r in parts])[order]
-    birth_label = np.concatenate([r.birth_label for r in parts])[order]
-    n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
-    parent = _joined_parents(parts, order)
+    record = JoinedRecord.of([(r.log_likelihood, r.label, r.log_birth, r.birth_label) for r in parts])
+    first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
+    parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
     # Each run has its own estimate: in the joined record a run is never complete between two rounds.
     remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
     log_start, log_start_error = _possible_share(parts)
-    evidence = integrate(log_likelihood, n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error)
+    evidence = integrate(
+        record.log_likelihood, record.n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error
+    )
     agreement = agreement_of(parts)
     check = _joined_checks(parts, evidence.log_z, evidence.error(remembered))
     p_value = combined_p_value([r.insertion_p_value for r in parts])
@@ -89,14 +87,14 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     said = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
     return NestedResult(
         names=parts[0].names,
-        theta=np.concatenate([r.theta for r in parts])[order],
-        log_likelihood=log_likelihood,
-        label=label,
+        theta=np.concatenate([r.theta for r in parts])[record.order],
+        log_likelihood=record.log_likelihood,
+        label=record.label,
         log_weight=evidence.log_weight,
-        log_birth=log_birth,
-        birth_label=birth_label,
-        parent=parent,
-        n_at_death=n_at_death,
+        log_birth=record.log_birth,
+        birth_label=record.birth_label,
+        parent=record.parents(parent),
+        n_at_death=record.n_at_death,
         log_start=log_start,
         log_start_error=log_start_error,
         log_z=evidence.log_z,
@@ -132,6 +130,35 @@ def agreement_of(results: Iterable[NestedResult]) -> Agreement:
     middle = float(weight @ log_z / weight.sum())
     chi_square = float(weight @ np.square(np.asarray(log_z) - middle))
     return Agreement(tuple(log_z), tuple(log_z_error), chi_square, float(chdtrc(len(log_z) - 1, chi_square)))
+
+
+@dataclass(frozen=True, eq=False)
+class JoinedRecord:
+    """The births and deaths of several runs in order of death, (n_dead,) each.
+
+    `order`: row of each point in the runs' concatenated records; `n_at_death`: points of all runs alive at its death.
+    """
+
+    order: IntArray
+    log_likelihood: FloatArray
+    label: FloatArray
+    log_birth: FloatArray
+    birth_label: FloatArray
+    n_at_death: IntArray
+
+    @classmethod
+    def of(cls, parts: Sequence[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]) -> JoinedRecord:
+        """Join log likelihood, label, log birth and birth label of each run, all (n_dead of the run,)."""
+        together = [np.concatenate(each) for each in zip(*parts, strict=True)]
+        order = np.lexsort((together[1], together[0]))
+        log_likelihood, label, log_birth, birth_label = (each[order] for each in together)
+        n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
+        return cls(order, log_likelihood, label, log_birth, birth_label, n_at_death)
+
+    def parents(self, parent: IntArray) -> IntArray:
+        """Convert rows of parents in the concatenated records, -1 for none, to rows in order of death, (n_dead,)."""
+        place = np.argsort(self.order)
+        return np.asarray(np.where(parent >= 0, place[parent], -1)[self.order])
 
 
 def alive_at_death(
@@ -170,14 +197,6 @@ def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) ->
     route = checks[0].route if len({c.route for c in checks}) == 1 else "the runs' second routes"
     distance = (log_z - mean) / max(math.hypot(error, mean_error), 1e-12)
     return Check(route, mean, mean_error, distance, sum(c.n_calls for c in checks))
-
-
-def _joined_parents(parts: Sequence[NestedResult], order: IntArray) -> IntArray:
-    """Rows of the parents in the joined and sorted record, (n_dead,)."""
-    first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
-    parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
-    place = np.argsort(order)
-    return np.asarray(np.where(parent >= 0, place[parent], -1)[order])
 
 
 def _check(parts: Sequence[NestedResult]) -> list[object]:

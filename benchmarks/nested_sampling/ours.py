@@ -14,19 +14,24 @@ from probewise.nested import KernelMove, Move, NestedResult, refine, run
 
 
 def ours_result(
-    problem: Counted | Known, seed: int, n_live: int | None = None, move: Move | None = None
+    problem: Counted | Known, seed: int, n_live: int | None = None, move: Move | None = None, max_cost: float = 1.0
 ) -> NestedResult:
-    """Run this project's sampler as its users do: every call of it in these benchmarks is here."""
+    """Run this project's sampler, by default without the check: every call of it in these benchmarks is here."""
     n_live = n_live or 300
     # A doubtful run is counted, not shouted about.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        return run(problem, rng=np.random.default_rng(seed), n_live=n_live, move=move, max_cost=1.0)
+        return run(problem, rng=np.random.default_rng(seed), n_live=n_live, move=move, max_cost=max_cost)
 
 
 def ours(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
     """Run this project's sampler."""
     return outcome_of(ours_result(problem, seed, n_live), problem.n_evaluations)
+
+
+def ours_checked(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
+    """Run it with the check of its evidence, as users get it."""
+    return outcome_of(ours_result(problem, seed, n_live, max_cost=5.0), problem.n_evaluations)
 
 
 def ours_refined(problem: Counted, seed: int, n_live: int | None = None) -> Outcome:
@@ -68,6 +73,7 @@ def outcome_of(result: NestedResult, n_evaluations: int) -> Outcome:
 
 SAMPLERS = {
     "ours": Sampler((), ours),
+    "ours-checked": Sampler((), ours_checked),
     "ours-refined": Sampler((), ours_refined),
     "ours-quick": Sampler((), ours_quick),
 }

@@ -230,7 +230,7 @@ def _modes(first: NestedResult, lost: Lost, problem: Samplable, rng: np.random.G
 
 def _raised(run: NestedResult, log_z: float) -> float:
     """By how many errors the evidence of a part that the run has not met raises log Z."""
-    return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / run.log_z_error
+    return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / max(run.log_z_error, 1e-12)
 
 
 def _with_peaks(run: NestedResult, lost: Lost, above: Beyond) -> NestedResult:

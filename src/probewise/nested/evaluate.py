@@ -162,6 +162,8 @@ class Evaluator:
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Evaluate the likelihood of hypotheses, (n, n_params) -> (n,), with the checks described above."""
+        if not len(theta):
+            return np.empty(0)  # a likelihood need not take an empty batch
         shared = self.executor is not None and len(theta) > 1
         parts = np.array_split(theta, min(self.n_parts, len(theta))) if shared else [theta]
         answers: list[object] = []

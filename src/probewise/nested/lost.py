@@ -2,10 +2,10 @@
 
 Two modes shrink at the same rate until their tops are near, over tens of nats, and all that while the number of live
 points in each drifts. A narrow mode that begins with a few of them may lose them all: neither the run nor anything that
-starts from its posterior can know of it. But points in it are among those that died early. So early dead points climb a
-little, and where the likelihood has a dip on the straight line from there to the nearest sample of the posterior, the
-point lies apart. Few points of a problem with one mode do; those of a lost one do soon. The tops of the hills that
-they stand on are weighed by importance sampling, and held against the share of the run's posterior at the same place.
+starts from its posterior can know of it. But points in it are among those that died early. Where the likelihood has a
+dip on the straight line from an early dead point to the nearest sample of the posterior, the point lies apart. Few
+points of a problem with one mode do. Some of those that do climb, and the hills that they end on are weighed by
+importance sampling, and held against the share of the run's posterior at the same place.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.importance import HeldOut, Weighted, weigh_draws
 from probewise.nested.mixture import single
@@ -41,7 +42,7 @@ _N_KNOWN = 200  # samples of the posterior: so few that a mode of which it has n
 _N_SAMPLES = 1000  # of a lost mode
 _MOST_HILLS = 8
 _SWEEPS = 12  # of a climb
-_FROM_TOP = 3.0  # nats a parameter, within which a climb comes of the top
+_FROM_TOP = 3.0  # nats a parameter: a climb ends as near to the top
 _NEAREST = 3
 _ROUNDS = 6
 _SETTLED = 0.5  # nats
@@ -57,18 +58,34 @@ _MET = 0.5  # of the evidence of a hill: with more, the run has met it
 class Hill:
     """A hill of the posterior and the log of its evidence.
 
-    `theta`: samples of it, (n, n_params). `inside`: the ellipsoid that holds most of it, in coordinates of `space`.
+    `theta`: samples of it, (n, n_params). The ellipsoid of `shape`, a single cluster in coordinates of `space`, holds
+    most of it within `radius` sds.
     """
 
     log_z: float
     theta: FloatArray
-    inside: _Ellipsoid
     space: Space
+    shape: Clusters
+    radius: float
+
+    @classmethod
+    def of(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> Hill:
+        """Take the shape of weighted draws."""
+        theta = drawn.samples(_N_SAMPLES, rng=rng)
+        x = space.enter(theta)
+        shape = Clusters.of([x])
+        return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance(x, shape), _INSIDE)))
 
     def is_met_by(self, run: NestedResult) -> bool:
         """Whether a run has at least half of this evidence at the same place."""
-        near = float(run.weight[self.inside.holds(self.space.enter(run.theta))].sum())
+        inside = _distance(self.space.enter(run.theta), self.shape) <= self.radius
+        near = float(run.weight[inside].sum())
         return near > 0 and run.log_z + math.log(near) > self.log_z + math.log(_MET * _INSIDE)
+
+
+def _distance(x: FloatArray, shape: Clusters) -> FloatArray:
+    """Distance of points (n, n_params) from the middle of a cluster, sds, (n,)."""
+    return np.asarray(np.linalg.norm((x - shape.mean[0]) @ shape.inverse_root[0].T, axis=1))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +114,7 @@ def look_for_lost(first: NestedResult, problem: Samplable, *, max_calls: int, rn
     problem
         Its problem, whose prior has `to_unit_cube` or coordinates of its own.
     max_calls
-        Limit of evaluations, for the climbs; a hill that is found takes some more.
+        Limit of evaluations for the lines; hills that are found take some more, up to a sixth of the run's in all.
     rng
         Source of randomness.
     """
@@ -131,8 +148,7 @@ def look_for_lost(first: NestedResult, problem: Samplable, *, max_calls: int, rn
         few = few.take(np.flatnonzero(_apart(few.now, top, scale, 1, evaluate, rng)))
         drawn = _weighed(space.enter(top.theta), space, evaluate, rng)
         if drawn is not None:
-            inside = _Ellipsoid.of(space.enter(drawn.theta), drawn.weight)
-            hill = Hill(drawn.log_z, drawn.samples(_N_SAMPLES, rng=rng), inside, space)
+            hill = Hill.of(drawn, space, rng)
             hills += [] if hill.is_met_by(first) else [hill]
     return Lost(tuple(hills), evaluate.n_calls)
 
@@ -246,6 +262,8 @@ def _weighed(x: FloatArray, space: Space, evaluate: Evaluator, rng: np.random.Ge
         drawn = weigh_draws(proposal, 0.0, HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
         if drawn.n_eff > enough:
             return drawn
+        if not drawn.n_eff > 1:
+            return None
         # A power of the weights that leaves enough of them for a covariance.
         power = next((p for p in _POWERS if n_effective(p * drawn.log_weight) > enough), None)
         if power is None:
@@ -255,27 +273,3 @@ def _weighed(x: FloatArray, space: Space, evaluate: Evaluator, rng: np.random.Ge
         mean = weight @ x
         covariance = (x - mean).T @ ((x - mean) * weight[:, None])
     return None
-
-
-@dataclass(frozen=True, eq=False)
-class _Ellipsoid:
-    """The ellipsoid about weighted points that holds most of their weight."""
-
-    centre: FloatArray
-    inverse_root: FloatArray
-    radius: float
-
-    @classmethod
-    def of(cls, x: FloatArray, weight: FloatArray) -> _Ellipsoid:
-        centre = weight @ x
-        covariance = (x - centre).T @ ((x - centre) * weight[:, None])
-        whole = cls(centre, np.linalg.inv(np.linalg.cholesky(covariance)), math.inf)
-        order = np.argsort(distance := whole.distance(x))
-        at = int(np.searchsorted(np.cumsum(weight[order]), _INSIDE))
-        return cls(centre, whole.inverse_root, float(distance[order[min(at, len(x) - 1)]]))
-
-    def distance(self, x: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.norm((x - self.centre) @ self.inverse_root.T, axis=1))
-
-    def holds(self, x: FloatArray) -> BoolArray:
-        return np.asarray(self.distance(x) <= self.radius)

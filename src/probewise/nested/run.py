@@ -78,8 +78,9 @@ def run(
     max_cost
         Limit of all evaluations in units of those of the first run; 1 means no check. The rest is spent on a second
         estimate of the evidence, about a fifth of the first run, and where the two disagree on a more precise second
-        estimate and a run with chains twice as long. A disagreement that remains is reported as a warning, and so is a
-        second estimate that does not end within the limits.
+        estimate and a run with chains twice as long; and on a look for modes that died out among the live points, after
+        which the run is repeated with hops to those that are found. A disagreement or a lost mode that remains is
+        reported as a warning, and so is a second estimate that does not end within the limits.
     checkpoint
         File to which the state is saved atomically as the run proceeds; its folder is created if missing. If the file
         exists, the run resumes and ends bit for bit as if it had not been interrupted or killed; `rng` must be in

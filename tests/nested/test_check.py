@@ -79,7 +79,7 @@ def test_right_runs_are_confirmed_for_a_fraction_of_their_cost() -> None:
     assert n_doubted < 4
 
 
-def misled(max_cost: float) -> tuple[NestedResult, NestedResult]:
+def misled(max_cost: float, seed: int = 5) -> tuple[NestedResult, NestedResult]:
     """A sound run whose evidence was shifted by eight errors, and what the check makes of it."""
     known = problems.problem("Gaussian 4-D")
     sound = quiet(known, max_cost=1.0)
@@ -92,7 +92,7 @@ def misled(max_cost: float) -> tuple[NestedResult, NestedResult]:
         max_cost=max_cost,
         max_calls=None,
         least_live=10,
-        rng=np.random.default_rng(5),
+        rng=np.random.default_rng(seed),
     )
     return sound, result
 
@@ -108,10 +108,15 @@ def test_a_wrong_evidence_is_doubted_where_nothing_is_left_to_spend() -> None:
 
 @pytest.mark.slow
 def test_a_wrong_evidence_is_cured_by_longer_chains() -> None:
-    sound, result = misled(5.0)
-    assert not result.warnings
-    assert abs(result.log_z - sound.log_z) < 5 * sound.log_z_error
-    assert result.n_calls <= 5 * sound.n_calls
+    """The longer run itself may be doubted: of twenty by one or two. Three of six have a probability below 1 %."""
+    n_cured = 0
+    for seed in range(6):
+        sound, result = misled(5.0, seed)
+        assert result.n_calls <= 5 * sound.n_calls
+        if not result.warnings:
+            assert abs(result.log_z - sound.log_z) < 5 * sound.log_z_error
+            n_cured += 1
+    assert n_cured > 3
 
 
 @pytest.mark.parametrize(

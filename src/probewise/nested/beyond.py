@@ -97,7 +97,8 @@ def look_beyond(first: NestedResult, problem: Samplable, *, max_calls: int, rng:
             n_draws = int(min(first.n_live * len(evaluate.names), (most - evaluate.n_calls) / len(_AT_TOP)))
             levels += [_drawn(evaluate, top.centre, wide * top.scale, root, n_draws, rng) for wide in _AT_TOP]
         highest = max(levels, key=lambda level: level.top)
-        known = top.top + _FLAT
+        # Of several peaks of about one height the draws climb one, and the run knows the others.
+        known = max(top.top, float(first.log_likelihood.max())) + _FLAT
         if not highest.top > known:
             break
         centre, scale = highest.points.u[int(highest.points.log_likelihood.argmax())], highest.scale

@@ -25,8 +25,9 @@ __all__ = ["NOTHING", "Beyond", "look_beyond"]
 
 _FLAT = 0.2  # nats between the best draw and the worst of the best tenth: the top of a peak
 _NARROWER = 0.8  # sd of a distribution over that of the one before
+_NARROWER_BEYOND = 0.87  # about another peak: with 0.8 a tenth of them were weighed too low by a nat or more
 _PER_LIVE = 5  # draws of a distribution on the way to the top of the known peak
-_PER_LIVE_BEYOND = 20  # on the way to that of another, which they also weigh
+_PER_LIVE_BEYOND = 20  # on the way to that of another
 _AT_TOP = (1.25, 1.0, 0.8)  # scales of those at the top, which get as many draws a live point as there are parameters
 _SHARE = 1 / 8  # of the run's evaluations, spent where there is no higher peak
 _MOST_LEVELS = 60
@@ -122,6 +123,7 @@ def _climb(
     that top count among the best: near a narrow peak most belong to the broad one.
     """
     lowest, known = heights
+    narrower = _NARROWER if known == -math.inf else _NARROWER_BEYOND
     levels = list[_Level]()
     while True:
         levels.append(_drawn(evaluate, centre, scale, root, n_draws, rng))
@@ -136,7 +138,7 @@ def _climb(
         if len(levels) == _MOST_LEVELS or evaluate.n_calls + n_draws > max_calls:
             return levels
         centre = found.u[best[above]].mean(axis=0) if above.any() else centre
-        scale *= _NARROWER
+        scale *= narrower
 
 
 def _drawn(

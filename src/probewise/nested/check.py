@@ -51,6 +51,7 @@ _ALIKE = 2.0  # errors within which two runs agree, against a second pass that l
 _SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
 _MATTERS = 0.25  # errors by which a lost mode raises log Z, above which the run is repeated
+_MISSING = 1.0  # errors by which a mode that is still lost raises log Z, above which it is a doubt
 
 
 class SingleRun(Protocol):
@@ -237,7 +238,7 @@ def _with_peaks(run: NestedResult, lost: Lost, above: Beyond) -> NestedResult:
     """Add a warning for each part of the posterior that is known to be missing and matters."""
     notes, log_z = list[str](), lost.not_in(run)
     mine = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}"
-    if _raised(run, log_z) > _MATTERS:
+    if _raised(run, log_z) > _MISSING:
         notes.append(
             f"a mode that died out among the live points has a log Z of about {log_z:.2f}, {mine}; "
             "use more n_live or a greater max_cost"

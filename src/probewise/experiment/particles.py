@@ -308,7 +308,7 @@ class _Bridge:
         """Log likelihood of the last reading under a perfect prediction; zero if it is missing."""
         recording = self.problem.recording
         reading = recording.readings[-1:]
-        return float(self.problem.likelihood.log_prob(reading, reading[None])[0]) if recording.usable[-1] else 0.0
+        return float(scores(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
 
     def weigh(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""

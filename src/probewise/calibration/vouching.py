@@ -10,7 +10,6 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-from scipy.spatial.distance import cdist
 
 from probewise._arrays import FloatArray
 from probewise.calibration.climb import Climb
@@ -85,6 +84,8 @@ def share_apart(known: FloatArray, asked: FloatArray, *, rng: np.random.Generato
     rng
         Source of randomness.
     """
+    from scipy.spatial.distance import cdist  # slow to import, and needed by calibrations only
+
     own, others = known[:_N_OWN], known[_N_OWN:]
     others = others[rng.permutation(len(others))[:_N_OTHERS]]
     root = np.linalg.cholesky(np.cov(known, rowvar=False))

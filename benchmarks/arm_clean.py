@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from probewise.arm import LegoScale, carry_out, read_geometry, recorded, shipped_geometry
+from probewise.arm import LegoScale, carry_out, read_geometry, recording_of, shipped_geometry
 from probewise.cli._bench import Bench
 from probewise.cli._plans import read_by_lego
 from probewise.diagnosis import diagnose
@@ -38,7 +38,7 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]
     with arm:
         readings = list(carry_out(arm, plan, origin_mm=origin_mm, ask=partial(bench.lay, plan.patterns, origin_mm)))
-    found = recorded(plan, readings)
+    found = recording_of(plan, readings)
     off = np.array(
         [
             (x - stand.x_mm + origin_mm[0], y - stand.y_mm + origin_mm[1], stand.height_mm - geometry.read_height_mm)

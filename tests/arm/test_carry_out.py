@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import LegoArm, Pose, Reading, Rehearsal, carry_out, read_geometry, recorded, shipped_geometry
+from probewise.arm import LegoArm, Pose, Reading, Rehearsal, carry_out, read_geometry, recording_of, shipped_geometry
 from probewise.errors import ParameterError, ReachError
 from probewise.recordings import paper_plan, read_recording, two_way_plan, write_recording
 
@@ -53,7 +53,7 @@ def test_every_row_has_its_place_and_the_orientation_nearest_to_the_planned(told
     told_mm = np.array([(r.pose.x_mm, r.pose.y_mm) for r in readings])
     away_mm = np.abs(told_mm - np.stack([plan.x_mm, plan.y_mm], axis=-1))
     assert 0.01 < away_mm.max() < 0.5
-    np.testing.assert_array_equal(recorded(plan, readings).plan.x_mm, told_mm[:, 0])
+    np.testing.assert_array_equal(recording_of(plan, readings).plan.x_mm, told_mm[:, 0])
     off = np.array([r.pose.orientation_rad for r in readings]) - plan.orientation_rad
     off = np.degrees(np.angle(np.exp(1j * off)))
     # The arm is 320 mm away: over 50 mm to either side its sensor turns by atan(50 / 320).
@@ -106,7 +106,7 @@ def test_a_recording_says_what_was_read_and_comes_back_from_its_file(tmp_path):
         )
         for k in range(5)
     ]
-    write_recording(recorded(plan, readings), tmp_path / "r.csv")
+    write_recording(recording_of(plan, readings), tmp_path / "r.csv")
     back = read_recording(tmp_path / "r.csv")
     np.testing.assert_array_equal(back.readings, [20, 21, 22, 23, 24])
     np.testing.assert_array_equal(back.plan.time_s, 2.5 * np.arange(5))

@@ -9,8 +9,8 @@ import pytest
 from probewise.arm import read_geometry, shipped_geometry
 from probewise.arm.fitting import MarksDisagreeError, fit_geometry
 from probewise.arm.geometry_file import with_fitted
+from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
 from probewise.arm.marks import marks_of
-from probewise.arm.touched import Touched, read_touched, write_touched
 from probewise.errors import FileError, ParameterError, ShapeError
 
 GEOMETRY = read_geometry(shipped_geometry())
@@ -48,7 +48,7 @@ def touched(true, *, noise_mm=0.0, rng=None, marks=None):
 
 def errors_mm(fitted, true):
     """Where the sensor really is, less where it is sent, all over the field: (n, 3)."""
-    places = GEOMETRY.spread_mm
+    places = GEOMETRY.places_over_field_mm
     places = places[fitted.holds(places)]
     angles = fitted.angles_rad(places, GEOMETRY.read_height_mm) - homes(fitted) + homes(true)
     return true.position_mm(angles) - np.column_stack([places, np.full(len(places), GEOMETRY.read_height_mm)])
@@ -141,19 +141,19 @@ def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
 
 
 def test_marks_come_back_from_their_file(tmp_path):
-    marks = [Touched((0.1, -0.2, 0.3), (100.0, 60.0, 32.0)), Touched((0.4, 0.5, -0.6), (520.0, 60.0, math.nan))]
-    write_touched(marks, tmp_path / "m.csv")
-    turned, places = read_touched(tmp_path / "m.csv")
+    marks = [TouchedMark((0.1, -0.2, 0.3), (100.0, 60.0, 32.0)), TouchedMark((0.4, 0.5, -0.6), (520.0, 60.0, math.nan))]
+    write_marks(marks, tmp_path / "m.csv")
+    turned, places = read_marks(tmp_path / "m.csv")
     np.testing.assert_allclose(turned, [mark.turned_rad for mark in marks], atol=1e-6)
     np.testing.assert_array_equal(places, [mark.place_mm for mark in marks])
     (tmp_path / "m.csv").write_text("x_mm,y_mm\n1,2\n")
     with pytest.raises(FileError, match="base_turned_deg"):
-        read_touched(tmp_path / "m.csv")
+        read_marks(tmp_path / "m.csv")
 
 
 def test_what_a_wrong_home_costs_is_told_from_the_geometry():
     """Both links two degrees off, worked out by moving them; a fitted geometry knows better."""
-    places = GEOMETRY.spread_mm
+    places = GEOMETRY.places_over_field_mm
     angles = GEOMETRY.angles_rad(places, 14.0)
     lower = angles - np.radians([0.0, 2.0, 2.0])
     sinks = 14.0 - GEOMETRY.position_mm(lower)[:, 2]

@@ -55,7 +55,7 @@ def test_the_rise_with_each_angle_is_the_difference_quotient(geometry):
     for k in range(3):
         step = 1e-6 * np.eye(3)[k]
         quotient = (geometry.position_mm(angles + step) - geometry.position_mm(angles - step))[:, 2] / 2e-6
-        np.testing.assert_allclose(geometry.rise_mm_rad(angles)[:, k], quotient, atol=1e-4)
+        np.testing.assert_allclose(geometry.height_slopes_mm_rad(angles)[:, k], quotient, atol=1e-4)
 
 
 def test_the_elbow_is_up():

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm.height_check import Look, check_heights
+from probewise.arm.height_check import HeightReading, check_heights
 from probewise.errors import ParameterError
 
 HEIGHTS = np.arange(14.0, 23.0).tolist()
@@ -18,7 +18,9 @@ LAWS = {
 
 def looks(law, heights, *, off_mm=0.0, noise=0.0, rng=None):
     return [
-        Look((100.0 * k, 50.0), h, law(h + off_mm) + (noise * rng.standard_normal() if rng else 0.0), noise or 0.02)
+        HeightReading(
+            (100.0 * k, 50.0), h, law(h + off_mm) + (noise * rng.standard_normal() if rng else 0.0), noise or 0.02
+        )
         for k, h in enumerate(heights)
     ]
 

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import OwnInstrument, Pose, Reading, SimulatedArm, carry_out, instrument_of, recorded
+from probewise.arm import OwnInstrument, Pose, Reading, SimulatedArm, carry_out, instrument_of, recording_of
 from probewise.errors import FileError, LinkError, ParameterError, ReachError, ShapeError
 from probewise.recordings import HalfPlane, Plan, Quadrant, read_recording, write_recording
 
@@ -273,7 +273,7 @@ def test_a_plan_is_carried_out_with_a_person_who_lays_patterns_and_turns_the_sen
         "lay sheet 'corner'",
     ]
     assert own.asked[2] == Pose(110.0, 50.0, math.pi / 3)
-    write_recording(recorded(plan(), readings), tmp_path / "r.csv")
+    write_recording(recording_of(plan(), readings), tmp_path / "r.csv")
     back = read_recording(tmp_path / "r.csv")
     assert back.plan.x_mm.tolist() == [-10.0, 0.0, 10.0, 10.0]
     assert back.readings.tolist() == [180.0, 200.0, 220.0, 220.0]

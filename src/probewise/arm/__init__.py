@@ -1,13 +1,13 @@
 """Instruments that take readings: one interface, a simulated arm and the LEGO arm (paper, "Robotic Arm Test Bed")."""
 
-from probewise.arm.carry_out import Request, carry_out, readings_of, recorded
+from probewise.arm.carry_out import Request, carry_out, readings_of, recording_of
 from probewise.arm.geometry import Geometry, Joint
 from probewise.arm.geometry_file import read_geometry, shipped_geometry
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm, in_lego_units
 from probewise.arm.limits import SoftLimits
 from probewise.arm.machine import Machine, Rehearsal
-from probewise.arm.own import Measures, OwnInstrument, instrument_of
+from probewise.arm.own_instrument import Measures, OwnInstrument, instrument_of
 from probewise.arm.reach import FIELD_MM, Reach, Workspace, require_reach
 from probewise.arm.scale import LegoScale
 from probewise.arm.simulated import Light, SimulatedArm, Speed
@@ -37,7 +37,10 @@ __all__ = [
     "instrument_of",
     "read_geometry",
     "readings_of",
-    "recorded",
+    "recording_of",
     "require_reach",
     "shipped_geometry",
 ]
+
+recorded = recording_of
+"""The old name of `recording_of`."""

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
-from probewise.arm.own import Measures, OwnInstrument, instrument_of
+from probewise.arm.own_instrument import Measures, OwnInstrument, instrument_of
 from probewise.arm.reach import Bounds, require_reach
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
@@ -89,8 +89,8 @@ def carry_out(
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
     require_reach(bounds_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_settings(arm, plan)
-    handed = _Lego(arm) if isinstance(arm, LegoArm) else _Own(arm)
-    turns = handed.turns(plan, places)
+    row_reader = _LegoRowReader(arm) if isinstance(arm, LegoArm) else _OwnRowReader(arm)
+    turns = row_reader.hand_turns_rad(plan, places)
     mounted, lying = 0.0, -1
     for row in range(first, len(plan)):
         if plan.pattern[row] != lying:
@@ -101,16 +101,16 @@ def carry_out(
             ask(Request(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
             mounted = float(turns[row])
-            text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {handed.from_where}"
+            text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {row_reader.from_where}"
             ask(Request(text, turned_rad=mounted))
         x_mm, y_mm = places[row].tolist()
-        reading = handed.measure(x_mm, y_mm, mounted, plan, row)
-        there = _in_plan(reading, plan, row, origin_mm)
+        reading = row_reader.read_row(x_mm, y_mm, mounted, plan, row)
+        there = _place_in_plan(reading, plan, row, origin_mm)
         yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
 
 
 def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], first: int = 0) -> float:
-    """Estimate the duration of a plan: time of the arm's readings, and half a minute per step by hand.
+    """Estimate the duration of a plan: the arm's travel and readings, and half a minute for each step by hand.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], f
     return seconds + BY_HAND_S * float(by_hand)
 
 
-def _in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
+def _place_in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
     """Return the place of a reading in the plan's frame, rounded to a micron; the planned place if it was reached."""
     x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
     if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
@@ -137,8 +137,8 @@ def _in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, flo
     return round(reading.pose.x_mm - origin_mm[0], 3), round(reading.pose.y_mm - origin_mm[1], 3)
 
 
-class _Lego:
-    """The LEGO arm: its sensor turns with the base, and by hand on its mount by right angles."""
+class _LegoRowReader:
+    """Reads a plan's rows with the LEGO arm: its base turns the sensor, and a person by right angles on its mount."""
 
     from_where = "anticlockwise seen from above, from where the geometry has it"
 
@@ -146,47 +146,47 @@ class _Lego:
         self._arm = arm
         arm.turned_rad = 0.0
 
-    def turns(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
+    def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
         """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
         off = plan.orientation_rad - self._arm.orientation_rad(places_mm)
         return np.asarray(np.rint(off / QUARTER_RAD) % 4 * QUARTER_RAD)
 
-    def measure(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
+    def read_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
         """Take the reading of a row, with its place in the lab frame."""
         self._arm.turned_rad = turned_rad
         standing = self._arm.orientation_rad(np.array([[x_mm, y_mm]]))
         return self._arm.measure(Pose(x_mm, y_mm, float(standing[0])))
 
 
-class _Own:
-    """A user's own instrument, or the simulated arm: the sensor is turned by the instrument or by hand."""
+class _OwnRowReader:
+    """Reads a plan's rows with a user's own instrument or the simulated arm; it turns the sensor, or a person does."""
 
     from_where = "anticlockwise seen from above, from how it stands by itself"
 
     def __init__(self, arm: OwnInstrument | SimulatedArm) -> None:
         self._arm = arm
-        self._turns, self._lifts = _skills(arm)
+        self._turns, self._lifts = _can_turn_and_lift(arm)
 
-    def turns(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
+    def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
         """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
         if self._turns:
             return np.zeros(len(plan))
         off = (plan.orientation_rad - self._arm.orientation_rad(places_mm)) % math.tau
         return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
 
-    def measure(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
+    def read_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
         """Take the reading of a row, with its place in the lab frame."""
         height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._lifts else math.nan
         up_mm = None if math.isnan(height_mm) else float(height_mm)
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
 
-def _skills(arm: OwnInstrument | SimulatedArm) -> tuple[bool, bool]:
+def _can_turn_and_lift(arm: OwnInstrument | SimulatedArm) -> tuple[bool, bool]:
     """Return whether an arm can turn its sensor, and whether it can read at a requested height."""
     return (True, True) if isinstance(arm, SimulatedArm) else (arm.turns, arm.lifts)
 
 
-def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
+def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
     """Build a recording of the plan's first rows with true places, orientations, times, battery voltage and heights.
 
     Parameters
@@ -211,7 +211,7 @@ def recorded(plan: Plan, readings: Sequence[Reading]) -> Recording:
 
 
 def readings_of(recording: Recording) -> list[Reading]:
-    """Convert a recording from `recorded` to readings with place, time and covariates."""
+    """Convert a recording to readings with pose, time and covariates: the inverse of `recording_of`."""
     rows = recording.plan
     return [
         Reading(
@@ -225,7 +225,7 @@ def readings_of(recording: Recording) -> list[Reading]:
 
 
 def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
-    """Return the object that defines the reach of an arm."""
+    """Return the object that says which places an arm can reach."""
     match arm:
         case LegoArm():
             return arm.geometry
@@ -239,7 +239,7 @@ def _require_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -
     there = {"led": 1.0}
     if isinstance(arm, LegoArm):
         there["height_mm"] = arm.geometry.read_height_mm
-    elif not _skills(arm)[1] and plan.instrumentation.height_mm is not None:
+    elif not _can_turn_and_lift(arm)[1] and plan.instrumentation.height_mm is not None:
         there["height_mm"] = plan.instrumentation.height_mm
     for name, value in there.items():
         wanted = plan.covariates.get(name, np.empty(0))

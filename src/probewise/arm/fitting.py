@@ -24,7 +24,7 @@ MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # largest sds of a geometry that
 
 
 class MarksDisagreeError(ProbewiseError, ValueError):
-    """Raised for marks that no geometry explains."""
+    """Raised if no geometry explains the marks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ def fit_geometry(
     p_value = float(chdtrc(n, total))
     residuals = marks - places_of(geometry, values, turned)
     if p_value < LEAST_P:
-        raise MarksDisagreeError(_disagreement(geometry, before, turned, marks, touch_mm, residuals))
+        raise MarksDisagreeError(_disagreement_message(geometry, before, turned, marks, touch_mm, residuals))
     covariance: FloatArray = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
     fitted = _with_values(geometry, values)
     accuracy = _accuracy(fitted, covariance, len(marks))
@@ -131,18 +131,18 @@ def fit_geometry(
 def _most_probable(
     geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
 ) -> tuple[FloatArray, float, FloatArray]:
-    """Return the most probable parameters, the sum of squares there, and the Jacobian, (n_residuals, 9)."""
+    """Return the most probable parameters, chi-square there, and the Jacobian of the residuals, (n_residuals, 9)."""
     known = np.isfinite(marks)
 
-    def misses(scaled: FloatArray) -> FloatArray:
+    def scaled_residuals(scaled: FloatArray) -> FloatArray:
         off = (places_of(geometry, before + RULER_SDS * scaled, turned) - marks)[known] / touch_mm
         return np.concatenate([off, scaled])
 
-    found = least_squares(misses, np.zeros(len(before)), method="lm", xtol=1e-12, ftol=1e-12)
+    found = least_squares(scaled_residuals, np.zeros(len(before)), method="lm", xtol=1e-12, ftol=1e-12)
     return before + RULER_SDS * found.x, float(2 * found.cost), np.asarray(found.jac / RULER_SDS)
 
 
-def _disagreement(
+def _disagreement_message(
     geometry: Geometry,
     before: FloatArray,
     turned: FloatArray,
@@ -166,7 +166,7 @@ def _disagreement(
 
 
 def _accuracy(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accuracy:
-    places = geometry.spread_mm
+    places = geometry.places_over_field_mm
     if not len(places):
         raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
     slopes = slopes_mm(geometry, places)

@@ -83,7 +83,7 @@ class Joint:
 
     @property
     def stop_side(self) -> Side | None:
-        """Direction of its stop; None without one."""
+        """Direction of its stop, 1 upwards or -1 downwards; None without one."""
         if self.stop_rad is None:
             return None
         return 1 if self.stop_rad >= self.high_rad else -1
@@ -104,7 +104,7 @@ class Joint:
     def counts_at(self, angle_rad: float, side: int = 0) -> int:
         """Return the motor count that puts the joint at an angle, approached upwards (1) or downwards (-1).
 
-        The joint lags behind by half the play; with side 0 it is in the middle of it, as at home.
+        The joint lags behind by half the play; with side 0 it is in the middle of the play, as at home.
         """
         return round((angle_rad + side * self.play_rad / 2 - self.home_rad) * self.counts_per_rad)
 
@@ -128,7 +128,7 @@ class Accuracy:
     Parameters
     ----------
     marks
-        So many.
+        Number of marks.
     place_sd_mm
         Sd of the sensor's place along x and y, root mean square over the field.
     height_sd_mm
@@ -136,7 +136,8 @@ class Accuracy:
     scale_sd
         Sd of the ratio of lengths on the field to lengths as the arm measures them.
     covariance
-        Of the errors of the nine numbers that were fitted (`arm.uncertainty.FITTED`), nine rows of nine; radians, mm.
+        Covariance of the errors of the nine fitted parameters (`arm.uncertainty.FITTED`), nine rows of nine; radians,
+        mm.
     """
 
     marks: int
@@ -191,10 +192,10 @@ class Geometry:
     whole_percent
         Whether readings are truncated to whole percent, as the brick shows them.
     accuracy
-        How well all this is known; None: nobody has fitted it to marks.
+        Accuracy of a geometry fitted to marks; None: not fitted.
     light_per_mm
-        Share of a reading over white by which it falls with each mm that the sensor reads higher, as `arm heights`
-        measures it; None: light falls with the square of the height.
+        Relative decrease of a reading over white per mm of height, as `arm heights` measures it; None: light falls
+        with the square of the height.
     """
 
     field_mm: tuple[float, float]
@@ -271,15 +272,16 @@ class Geometry:
     def height_doubt_mm(self) -> float:
         """Largest amount by which the sensor may be lower than commanded.
 
-        Two sds of a fitted geometry; otherwise the effect of an error of two degrees in both links' home angles.
+        Two sds of the height if the geometry was fitted; otherwise the effect of an error of two degrees in both
+        links' home angles.
         """
         if self.accuracy is not None:
             return 2 * self.accuracy.height_sd_mm
-        rises = np.abs(self.rise_mm_rad(self.angles_rad(self.spread_mm, self.read_height_mm)))
+        rises = np.abs(self.height_slopes_mm_rad(self.angles_rad(self.places_over_field_mm, self.read_height_mm)))
         return float(rises.sum(axis=-1).max(initial=0.0) * UNMEASURED_RAD)
 
     @property
-    def spread_mm(self) -> FloatArray:
+    def places_over_field_mm(self) -> FloatArray:
         """Places all over the field at which the sensor can read, (n, 2)."""
         sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
         places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
@@ -287,7 +289,7 @@ class Geometry:
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
         """Forward kinematics: joint angles (n, 3) to place and height of the sensor's face in the lab frame, (n, 3)."""
-        return placed_mm(
+        return forward_kinematics_mm(
             angles_rad,
             self.links_mm,
             self.axis_mm,
@@ -296,7 +298,7 @@ class Geometry:
             elbow_is_relative=self.elbow_is_relative,
         )
 
-    def rise_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
+    def height_slopes_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
         """Return the derivative of the sensor's height with each joint angle: (n, 3) to (n, 3), mm per radian."""
         _, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
         lower = shoulder + elbow if self.elbow_is_relative else elbow
@@ -367,7 +369,7 @@ class Geometry:
         )
 
     def _leaves_room(self, places_mm: FloatArray) -> BoolArray:
-        """Return over which places, (n, 2), the motors have room to approach at both heights, shape (n,)."""
+        """Return which places, (n, 2), leave the motors room to approach at both heights, shape (n,)."""
         room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
         read, travel = (self.angles_rad(places_mm, height) for height in (self.read_height_mm, self.travel_height_mm))
         roomy = [self.allows(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
@@ -382,7 +384,7 @@ class Geometry:
         return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
 
 
-def placed_mm(
+def forward_kinematics_mm(
     angles_rad: FloatArray,
     links_mm: Sequence[float] | FloatArray,
     axis_mm: Sequence[float] | FloatArray,

@@ -24,8 +24,8 @@ ROUNDING_MM = 0.2  # sd of a height that whole counts leave
 
 
 @dataclass(frozen=True)
-class Look:
-    """Readings over white: the place, the height by the counters, the mean reading and its standard error."""
+class HeightReading:
+    """Mean reading over white at one place and height (by the counters), and its standard error."""
 
     place_mm: tuple[float, float]
     height_mm: float
@@ -58,7 +58,7 @@ class HeightCheck:
         return self.p_value >= _LEAST_P
 
 
-def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
+def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading]) -> HeightCheck:
     """Compare heights measured by the light with those of the counters.
 
     Parameters
@@ -66,7 +66,7 @@ def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
     curve
         Readings at the first place, three heights or more.
     others
-        Readings elsewhere over the same white, one Look per place.
+        Readings elsewhere over the same white, one for each place.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
     low, high = int(height.argmin()), int(height.argmax())
     fall, noise = value[low] - value[high], float(np.hypot(error[low], error[high]))
     if fall < _TELLS * noise or min(look.value for look in (*curve, *others)) <= 0:
-        raise _tells_nothing(curve[low], curve[high], noise)
+        raise _uninformative_readings(curve[low], curve[high], noise)
     # The logarithm by that of the height: light that falls with its square is a straight line, other light bends it.
     lowest_mm, y = float(height.min()), np.log(value)
 
@@ -100,7 +100,7 @@ def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
     own = error / value
     coefficients, covariance = fitted(np.hypot(own, ROUNDING_MM * steepness(fitted(own)[0], height)))
     if (steepness(coefficients, height) >= 0).any():
-        raise _tells_nothing(curve[low], curve[high], noise)
+        raise _uninformative_readings(curve[low], curve[high], noise)
     told, read = (np.array([getattr(look, name) for look in others]) for name in ("height_mm", "value"))
     steep = steepness(coefficients, told)
     basis = np.vander(np.log(told / lowest_mm), _DEGREE + 1)
@@ -112,7 +112,7 @@ def check_heights(curve: Sequence[Look], others: Sequence[Look]) -> HeightCheck:
     return HeightCheck(float(-steepness(coefficients, height[[low]])[0]), off, np.sqrt(np.diagonal(joint)), p_value)
 
 
-def _tells_nothing(low: Look, high: Look, noise: float) -> ParameterError:
+def _uninformative_readings(low: HeightReading, high: HeightReading, noise: float) -> ParameterError:
     return ParameterError(
         "readings over white",
         f"{low.value:.3g} at {low.height_mm:.0f} mm and {high.value:.3g} at {high.height_mm:.0f} mm",

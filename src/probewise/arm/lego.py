@@ -170,7 +170,7 @@ class LegoArm:
         goals = self._goals(x_mm, y_mm, self.geometry.travel_height_mm)
         self.rise()
         self._arrive(BASE, goals[BASE])
-        for joint in self._order(goals):
+        for joint in self._link_order(goals):
             self._move_near(joint, goals[joint].counts)
 
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
@@ -196,7 +196,7 @@ class LegoArm:
         self.rise()
         self._arrive(BASE, goals[BASE])
         self._is_down = True
-        for joint in self._order(goals):
+        for joint in self._link_order(goals):
             self._arrive(joint, goals[joint])
 
     def rise(self) -> None:
@@ -210,7 +210,7 @@ class LegoArm:
         for _ in range(N_RISES):
             if self.position_mm[2] >= self.geometry.travel_height_mm - NEAR_TRAVEL_MM:
                 break
-            ways = [way for joint in (SHOULDER, ELBOW) if (way := self._way_up(joint)) is not None]
+            ways = [way for joint in (SHOULDER, ELBOW) if (way := self._single_link_rise(joint)) is not None]
             if not ways:
                 stand = np.degrees(self.angles_rad).round(1).tolist()
                 raise ReachError("joints", stand, "angles from which the sensor can rise; bring the arm home by hand")
@@ -236,9 +236,9 @@ class LegoArm:
                 self._arrived[joint] = side
                 stopped.append(joint)
         self.rise()
-        goals = [Goal(0, side) for side in self._sides(np.array([joint.home_rad for joint in self.geometry.joints]))]
+        goals = [Goal(0, side) for side in self._sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))]
         self._arrive(BASE, goals[BASE])
-        for joint in self._order(goals):
+        for joint in self._link_order(goals):
             self._arrive(joint, goals[joint])
         if stopped:
             self._machine.reset(stopped)
@@ -256,7 +256,7 @@ class LegoArm:
         return in_lego_units(self._machine.read_percent(), self.geometry)
 
     def brightness(self) -> float:
-        """Read the sensor where it stands, 0 to 100, in all the steps that it has."""
+        """Read the sensor at its current place, 0 to 100, at its full resolution."""
         return self._machine.read_percent()
 
     def battery_mv(self) -> float:
@@ -289,23 +289,23 @@ class LegoArm:
     def _goals_at(self, angles_rad: FloatArray) -> list[Goal]:
         return [
             Goal(joint.counts_at(float(angle), side), side)
-            for joint, angle, side in zip(self.geometry.joints, angles_rad, self._sides(angles_rad), strict=True)
+            for joint, angle, side in zip(self.geometry.joints, angles_rad, self._sides_of(angles_rad), strict=True)
         ]
 
-    def _sides(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
+    def _sides_of(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
         """Choose the direction from which each joint approaches these angles, (3,).
 
         The links approach a place from above, so that their weight and their motors take up the play in the same
         direction; the base could approach from either side.
         """
-        _, shoulder, elbow = self.geometry.rise_mm_rad(angles_rad[None, :])[0]
+        _, shoulder, elbow = self.geometry.height_slopes_mm_rad(angles_rad[None, :])[0]
         return 1, (-1 if shoulder > 0 else 1), (-1 if elbow > 0 else 1)
 
-    def _order(self, goals: Sequence[Goal]) -> tuple[int, int]:
-        """Choose the order of the two links in which the sensor stays highest.
+    def _link_order(self, goals: Sequence[Goal]) -> tuple[int, int]:
+        """Choose in which order to move the two links, so that the sensor stays as high as possible.
 
         The sensor is far down while the lower link swings through the vertical. If neither order leaves enough room,
-        the upper link goes up first and comes down last.
+        this raises the upper link and puts its move last.
         """
         orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
         ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
@@ -325,10 +325,10 @@ class LegoArm:
             counts[joint] = goal
         return np.concatenate(heights)
 
-    def _way_up(self, joint: int) -> tuple[int, int, int] | None:
-        """Find how one link alone can raise the sensor: counts to turn, joint, target count."""
+    def _single_link_rise(self, joint: int) -> tuple[int, int, int] | None:
+        """Find how one link alone can raise the sensor: counts to turn, joint, target count; None if it cannot."""
         mechanics, stand = self.geometry.joints[joint], self.angles_rad
-        up = mechanics.low_rad if self._sides(stand)[joint] > 0 else mechanics.high_rad
+        up = mechanics.low_rad if self._sides_of(stand)[joint] > 0 else mechanics.high_rad
         angles = np.tile(stand, (N_TRIED, 1))
         angles[:, joint] = np.linspace(stand[joint], up, N_TRIED)
         high_enough = np.flatnonzero(self.geometry.position_mm(angles)[:, 2] >= self.geometry.travel_height_mm)

@@ -11,11 +11,11 @@ from probewise._arrays import FloatArray
 from probewise.arm.geometry import JOINTS, Geometry
 from probewise.errors import ReachError
 
-N_STOPS = 33  # points checked along a move
+N_CHECKED = 33  # points checked along a move
 
 
 class SoftLimits:
-    """Tracks the motors' positions, and refuses moves that the geometry does not allow.
+    """Limits of the joints and of the sensor's height, checked from the motors' last counts.
 
     Parameters
     ----------
@@ -27,18 +27,20 @@ class SoftLimits:
         self._geometry = geometry
         self._counts = [0, 0, 0]
 
-    def stands(self, joint: int, counts: int) -> None:
-        """Record the count of a joint's motor."""
+    def record(self, joint: int, counts: int) -> None:
+        """Record the present count of a joint's motor."""
         self._counts[joint] = counts
+
+    stands = record  # its old name
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Counts of the motors."""
+        """Last recorded counts of the motors: base, shoulder, elbow."""
         base, shoulder, elbow = self._counts
         return base, shoulder, elbow
 
     def heights_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
-        """Return the sensor's height along a move of one joint: shape (n_stops,).
+        """Return the sensor's height at points along a move of one joint, shape (n,).
 
         Parameters
         ----------
@@ -50,10 +52,10 @@ class SoftLimits:
             Starting count of that joint, if different.
         """
         joints = self._geometry.joints
-        way = np.empty((N_STOPS, 3))
+        way = np.empty((N_CHECKED, 3))
         way[:] = [mechanics.angle_at(count) for mechanics, count in zip(joints, counts, strict=True)]
         start = joints[joint].angle_at(counts[joint] if here is None else here)
-        way[:, joint] = np.linspace(start, joints[joint].angle_at(to), N_STOPS)
+        way[:, joint] = np.linspace(start, joints[joint].angle_at(to), N_CHECKED)
         return np.asarray(self._geometry.position_mm(way)[:, 2])
 
     def check(self, joint: int, here: int, to: int) -> None:

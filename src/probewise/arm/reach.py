@@ -58,7 +58,7 @@ def require_reach(workspace: Bounds, places_mm: FloatArray, of: str, *, way_out:
     places_mm
         Shape (n_places, 2).
     of
-        Words for messages: the owner of a place, such as "reading", and of all places, such as "of the plan".
+        What a place belongs to, for messages: a noun, and words on all of them if any, as in "row of the plan".
     way_out
         Advice besides choosing other places, if there is any.
 

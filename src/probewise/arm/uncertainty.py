@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm.geometry import Geometry, placed_mm
+from probewise.arm.geometry import Geometry, forward_kinematics_mm
 
 FITTED = (
     *("base home", "shoulder home", "elbow home", "upper link", "lower link"),
@@ -24,8 +24,8 @@ def values_of(geometry: Geometry) -> FloatArray:
 
 
 def places_of(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
-    """Return the sensor's places (n, 3) for these values of `FITTED` and joint turns from home (n, 3)."""
-    return placed_mm(
+    """Return the sensor's places and heights, (n, 3), from values of `FITTED` and joint turns from home, (n, 3)."""
+    return forward_kinematics_mm(
         values[:3] + turned_rad,
         values[3:5],
         values[5:7],

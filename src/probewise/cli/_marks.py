@@ -12,7 +12,7 @@ from probewise.errors import ReachError
 
 if TYPE_CHECKING:
     from probewise.arm import LegoArm
-    from probewise.arm.touched import Touched
+    from probewise.arm.mark_file import TouchedMark
 
 STEP_MM = 5.0
 _MOST_MM = 60.0  # largest step
@@ -53,7 +53,7 @@ def bring(
     tell: Callable[[str], None],
     *,
     named: str,
-) -> Touched | None:
+) -> TouchedMark | None:
     """Bring the sensor over a mark and down to the block on it, as a person directs; None if the mark is skipped.
 
     Every move turns the base first and then lowers, as in a reading.
@@ -71,7 +71,7 @@ def bring(
     named
         Name of the mark.
     """
-    from probewise.arm.touched import Touched
+    from probewise.arm.mark_file import TouchedMark
 
     at = (*mark_mm, arm.geometry.travel_height_mm)
     arm.go_down(*at)
@@ -84,7 +84,7 @@ def bring(
             homes = np.array([joint.home_rad for joint in arm.geometry.joints])
             base, shoulder, elbow = (arm.angles_rad - homes).tolist()
             height_mm = block_mm if answer == "ok" else math.nan
-            return Touched((base, shoulder, elbow), (*mark_mm, height_mm))
+            return TouchedMark((base, shoulder, elbow), (*mark_mm, height_mm))
         moved = _place_after(at, answer)
         if moved is None:
             tell(f"{answer!r} says nothing that can be done. {_HELP}")

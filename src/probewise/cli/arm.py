@@ -308,7 +308,7 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm import shipped_geometry
     from probewise.arm.fitting import fit_geometry
     from probewise.arm.geometry_file import read_geometry, with_fitted
-    from probewise.arm.touched import read_touched
+    from probewise.arm.mark_file import read_marks
     from probewise.recordings import write_text_atomically
 
     source = arguments.geometry or shipped_geometry()
@@ -322,7 +322,7 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
     if arguments.arm is not None:
         _touch_marks(arguments, geometry, check_out_file(kept))
-    turned, marks = read_touched(kept)
+    turned, marks = read_marks(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
     say(fitted.summary(), quiet=arguments.quiet)
     text = with_fitted(source.read_text(encoding="utf-8-sig"), fitted.geometry)
@@ -334,8 +334,8 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
 def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
     """Bring the sensor to one mark after another, and save each at once."""
     from probewise.arm import LegoArm
+    from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
     from probewise.arm.marks import marks_of
-    from probewise.arm.touched import Touched, read_touched, write_touched
     from probewise.cli._marks import bring
 
     chosen = parse_arm(arguments.arm)
@@ -343,10 +343,10 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
         raise ParameterError("--arm", arguments.arm, "nxt:PORT or emulator:TRUE.toml: the arm whose geometry is fitted")
     if kept.exists() and not arguments.resume:
         raise FileError(kept, "the file exists already", "--resume to continue it, or another --marks")
-    taken: list[Touched] = []
+    taken: list[TouchedMark] = []
     if kept.exists():
-        rows = zip(*(array.tolist() for array in read_touched(kept)), strict=True)
-        taken = [Touched(tuple(turned), tuple(place)) for turned, place in rows]
+        rows = zip(*(array.tolist() for array in read_marks(kept)), strict=True)
+        taken = [TouchedMark(tuple(turned), tuple(place)) for turned, place in rows]
     done = {mark.place_mm[:2] for mark in taken}
     marks = [(x, y) for x, y in marks_of(geometry).tolist()]
     arguments.scene = arguments.sensor = arguments.seed = None
@@ -371,7 +371,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
             met = bring(arm, mark, arguments.block_mm, eyes, tell, named=f"mark {number} of {len(marks)}")
             if met is not None:
                 taken.append(met)
-                write_touched(taken, kept)
+                write_marks(taken, kept)
                 say(f"mark {number} kept: {kept}", quiet=arguments.quiet)
 
 
@@ -380,7 +380,7 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
     from probewise.arm import LegoArm, require_reach
-    from probewise.arm.height_check import Look, check_heights
+    from probewise.arm.height_check import HeightReading, check_heights
     from probewise.arm.marks import marks_of
 
     if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
@@ -401,11 +401,11 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
         if bench is None:
             _asker(arguments, arm)("lay white matt paper, the same everywhere, over the field, or under each place")
 
-        def look(place: tuple[float, float], height_mm: float) -> Look:
+        def look(place: tuple[float, float], height_mm: float) -> HeightReading:
             arm.go_down(*place, height_mm)
             values = np.array([arm.brightness() for _ in range(arguments.readings)])
             error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
-            return Look(place, float(arm.position_mm[2]), float(values.mean()), error)
+            return HeightReading(place, float(arm.position_mm[2]), float(values.mean()), error)
 
         arm.go_over(*places[0])
         lowest_mm = geometry.read_height_mm
@@ -479,7 +479,7 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise._progress import progress_shown
-    from probewise.arm import carry_out, recorded
+    from probewise.arm import carry_out, recording_of
     from probewise.arm.carry_out import BY_HAND_S, duration_s
     from probewise.cli._hands import Hands, is_pty
     from probewise.cli._sheet_watch import SheetWatch
@@ -532,7 +532,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 taken.append(reading)
                 progress("readings", len(taken), len(plan))
                 if not arguments.dry_run:
-                    write_recording(recorded(plan, taken), out)
+                    write_recording(recording_of(plan, taken), out)
     if not arguments.dry_run:
         say(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 

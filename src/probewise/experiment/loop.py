@@ -18,7 +18,7 @@ import numpy as np
 
 from probewise._kinds import require_callable, require_kind, require_path, require_rng, require_whole
 from probewise.arm.instrument import Instrument, Reading
-from probewise.arm.own import Measures, instrument_of, require_measures
+from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
 from probewise.experiment.acquisition import ArmOverGrid, inquire, next_poses
 from probewise.experiment.arm_error import arm_error, moved_by_arm

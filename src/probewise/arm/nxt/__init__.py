@@ -5,7 +5,7 @@ interface. Each layer can be used and tested without those above it.
 """
 
 from probewise.arm.nxt.brick import Brick
-from probewise.arm.nxt.light import Light, LightReading, SensorError, normalized_of
+from probewise.arm.nxt.light import LightReading, LightSensor, SensorError, normalized_of
 from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, Timing
 from probewise.arm.nxt.machine import BrickMachine
 from probewise.arm.nxt.motor import Drive, Guard, Motor, MotorError
@@ -21,8 +21,8 @@ __all__ = [
     "ByteStream",
     "Drive",
     "Guard",
-    "Light",
     "LightReading",
+    "LightSensor",
     "Link",
     "Motor",
     "MotorError",
@@ -38,3 +38,6 @@ __all__ = [
     "framed",
     "normalized_of",
 ]
+
+Light = LightSensor
+"""The old name of `LightSensor`."""

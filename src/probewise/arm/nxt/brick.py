@@ -9,7 +9,7 @@ from typing import Self
 
 from probewise._signals import deferred
 from probewise.arm.basics import Clock
-from probewise.arm.nxt.light import Light
+from probewise.arm.nxt.light import LightSensor
 from probewise.arm.nxt.link import Link
 from probewise.arm.nxt.motor import Drive, Guard, Motor
 from probewise.arm.nxt.serial_port import SerialPort
@@ -48,7 +48,7 @@ class Brick:
 
     def __init__(self, link: Link, *, clock: Clock = time) -> None:
         self.link, self._clock = link, clock
-        self._lights: dict[int, Light] = {}
+        self._lights: dict[int, LightSensor] = {}
         self._last_mv: int | None = None
         self._told_low = False
 
@@ -89,9 +89,9 @@ class Brick:
         """Make the motor at port 0 to 2; see `Motor`."""
         return Motor(self.link, port, guard=guard, drive=drive, clock=self._clock)
 
-    def light(self, port: int) -> Light:
-        """Make the light sensor at input 0 to 3; see `Light`."""
-        return self._lights.setdefault(port, Light(self.link, port, clock=self._clock))
+    def light(self, port: int) -> LightSensor:
+        """Make the light sensor at input 0 to 3; see `LightSensor`."""
+        return self._lights.setdefault(port, LightSensor(self.link, port, clock=self._clock))
 
     def battery_mv(self) -> int:
         """Read the battery's voltage; warn once if it is low.

@@ -60,7 +60,7 @@ class LightReading:
         return self.normalized * 100 / AD_MAX
 
 
-class Light:
+class LightSensor:
     """A light sensor at one of the brick's inputs, read in RAW mode.
 
     Parameters
@@ -70,7 +70,7 @@ class Light:
     port
         0 to 3, for 1 to 4.
     clock
-        What is waited with.
+        Clock used for waiting.
     valid_s
         Seconds after a change during which the brick may mark its readings as invalid.
     """
@@ -98,7 +98,7 @@ class Light:
             self.light_up()
         deadline = self._clock.monotonic() + self._valid_s
         for number in itertools.count(1):
-            values = self._link.ask(GetInputValues(self.port), check=_require_sense)
+            values = self._link.ask(GetInputValues(self.port), check=_require_consistent)
             as_set = (values.type, values.mode) == (self._type, Mode.RAW)
             # An invalid reading still holds the old values.
             if as_set and values.valid:
@@ -118,7 +118,7 @@ class Light:
         return SetInputMode(self.port, SensorType.NONE, Mode.RAW)
 
 
-def _require_sense(values: InputValues) -> None:
+def _require_consistent(values: InputValues) -> None:
     """Refuse values that the firmware never sends: each reading comes in four consistent conversions.
 
     The protocol has no checksum. A corrupted byte makes the four values inconsistent, or changes none that is used.

@@ -130,7 +130,7 @@ class Link:
     Attributes
     ----------
     n_asked, n_told
-        Numbers of questions sent, and of commands without an answer.
+        Number of questions sent, and of commands sent without requesting an answer.
     """
 
     def __init__(self, stream: ByteStream, *, clock: Clock = time, timing: Timing = Timing()) -> None:

@@ -39,7 +39,7 @@ class BrickMachine:
         try:
             for joint, motor in enumerate(self._motors):
                 # An earlier session that lost its connection may have left a motor turning.
-                self.limits.stands(joint, motor.rest())
+                self.limits.record(joint, motor.stop_and_settle())
             self._light.light_up()
         except BaseException as error:
             self.brick.__exit__(type(error), error, error.__traceback__)
@@ -54,12 +54,12 @@ class BrickMachine:
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
         """Turn a joint's motor to a count, approaching in direction `side`, and hold it; see `Motor.move_to`."""
-        with self._watched(joint) as motor:
+        with self._recording_counts(joint) as motor:
             motor.move_to(goal + self._zeros[joint], side)
 
     def move_near(self, joint: int, goal: int) -> None:
         """Turn a joint's motor approximately to a count, and hold it; see `Motor.move_near`."""
-        with self._watched(joint) as motor:
+        with self._recording_counts(joint) as motor:
             motor.move_near(goal + self._zeros[joint])
 
     def release(self) -> None:
@@ -76,14 +76,14 @@ class BrickMachine:
         found = motor.find_stop(with_gears, round(range_counts) + 2 * ROOM_COUNTS)
         at_stop = mechanics.stop_counts
         self._zeros[joint] = found - at_stop
-        self.limits.stands(joint, at_stop)
+        self.limits.record(joint, at_stop)
 
     def reset(self, joints: Sequence[int]) -> None:
         """Set the counters of these joints' motors to 0."""
         for joint in joints:
             self._motors[joint].reset()
             self._zeros[joint] = 0
-            self.limits.stands(joint, 0)
+            self.limits.record(joint, 0)
 
     def read_percent(self) -> float:
         """Read the light sensor, LED on."""
@@ -98,13 +98,13 @@ class BrickMachine:
         self.brick.link.keep_awake()
 
     @contextlib.contextmanager
-    def _watched(self, joint: int) -> Iterator[Motor]:
-        """Yield a motor, and update the limits with its final count, also after a failed move."""
+    def _recording_counts(self, joint: int) -> Iterator[Motor]:
+        """Yield a joint's motor, then record its last count in `limits`, also after a failed move."""
         motor = self._motors[joint]
         try:
             yield motor
         finally:
-            self.limits.stands(joint, motor.last_counts - self._zeros[joint])
+            self.limits.record(joint, motor.last_counts - self._zeros[joint])
 
     def _check(self, joint: int, here: int, to: int) -> None:
         """Check a move against the limits, whose counts are from home."""

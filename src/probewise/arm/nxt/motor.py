@@ -109,11 +109,12 @@ class Motor:
     port
         0 to 2, for A to C.
     guard
-        Checked before every possible move; None: no limits.
+        Function of the counts at the start and at the end of a move; it raises ReachError to refuse the move. None: no
+        limits.
     drive
         Driving parameters; None: those of a lightly loaded motor.
     clock
-        What is waited with.
+        Clock used for waiting.
 
     Attributes
     ----------
@@ -128,7 +129,7 @@ class Motor:
         self.drive = Drive() if drive is None else drive
         self.last_counts = 0
         self._target: int | None = None  # the firmware's target, in rotation counts; None: unknown
-        self._datum: tuple[int, int] | None = None  # tacho counter minus rotation and minus block counter
+        self._offsets: tuple[int, int] | None = None  # tacho counter minus rotation and minus block counter
         self._n_untaken = 0  # moves in a row
         self._arrived: Side | None = None  # the direction of its last approach
         self._coast: dict[tuple[int, Side], float] = {}
@@ -148,14 +149,14 @@ class Motor:
         self._link.ask(ResetMotorPosition(self.port, 0))
         if self._target is not None:
             self._target -= state.rotation_counts
-        self._datum = state.tacho_counts, state.tacho_counts - state.block_counts
+        self._offsets = state.tacho_counts, state.tacho_counts - state.block_counts
 
     def hold(self) -> None:
         """Hold its position against a load."""
         self._link.ask(self._command(0, 0))
 
-    def rest(self) -> int:
-        """Stop and hold it, and read the count once it has settled."""
+    def stop_and_settle(self) -> int:
+        """Stop and hold it; return its count once it has settled."""
         self.hold()
         self._clock.sleep(self.drive.settle_s)
         return self.counts()
@@ -175,7 +176,7 @@ class Motor:
         Raises
         ------
         ReachError
-            If the guard refuses a move; nothing moves then.
+            If the guard refuses a move, which is then not made.
         MotorError
             If it does not reach the goal.
         """
@@ -232,7 +233,7 @@ class Motor:
         while not self._start(start + side * farthest, side, gently):
             start = self._synchronise()
         trouble = self._await_idle(start, side * (farthest + self.drive.runaway_counts), start + side * farthest)
-        here = self.rest()
+        here = self.stop_and_settle()
         self._target = None  # it lies behind the stop
         if trouble != STUCK:
             raise MotorError(
@@ -279,10 +280,10 @@ class Motor:
         if self._guard is not None:
             self._guard(here, stop)
         if not self._start(target, side, self._command(side * power, side * (target - self._known_target))):
-            return self.rest()
+            return self.stop_and_settle()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
         trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here, target)
-        here = self.rest()
+        here = self.stop_and_settle()
         if trouble:
             self._target = None
             raise MotorError(
@@ -337,7 +338,7 @@ class Motor:
                 f"motor {self.letter} does not keep the power it was set to; does a program run on the brick?"
             )
         self._target = state.rotation_counts
-        return self.rest()
+        return self.stop_and_settle()
 
     def _await_idle(self, start: int, farthest: int, target: int) -> str:
         """Wait for a limited move to end; return a description of the trouble if it sticks or overruns."""
@@ -365,17 +366,17 @@ class Motor:
         """
         state, before = self._output_state(), None
         n_asked = 1
-        while (_datum_of(state) != self._datum or not is_likely(state)) and _settings_of(state) != before:
+        while (_counter_offsets(state) != self._offsets or not is_likely(state)) and _constant_fields(state) != before:
             if n_asked == N_ASKED:
                 raise MotorError(
                     f"motor {self.letter} reports another state each of {N_ASKED} times; is the brick near?"
                 )
-            before, state = _settings_of(state), self._output_state()
+            before, state = _constant_fields(state), self._output_state()
             n_asked += 1
         self.last_counts = state.rotation_counts
-        if _datum_of(state) != self._datum:
+        if _counter_offsets(state) != self._offsets:
             # Another program reset a counter: the known target is void.
-            self._target, self._datum = None, _datum_of(state)
+            self._target, self._offsets = None, _counter_offsets(state)
         return state
 
     def _output_state(self) -> OutputState:
@@ -387,11 +388,11 @@ class Motor:
         )
 
 
-def _datum_of(state: OutputState) -> tuple[int, int]:
+def _counter_offsets(state: OutputState) -> tuple[int, int]:
     """Return the differences of the counters, which motion does not change."""
     return state.tacho_counts - state.rotation_counts, state.tacho_counts - state.block_counts
 
 
-def _settings_of(state: OutputState) -> tuple[object, ...]:
+def _constant_fields(state: OutputState) -> tuple[object, ...]:
     """Return the fields that do not change while a motor turns."""
-    return _datum_of(state), state.power, state.mode, state.regulation, state.run_state, state.limit_counts
+    return _counter_offsets(state), state.power, state.mode, state.regulation, state.run_state, state.limit_counts

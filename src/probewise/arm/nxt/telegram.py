@@ -14,7 +14,7 @@ from enum import IntEnum, IntFlag
 from typing import ClassVar, Generic, TypeVar, cast
 
 from probewise.arm.nxt.status import OK, BrickError
-from probewise.arm.nxt.wire import Answer, Fields, TelegramError, Whole, field_of, shown
+from probewise.arm.nxt.wire import Answer, Fields, IntegerField, TelegramError, field_of, in_hex
 
 A_co = TypeVar("A_co", bound=Answer, covariant=True)
 
@@ -23,7 +23,7 @@ FIRST_SYSTEM_OPCODE = 0x80
 LONGEST = 128
 """Bytes of the longest telegram that a brick sends or takes over Bluetooth."""
 
-_OUTPUT, _INPUT, _PERCENT = Whole("B", 0, 2), Whole("B", 0, 3), Whole("b", -100, 100)
+_OUTPUT, _INPUT, _PERCENT = IntegerField("B", 0, 2), IntegerField("B", 0, 3), IntegerField("b", -100, 100)
 
 ALL_OUTPUTS = 0xFF
 
@@ -113,13 +113,13 @@ class SetOutputState(Request[Done]):
     """Drive a motor, or all with port 255; a limit of 0 counts means no limit. By default they idle, free to turn."""
 
     OPCODE = 0x04
-    port: int = field_of(Whole("B", 0, 2, (ALL_OUTPUTS,)))
+    port: int = field_of(IntegerField("B", 0, 2, (ALL_OUTPUTS,)))
     power: int = field_of(_PERCENT, 0)
-    mode: int = field_of(Whole("B", 0, 7), OutputMode.IDLE)
-    regulation: int = field_of(Whole("B", 0, 2), Regulation.IDLE)
+    mode: int = field_of(IntegerField("B", 0, 7), OutputMode.IDLE)
+    regulation: int = field_of(IntegerField("B", 0, 2), Regulation.IDLE)
     turn_ratio: int = field_of(_PERCENT, 0)
-    run_state: int = field_of(Whole("B", 0, 0, (0x10, 0x20, 0x40)), RunState.IDLE)
-    limit_counts: int = field_of(Whole("I", 0, 0xFFFFFFFF), 0)
+    run_state: int = field_of(IntegerField("B", 0, 0, (0x10, 0x20, 0x40)), RunState.IDLE)
+    limit_counts: int = field_of(IntegerField("I", 0, 0xFFFFFFFF), 0)
 
     @property
     def repeatable(self) -> bool:
@@ -133,8 +133,8 @@ class SetInputMode(Request[Done]):
 
     OPCODE = 0x05
     port: int = field_of(_INPUT)
-    type: int = field_of(Whole("B", 0, 0x12))
-    mode: int = field_of(Whole("B", 0, 0xFF))
+    type: int = field_of(IntegerField("B", 0, 0x12))
+    mode: int = field_of(IntegerField("B", 0, 0xFF))
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ class ResetMotorPosition(Request[Done]):
 
     OPCODE = 0x0A
     port: int = field_of(_OUTPUT)
-    relative: int = field_of(Whole("B", 0, 1))
+    relative: int = field_of(IntegerField("B", 0, 1))
 
 
 @dataclass(frozen=True)
@@ -304,7 +304,7 @@ def decode(telegram: bytes) -> Reply:
         If the bytes are not a reply.
     """
     if len(telegram) < 3 or telegram[0] != REPLY:
-        raise TelegramError(f"a reply has the type 02, an opcode and a status; there is {shown(telegram)}")
+        raise TelegramError(f"a reply has the type 02, an opcode and a status; there is {in_hex(telegram)}")
     return Reply(telegram[1], telegram[2], telegram[3:])
 
 

@@ -16,7 +16,7 @@ class TelegramError(LinkError):
 
 
 @dataclass(frozen=True)
-class Whole:
+class IntegerField:
     """An integer field: `code` as in the module struct, range `low` to `high`, or one of `others`."""
 
     code: str
@@ -32,7 +32,7 @@ class Whole:
             raise ParameterError(name, value, f"a whole number from {self.low} to {self.high}{more}")
 
 
-def field_of(kind: Whole, default: Any = dataclasses.MISSING) -> Any:
+def field_of(kind: IntegerField, default: Any = dataclasses.MISSING) -> Any:
     """Make a dataclass field with this byte layout."""
     return dataclasses.field(default=default, metadata={"kind": kind})
 
@@ -49,7 +49,7 @@ class Fields:
         """Encode the fields."""
         return b"".join(struct.pack("<" + kind.code, getattr(self, name)) for name, kind in self._kinds())
 
-    def _kinds(self) -> Iterator[tuple[str, Whole]]:
+    def _kinds(self) -> Iterator[tuple[str, IntegerField]]:
         return ((field.name, field.metadata["kind"]) for field in dataclasses.fields(self))
 
 
@@ -72,11 +72,11 @@ class Answer:
             values = struct.unpack("<" + cls.LAYOUT, raw)
         except struct.error as error:
             size = struct.calcsize("<" + cls.LAYOUT)
-            raise TelegramError(f"{cls.__name__} has {size} bytes; there are {len(raw)}: {shown(raw)}") from error
+            raise TelegramError(f"{cls.__name__} has {size} bytes; there are {len(raw)}: {in_hex(raw)}") from error
         return cls(*(_text(value) if isinstance(value, bytes) else value for value in values))
 
 
-def shown(raw: bytes) -> str:
+def in_hex(raw: bytes) -> str:
     """Format bytes in hexadecimal."""
     return raw.hex(" ").upper() or "no bytes"
 

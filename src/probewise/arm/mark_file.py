@@ -19,14 +19,14 @@ _LARGEST = 1e4
 
 
 @dataclass(frozen=True)
-class Touched:
+class TouchedMark:
     """One mark: joint angles from home, and place of the sensor's face; a height of NaN: not measured."""
 
     turned_rad: tuple[float, float, float]
     place_mm: tuple[float, float, float]
 
 
-def read_touched(path: Path) -> tuple[FloatArray, FloatArray]:
+def read_marks(path: Path) -> tuple[FloatArray, FloatArray]:
     """Read marks: turns in radians and places in mm, both (n_marks, 3).
 
     Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty.
@@ -38,7 +38,7 @@ def read_touched(path: Path) -> tuple[FloatArray, FloatArray]:
     return np.radians(np.stack(turned, axis=-1)), np.stack(place, axis=-1)
 
 
-def write_touched(marks: Sequence[Touched], path: Path) -> None:
+def write_marks(marks: Sequence[TouchedMark], path: Path) -> None:
     """Write marks atomically."""
     turned = np.degrees([mark.turned_rad for mark in marks]).reshape(-1, 3).round(4)
     place = np.array([mark.place_mm for mark in marks]).reshape(-1, 3).round(4)

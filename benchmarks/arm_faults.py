@@ -27,7 +27,7 @@ from tqdm import tqdm
 from probewise.arm import LegoArm, Pose, Reading, read_geometry, shipped_geometry
 from probewise.arm.nxt import Brick, BrickMachine, Link, Timing
 from probewise.calibration import FittedSensor
-from probewise.emulator import Bench, Faults, Stand, VirtualClock, VirtualLine, set_up
+from probewise.emulator import Bench, Faults, SensorPose, VirtualClock, VirtualLine, set_up
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
 from probewise.experiment import Experiment, Step, experiment_for, explore, read_journal, world_like
@@ -115,7 +115,7 @@ class Answer:
 
     time_s: float
     percent: float
-    stand: Stand
+    stand: SensorPose
     battery_mv: float
 
 
@@ -130,7 +130,7 @@ class BrickLog:
         telegram = bytes.fromhex(text.split("  ")[0]) if event == "<" else b""
         if telegram[1:3] == bytes((LIGHT, 0)) and telegram[4]:
             (normalized,) = struct.unpack_from("<H", telegram, 10)
-            here = self.bench.arm.stand(), self.bench.radio.brick.battery_mv
+            here = self.bench.arm.sensor_pose(), self.bench.radio.brick.battery_mv
             self.answers.append(Answer(now_s, 100 * normalized / 1023, *here))
 
     def last(self, began_s: float, ended_s: float) -> int | None:
@@ -329,7 +329,7 @@ def violations(run: Run) -> list[str]:
     return found
 
 
-def expected_at(stand: Stand) -> float:
+def expected_at(stand: SensorPose) -> float:
     """Return the mean of what the world shows at a place."""
     disc, rng = Disc(TRUTH[:2], TRUTH[2]), np.random.default_rng(0)
     reads = [WORLD.read(disc, stand.x_mm, stand.y_mm, stand.orientation_rad, time_s=0.0, rng=rng) for _ in range(9)]

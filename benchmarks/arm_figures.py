@@ -47,7 +47,7 @@ def run(machine_type: type[BrickMachine], places_mm: np.ndarray, *, seed: int) -
     machine = machine_type(Brick(link, clock=clock), geometry)
     stands = []
     read = machine.read_percent
-    machine.read_percent = lambda: (stands.append(bench.arm.stand()), read())[1]
+    machine.read_percent = lambda: (stands.append(bench.arm.sensor_pose()), read())[1]
     arm = LegoArm(machine, geometry, clock=clock)
     seconds, telegrams, told = [], [], []
     with arm:

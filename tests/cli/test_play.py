@@ -43,7 +43,7 @@ def turned_deg(play_deg, path):
         for x_mm, y_mm in places:
             (orientation_rad,) = arm.orientation_rad(np.array([[x_mm, y_mm]]))
             at = arm.measure(Pose(float(x_mm), float(y_mm), float(orientation_rad))).pose
-            stand = bench.arm.stand()
+            stand = bench.arm.sensor_pose()
             believed, true = (
                 math.degrees(math.atan2(here.y_mm - BASE_MM[1], here.x_mm - BASE_MM[0])) for here in (at, stand)
             )

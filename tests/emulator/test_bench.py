@@ -16,7 +16,7 @@ from probewise.emulator import (
     EmulatedArm,
     Geometry,
     LightModel,
-    Stand,
+    SensorPose,
     Table,
     VirtualClock,
     parse_scene,
@@ -37,12 +37,12 @@ def geometry() -> Geometry:
     return read_geometry(shipped_geometry())
 
 
-def posed(geometry: Geometry, *angles_deg: float) -> Stand:
+def posed(geometry: Geometry, *angles_deg: float) -> SensorPose:
     """Bring an arm's base, shoulder and elbow to these angles by hand."""
     arm = EmulatedArm(geometry)
     for joint, angle_deg in zip(arm.joints, angles_deg, strict=True):
         joint.bring_to(angle_deg)
-    return arm.stand()
+    return arm.sensor_pose()
 
 
 def test_the_arm_stands_where_two_links_over_a_turning_base_lead(geometry: Geometry) -> None:
@@ -74,7 +74,7 @@ def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry: Geometr
     for way in (1, -1):
         while way * motor.angle_deg < 70:
             motor.step(1e-3, 40 * way, brake=False, battery_mv=7400)
-        angles.append(arm.stand().orientation_rad - math.radians(motor.angle_deg / geometry.joints[0].gear_ratio))
+        angles.append(arm.sensor_pose().orientation_rad - math.radians(motor.angle_deg / geometry.joints[0].gear_ratio))
     assert math.degrees(angles[1] - angles[0]) == pytest.approx(geometry.joints[0].play_deg)
 
 
@@ -98,23 +98,23 @@ def test_a_joint_stops_beyond_its_limits(geometry: Geometry) -> None:
     assert min(abs(end_deg - base.low_deg), abs(end_deg - base.high_deg)) == pytest.approx(3.0)
 
 
-def sight(stand: Stand, clock: VirtualClock, *, albedo: float = 1.0) -> LightModel:
+def sight(stand: SensorPose, clock: VirtualClock, *, albedo: float = 1.0) -> LightModel:
     world = replace(WORLD, noise_sd=0.0)
     return LightModel(world, Table(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
 
 
 def test_at_the_reading_height_the_brick_shows_what_the_world_reads(clock: VirtualClock) -> None:
-    assert sight(Stand(0, 0, 14.0, 0), clock)(True) == pytest.approx(60.5)
-    assert sight(Stand(0, 0, 14.0, 0), clock, albedo=0.0)(True) == pytest.approx(10.5)
+    assert sight(SensorPose(0, 0, 14.0, 0), clock)(True) == pytest.approx(60.5)
+    assert sight(SensorPose(0, 0, 14.0, 0), clock, albedo=0.0)(True) == pytest.approx(10.5)
 
 
 def test_without_the_led_contrast_is_halved_and_height_does_not_matter(clock: VirtualClock) -> None:
     for height_mm in (5.0, 14.0, 60.0):
-        assert sight(Stand(0, 0, height_mm, 0), clock)(False) == pytest.approx(30.25)
+        assert sight(SensorPose(0, 0, height_mm, 0), clock)(False) == pytest.approx(30.25)
 
 
 def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetres(clock: VirtualClock) -> None:
-    lit = {h: sight(Stand(0, 0, h, 0), clock)(True) for h in (0.0, 4.0, 8.0, 14.0, 25.0, 60.0)}
+    lit = {h: sight(SensorPose(0, 0, h, 0), clock)(True) for h in (0.0, 4.0, 8.0, 14.0, 25.0, 60.0)}
     assert lit[8.0] == max(lit.values())
     assert lit[0.0] == pytest.approx(30.25)
     assert lit[14.0] > lit[25.0] > lit[60.0]
@@ -123,10 +123,10 @@ def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetr
 
 def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualClock) -> None:
     """As on the simulated arm with the same seed, however often it is read at one stand."""
-    at = [Stand(0, 0, 14.0, 0)]
+    at = [SensorPose(0, 0, 14.0, 0)]
     look = LightModel(WORLD, Table(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
     for number in range(4):
-        at[0] = Stand(10.0 * number, 0, 14.0, 0)
+        at[0] = SensorPose(10.0 * number, 0, 14.0, 0)
         expected = 60.5 + 0.6 * np.random.default_rng([7, number]).standard_normal()
         assert look(True) == pytest.approx(expected)
         assert look(True) != pytest.approx(expected)
@@ -157,7 +157,7 @@ def test_a_brick_over_a_circle_reads_white_inside_and_black_outside(geometry: Ge
         elbow = slope - math.acos((lower**2 + far**2 - upper**2) / (2 * lower * far))
         for joint, angle_rad in zip(bench.arm.joints, (-math.pi / 2, shoulder, elbow), strict=True):
             joint.bring_to(math.degrees(angle_rad))
-        stand = bench.arm.stand()
+        stand = bench.arm.sensor_pose()
         assert (stand.x_mm, stand.y_mm, stand.height_mm) == pytest.approx((524.0, y_mm, 14.0))
         readings.append(read_light(bench, clock, geometry.sensor_port - 1))
     assert readings[0] == pytest.approx(60, abs=3)
@@ -168,7 +168,7 @@ def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClo
     """Over an edge the spot's centre, 6 mm along v, is on the white side, then on the black one."""
     table = Table(HalfPlane(math.pi / 2, 0.0))
     world = World(gaussian_spot([Blob(1.0, (0.0, 6.0), (1.0, 1.0))]), noise_sd=0.0)
-    look = LightModel(world, table, lambda: Stand(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
+    look = LightModel(world, table, lambda: SensorPose(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
     assert look(True) == pytest.approx(60.5)
     table.obey("turn 180")
     assert look(True) == pytest.approx(10.5)

@@ -120,7 +120,7 @@ def test_after_a_cut_anywhere_the_motors_stop_and_the_next_reading_is_taken(cloc
     clock.sleep(5.0)
     bench.radio.brick.advance()
     assert not any(motor.speed_deg_s for motor in bench.arm.motors())
-    assert bench.arm.stand().height_mm > 8.0
+    assert bench.arm.sensor_pose().height_mm > 8.0
     cut.mend()
     (second,) = measured(bench, clock, places[1:])
     assert (first.value, second.value) == pytest.approx((10, 10), abs=3)

@@ -33,7 +33,7 @@ import probewise
 from probewise.arm import LegoArm, Pose, Reading
 from probewise.arm.geometry import Accuracy
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.emulator import Faults, Stand, VirtualClock, VirtualLine
+from probewise.emulator import Faults, SensorPose, VirtualClock, VirtualLine
 from probewise.experiment import Experiment, arm_over
 from probewise.experiment import run as run_experiment
 from probewise.recordings import Disc
@@ -90,12 +90,12 @@ def test_the_same_seed_gives_the_same_measurements_as_on_the_simulated_arm(asked
     assert len(again.taken) >= 5
     for step, taken in zip(there.steps, again.taken, strict=True):
         pose, stand = step.reading.pose, taken.answer.stand
-        meant = Stand(pose.x_mm, pose.y_mm, stand.height_mm, pose.orientation_rad)
+        meant = SensorPose(pose.x_mm, pose.y_mm, stand.height_mm, pose.orientation_rad)
         missed = abs(expected_at(meant) - expected_at(stand))
         assert abs(taken.reading.value - step.reading.value) <= 1 + 0.05 * step.reading.value + missed
 
 
-STAND = Stand(600.0, 250.0, GEOMETRY.read_height_mm, 0.5)
+STAND = SensorPose(600.0, 250.0, GEOMETRY.read_height_mm, 0.5)
 READ = Reading(60.0, Pose(600.0, 250.0, 0.5), 1.0, {"battery_mv": 7400.0})
 GOOD = Taken(READ.pose, READ, 60.9, 0, Answer(1.0, 60.9, STAND, 7410.0))
 

@@ -31,7 +31,7 @@ def true_off_mm(file):
     with lego as arm:
         for text in PLACES:
             arm.go_down(*map(float, text.split(",")))
-            off.append(bench.arm.stand().height_mm - arm.position_mm[2])
+            off.append(bench.arm.sensor_pose().height_mm - arm.position_mm[2])
     return np.array(off[1:]) - off[0]
 
 

@@ -51,7 +51,7 @@ def lowest_while(bench: Bench) -> list[float]:
 
     def watched(telegram: bytes) -> bytes | None:
         reply = answer(telegram)
-        heights.append(bench.arm.stand().height_mm)
+        heights.append(bench.arm.sensor_pose().height_mm)
         return reply
 
     bench.radio.brick.answer = watched  # type: ignore[method-assign]
@@ -72,7 +72,7 @@ def test_an_arm_with_stops_comes_home_from_wherever_it_was(clock: VirtualClock, 
         np.testing.assert_allclose(np.degrees(lego.angles_rad), [-90, 90, -20], atol=0.25)
         place = np.array([[300.0, 200.0]])
         lego.go_down(*place[0])
-        stand = bench.arm.stand()
+        stand = bench.arm.sensor_pose()
         assert math.dist((stand.x_mm, stand.y_mm), place[0]) < 3.0
         assert stand.height_mm == pytest.approx(14.0, abs=2.0)
     assert min(heights) > geometry.lowest_mm
@@ -92,7 +92,7 @@ def test_joints_without_a_stop_keep_their_counters(clock: VirtualClock) -> None:
 def test_a_stop_that_is_not_there_is_told_of(clock: VirtualClock) -> None:
     bench = lost(clock)
     base = bench.arm.joints[0].motor
-    base.nature = dataclasses.replace(base.nature, stops_deg=(-math.inf, math.inf))
+    base.parameters = dataclasses.replace(base.parameters, stops_deg=(-math.inf, math.inf))
     with (
         connected(bench, clock, with_stops("base")) as lego,
         pytest.raises(MotorError, match="motor A met no stop within 4420 counts"),

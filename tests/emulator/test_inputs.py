@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.emulator import Brick, Light, NothingAnalog, VirtualClock
+from probewise.emulator import Brick, EmptyPort, LightSensor, VirtualClock
 
 
 class Fixed:
@@ -27,7 +27,7 @@ def values(ask: Callable[[str], str]) -> tuple[int, int, int, int]:
 
 
 def light_brick(clock: VirtualClock, sensor: object) -> Brick:
-    return Brick(clock, sensors=[NothingAnalog(), sensor, NothingAnalog(), NothingAnalog()])  # type: ignore[list-item]
+    return Brick(clock, sensors=[EmptyPort(), sensor, EmptyPort(), EmptyPort()])  # type: ignore[list-item]
 
 
 def asking(brick: Brick) -> Callable[[str], str]:
@@ -86,7 +86,7 @@ def test_the_converter_takes_a_new_sample_every_three_milliseconds(clock: Virtua
         taken.append(lit)
         return 50.0
 
-    light = Light(seen, clock)
+    light = LightSensor(seen, clock)
     for _ in range(30):
         light.counts(lit=True)
         clock.sleep(0.001)
@@ -97,7 +97,7 @@ def test_the_converter_takes_a_new_sample_every_three_milliseconds(clock: Virtua
 def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
     """One count of the converter is 0.147 %, and the firmware truncates."""
     clock = VirtualClock()
-    ask = asking(light_brick(clock, Light(lambda lit: percent, clock)))
+    ask = asking(light_brick(clock, LightSensor(lambda lit: percent, clock)))
     ask("80 05 01 05 00")
     clock.sleep(0.1)
     assert values(ask)[2] * 100 / 1023 == pytest.approx(percent, abs=0.3)
@@ -105,11 +105,11 @@ def test_what_is_seen_comes_back_in_percent(percent: float) -> None:
 
 @given(percent=st.floats(-1e6, 1e6))
 def test_no_light_leaves_the_converter_s_range(percent: float) -> None:
-    assert 0 <= Light(lambda lit: percent, VirtualClock()).counts(lit=True) <= 1023
+    assert 0 <= LightSensor(lambda lit: percent, VirtualClock()).counts(lit=True) <= 1023
 
 
 def test_an_empty_port_reads_the_full_voltage_and_a_touch_sensor_s_rest(clock: VirtualClock) -> None:
-    ask = asking(light_brick(clock, NothingAnalog()))
+    ask = asking(light_brick(clock, EmptyPort()))
     ask("80 05 01 01 20")
     clock.sleep(0.1)
     assert values(ask) == (1, 1023, 1023, 0)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from probewise.emulator import Battery, Brick, Motor, MotorNature, VirtualClock
+from probewise.emulator import Battery, Brick, Motor, MotorParameters, VirtualClock
 from probewise.emulator.output import Output, RunState
 
 RUN, COAST, HOLD = "07 01 00 20", "00 00 00 00", "00 07 01 00 20 00 00 00 00"
@@ -28,9 +28,9 @@ def wait(clock: VirtualClock, brick: Brick, seconds: float) -> Output:
     return brick.outputs.ports[0]
 
 
-def coasted(speed_deg_s: float, nature: MotorNature) -> float:
+def coasted(speed_deg_s: float, parameters: MotorParameters) -> float:
     """Integrate speed' = -speed/T - f to standstill: T v - f T^2 ln(1 + v / (f T))."""
-    t, f = nature.coasting_s, nature.friction_deg_s2
+    t, f = parameters.coasting_s, parameters.friction_deg_s2
     return t * speed_deg_s - f * t * t * math.log1p(speed_deg_s / (f * t))
 
 
@@ -38,15 +38,18 @@ def test_a_coasting_motor_stops_where_the_integral_says() -> None:
     motor = Motor(speed_deg_s=600.0)
     for _ in range(2000):
         motor.step(1e-3, 0, brake=False, battery_mv=7400)
-    assert motor.angle_deg == pytest.approx(coasted(600.0, motor.nature), rel=0.01)
+    assert motor.angle_deg == pytest.approx(coasted(600.0, motor.parameters), rel=0.01)
     assert motor.speed_deg_s == 0
 
 
 def test_an_unregulated_motor_runs_at_the_speed_that_friction_leaves(ask, clock, brick) -> None:
     turn(ask, 50, 0, how="01 00 00 20")
     port = wait(clock, brick, 1.0)
-    nature = port.motor.nature
-    expected = nature.full_speed_deg_s * 0.5 * 7412 / nature.rated_mv - nature.friction_deg_s2 * nature.driven_s
+    parameters = port.motor.parameters
+    expected = (
+        parameters.full_speed_deg_s * 0.5 * 7412 / parameters.rated_mv
+        - parameters.friction_deg_s2 * parameters.driven_s
+    )
     assert port.motor.speed_deg_s == pytest.approx(expected, rel=0.01)
 
 
@@ -186,7 +189,7 @@ def test_a_ramp_up_gets_faster_until_its_limit(ask, clock, brick) -> None:
 
 
 def test_motors_in_step_stay_together_though_one_has_more_friction(clock: VirtualClock) -> None:
-    heavy = Motor(MotorNature(friction_deg_s2=2400))
+    heavy = Motor(MotorParameters(friction_deg_s2=2400))
     brick = Brick(clock, motors=[Motor(), heavy, Motor()])
     for port in ("00", "01"):
         brick.answer(bytes.fromhex(f"80 04 {port} 32 07 02 00 20 00 00 00 00"))
@@ -208,14 +211,14 @@ def test_a_turn_ratio_slows_the_inner_motor(clock: VirtualClock) -> None:
 
 
 def test_a_motor_stands_still_at_its_stop() -> None:
-    motor = Motor(MotorNature(stops_deg=(-50.0, 100.0)))
+    motor = Motor(MotorParameters(stops_deg=(-50.0, 100.0)))
     for _ in range(1000):
         motor.step(1e-3, 80, brake=False, battery_mv=7400)
     assert (motor.angle_deg, motor.speed_deg_s) == (100.0, 0.0)
 
 
 def test_what_hangs_on_a_motor_follows_when_the_play_is_used_up() -> None:
-    motor = Motor(MotorNature(play_deg=8.0))
+    motor = Motor(MotorParameters(play_deg=8.0))
     for side in (1, -1):
         while side * motor.angle_deg < 100:
             motor.step(1e-3, 50 * side, brake=False, battery_mv=7400)

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
-from probewise.emulator import Brick, NothingAnalog, VirtualClock
+from probewise.emulator import Brick, EmptyPort, VirtualClock
 from probewise.emulator.output import OutputSetting
-from probewise.emulator.protocol import COMMANDS, Frames, framed
+from probewise.emulator.protocol import COMMANDS, FrameAssembler, framed
 
 
 class Fixed:
@@ -23,7 +23,7 @@ class Fixed:
 
 def exchanged(brick: Brick, sent: str) -> str:
     """Send a frame and return the frame that comes back."""
-    (telegram,) = Frames().feed(bytes.fromhex(sent), 0.0)
+    (telegram,) = FrameAssembler().feed(bytes.fromhex(sent), 0.0)
     reply = brick.answer(telegram)
     return "" if reply is None else framed(reply).hex(" ").upper()
 
@@ -94,7 +94,7 @@ def test_input_values_are_laid_out_as_in_the_vectors(
     clock: VirtualClock, wait_s: float, kind: str, mode: str, counts: int, expected: str
 ) -> None:
     """512 counts: t = (512-200)*100//68 = 458, 1023 - 458 = 565, 55 %; 640 counts: 376, shown while invalid."""
-    brick = Brick(clock, sensors=[NothingAnalog(), Fixed(counts), NothingAnalog(), NothingAnalog()])
+    brick = Brick(clock, sensors=[EmptyPort(), Fixed(counts), EmptyPort(), EmptyPort()])
     brick.answer(bytes.fromhex("80 05 01 05 00"))
     clock.sleep(0.1)
     exchanged(brick, f"05 00 80 05 01 {kind} {mode}")
@@ -188,20 +188,20 @@ def test_no_error_of_a_command_without_reply_is_told(brick: Brick) -> None:
 def test_frames_come_in_any_pieces() -> None:
     stream = framed(b"\x00\x0b") + framed(b"\x01\x88") + framed(b"")
     for size in range(1, len(stream) + 1):
-        frames = Frames()
+        frames = FrameAssembler()
         pieces = [stream[at : at + size] for at in range(0, len(stream), size)]
         assert [t for piece in pieces for t in frames.feed(piece, 0.0)] == [b"\x00\x0b", b"\x01\x88", b""]
 
 
 def test_half_a_frame_is_forgotten_after_a_silence() -> None:
-    frames = Frames()
+    frames = FrameAssembler()
     assert not list(frames.feed(b"\x40\x00\x00", 0.0))
     assert list(frames.feed(framed(b"\x00\x0b"), 1.0)) == [b"\x00\x0b"]
 
 
 def test_half_a_frame_is_forgotten_also_where_somebody_keeps_looking_for_the_rest() -> None:
     """A terminal is read every 50 ms, mostly in vain."""
-    frames = Frames()
+    frames = FrameAssembler()
     assert not list(frames.feed(b"\x0c\x00\x00\x04", 0.0))
     for k in range(1, 20):
         assert not list(frames.feed(b"", 0.05 * k))
@@ -209,7 +209,7 @@ def test_half_a_frame_is_forgotten_also_where_somebody_keeps_looking_for_the_res
 
 
 def test_a_frame_in_slow_pieces_is_whole_in_the_end() -> None:
-    frames, frame = Frames(), framed(b"\x00\x0b")
+    frames, frame = FrameAssembler(), framed(b"\x00\x0b")
     for k, byte in enumerate(frame[:-1]):
         assert not list(frames.feed(bytes([byte]), 0.5 * k))
         assert not list(frames.feed(b"", 0.5 * k + 0.4))

@@ -19,7 +19,7 @@ from probewise.cli._stopping import saying_what_is_kept
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.emulator import Bench, Stand, Trace
+    from probewise.emulator import Bench, SensorPose, Trace
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,7 +110,7 @@ class _Listener:
 
     def listen(self) -> None:
         """Read typed input without waiting; from a terminal only in the foreground, as job control requires."""
-        stand = self._bench.arm.stand()
+        stand = self._bench.arm.sensor_pose()
         if (stand.height_mm < 0) is not self._is_in_table:
             self._is_in_table = stand.height_mm < 0
             say(f"{'the sensor went through' if self._is_in_table else 'it came out of'} the table: {_place(stand)}")
@@ -123,7 +123,7 @@ class _Listener:
 
     def _obey(self, line: str) -> None:
         if line.strip() == "where":
-            say(_place(self._bench.arm.stand()))
+            say(_place(self._bench.arm.sensor_pose()))
             return
         try:
             self._bench.table.obey(line)
@@ -132,7 +132,7 @@ class _Listener:
             say(str(error))
 
 
-def _place(stand: Stand) -> str:
+def _place(stand: SensorPose) -> str:
     """Describe the sensor's position."""
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 

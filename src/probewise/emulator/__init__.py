@@ -4,7 +4,7 @@ It answers LEGO's Bluetooth protocol byte for byte, simulates motors that oversh
 sensor over a `world`. It shares no code with the driver in `arm`, so each tests the other.
 """
 
-from probewise.emulator.arm import EmulatedArm, Joint, Stand
+from probewise.emulator.arm import EmulatedArm, Joint, SensorPose
 from probewise.emulator.bench import Bench, set_up
 from probewise.emulator.brick import Battery, Brick
 from probewise.emulator.clock import Clock, VirtualClock
@@ -12,14 +12,26 @@ from probewise.emulator.faults import Faults
 from probewise.emulator.geometry import Geometry, JointNumbers, read_geometry, shipped_geometry
 from probewise.emulator.light_model import LightModel
 from probewise.emulator.line import VirtualLine
-from probewise.emulator.motor import Motor, MotorNature
+from probewise.emulator.motor import Motor, MotorParameters
 from probewise.emulator.radio import Radio, Trace
 from probewise.emulator.scenes import parse_scene
-from probewise.emulator.sensors import Analog, Digital, Light, NothingAnalog, sonar
+from probewise.emulator.sensors import Analog, Digital, EmptyPort, LightSensor, sonar
 from probewise.emulator.table import Table
 
 Sight = LightModel
 """The old name of `LightModel`."""
+
+Stand = SensorPose
+"""The old name of `SensorPose`."""
+
+NothingAnalog = EmptyPort
+"""The old name of `EmptyPort`."""
+
+MotorNature = MotorParameters
+"""The old name of `MotorParameters`."""
+
+Light = LightSensor
+"""The old name of `LightSensor`."""
 
 __all__ = [
     "Analog",
@@ -28,18 +40,18 @@ __all__ = [
     "Brick",
     "Clock",
     "Digital",
+    "EmptyPort",
     "EmulatedArm",
     "Faults",
     "Geometry",
     "Joint",
     "JointNumbers",
-    "Light",
     "LightModel",
+    "LightSensor",
     "Motor",
-    "MotorNature",
-    "NothingAnalog",
+    "MotorParameters",
     "Radio",
-    "Stand",
+    "SensorPose",
     "Table",
     "Trace",
     "VirtualClock",

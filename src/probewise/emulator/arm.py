@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import Self
 
 from probewise.emulator.geometry import Geometry, JointNumbers
-from probewise.emulator.motor import Motor, MotorNature
+from probewise.emulator.motor import Motor, MotorParameters
 
 _BEYOND_LIMITS_DEG = 3.0  # a joint's mechanical stops lie this far outside the file's limits
 
 
 @dataclass(frozen=True)
-class Stand:
-    """Pose of the sensor in the lab frame: place, height of its face above the surface, angle from x to its u axis."""
+class SensorPose:
+    """Pose of the sensor in the lab frame: place, height of its face above the surface, angle from X to its u axis."""
 
     x_mm: float
     y_mm: float
@@ -39,7 +39,7 @@ class Joint:
         play_deg = numbers.play_deg * abs(numbers.gear_ratio)
         # The stops are the joint's: its motor turns half the backlash further.
         stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)
-        return cls(numbers, Motor(MotorNature(stops_deg=stops_deg, play_deg=play_deg)))
+        return cls(numbers, Motor(MotorParameters(stops_deg=stops_deg, play_deg=play_deg)))
 
     @property
     def angle_rad(self) -> float:
@@ -65,26 +65,26 @@ class EmulatedArm:
     joints
         Base, shoulder, elbow.
     lowest
-        Where the sensor was lowest so far; below 0 it would have gone through the table.
+        Lowest pose of the sensor so far; below a height of 0 it would have gone through the table.
     """
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
         self.joints = tuple(Joint.at_home(numbers) for numbers in geometry.joints)
-        self.lowest = self.stand()
+        self.lowest = self.sensor_pose()
 
     def motors(self) -> tuple[Motor, ...]:
         """Return the motors at ports A, B, C."""
         by_port = {joint.numbers.port: joint.motor for joint in self.joints}
         return tuple(by_port[port] for port in "ABC")
 
-    def watch(self) -> None:
-        """Take note of where the sensor is lowest."""
-        here = self.stand()
+    def record_lowest(self) -> None:
+        """Update `lowest`, the lowest pose of the sensor so far."""
+        here = self.sensor_pose()
         if here.height_mm < self.lowest.height_mm:
             self.lowest = here
 
-    def stand(self) -> Stand:
+    def sensor_pose(self) -> SensorPose:
         """Return the sensor's pose (the paper's arm: two links on a turning base)."""
         g = self._geometry
         base, shoulder, elbow = (joint.angle_rad for joint in self.joints)
@@ -92,9 +92,11 @@ class EmulatedArm:
         (upper_mm, lower_mm), (forward_mm, height_mm) = g.links_mm, g.shoulder_mm
         out_mm = forward_mm + upper_mm * math.cos(shoulder) + lower_mm * math.cos(lower) + g.sensor_mm[0]
         face_mm = height_mm + upper_mm * math.sin(shoulder) + lower_mm * math.sin(lower) - g.sensor_mm[1]
-        return Stand(
+        return SensorPose(
             x_mm=g.base_mm[0] + out_mm * math.cos(base),
             y_mm=g.base_mm[1] + out_mm * math.sin(base),
             height_mm=face_mm,
             orientation_rad=math.radians(g.mounting_deg - 90) + base,
         )
+
+    stand = sensor_pose  # its old name

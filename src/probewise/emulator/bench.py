@@ -14,7 +14,7 @@ from probewise.emulator.geometry import Geometry
 from probewise.emulator.inputs import Sensor
 from probewise.emulator.light_model import LightModel
 from probewise.emulator.radio import Radio, Trace, no_trace
-from probewise.emulator.sensors import Light, NothingAnalog, sonar
+from probewise.emulator.sensors import EmptyPort, LightSensor, sonar
 from probewise.emulator.table import Table
 from probewise.world import Surface, World
 
@@ -71,10 +71,10 @@ def set_up(
     faults = Faults() if faults is None else faults
     arm = EmulatedArm(geometry)
     table = Table(surface)
-    light = LightModel(world, table, arm.stand, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
-    sensors: list[Sensor] = [NothingAnalog() for _ in range(4)]
+    light = LightModel(world, table, arm.sensor_pose, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
+    sensors: list[Sensor] = [EmptyPort() for _ in range(4)]
     at = geometry.sensor_port - 1
-    sensors[at] = Light(light, clock)
+    sensors[at] = LightSensor(light, clock)
     sensors[0 if at == 3 else 3] = sonar(_WALL_CM)
     brick = Brick(
         clock,
@@ -83,7 +83,7 @@ def set_up(
         name=name,
         battery=Battery(sag_mv_min=faults.sag),
         sleep_min=sleep_min,
-        watch=arm.watch,
+        watch=arm.record_lowest,
     )
     rng = np.random.default_rng([seed, 1])
     return Bench(table, arm, Radio(brick, clock, rng=rng, faults=faults, trace=trace))

@@ -13,7 +13,7 @@ from probewise.emulator.motor import Motor
 from probewise.emulator.outputs import Outputs
 from probewise.emulator.programs import Programs
 from probewise.emulator.protocol import Refused, Request, Status, parse, reply
-from probewise.emulator.sensors import NothingAnalog
+from probewise.emulator.sensors import EmptyPort
 from probewise.errors import ParameterError
 
 ADDRESS = bytes.fromhex("0016530A0B0C")
@@ -46,9 +46,9 @@ class Brick:
     clock
         Time in seconds, for motors and timers.
     motors
-        At ports A, B, C.
+        Motors at ports A, B, C.
     sensors
-        At ports 1 to 4.
+        Sensors at ports 1 to 4.
     name
         Up to 14 characters of Latin-1.
     battery
@@ -58,12 +58,12 @@ class Brick:
     files
         Files in flash. Each of them runs as a program that echoes messages.
     watch
-        Called again and again while a motor turns.
+        Function called every 10 ms while a motor turns.
 
     Raises
     ------
     ParameterError
-        If the name or `sleep_min` is not one that a brick can have.
+        If the name or `sleep_min` is invalid.
     """
 
     def __init__(
@@ -88,9 +88,9 @@ class Brick:
         self._name = name.encode("latin-1")
         plugged = [Motor() for _ in range(3)] if motors is None else motors
         self.outputs = Outputs(plugged, now_s=self._began_s, watch=watch)
-        self.inputs = Inputs([NothingAnalog()] * 4 if sensors is None else sensors, clock)
+        self.inputs = Inputs([EmptyPort()] * 4 if sensors is None else sensors, clock)
         self._files = Files({"echo.rxe": b""} if files is None else files, capacity=_FLASH_BYTES)
-        self._programs = Programs(self._files.exists, self._release)
+        self._programs = Programs(self._files.exists, self._reset_ports)
         self._commands: Mapping[int, Callable[..., bytes]] = {
             **self.outputs.commands,
             **self.inputs.commands,
@@ -153,9 +153,9 @@ class Brick:
             zeros = bytes(request.command.error_bytes)
             return refused.status, zeros if refused.payload is None else refused.payload
 
-    def _release(self) -> None:
+    def _reset_ports(self) -> None:
         self.outputs.release()
-        self.inputs.release()
+        self.inputs.reset_ports()
 
     def _play_file(self, loop: int, name: bytes) -> bytes:
         if not self._files.exists(name.split(b"\0")[0].decode("latin-1")):

@@ -9,7 +9,7 @@ from typing import TypeAlias
 
 from probewise.emulator.clock import Clock
 from probewise.emulator.protocol import Refused, Status
-from probewise.emulator.sensors import AD_MAX, Analog, Digital, NothingAnalog
+from probewise.emulator.sensors import AD_MAX, Analog, Digital, EmptyPort
 
 Sensor: TypeAlias = Analog | Digital
 
@@ -61,8 +61,8 @@ class Inputs:
             0x10: self._bus_read,
         }
 
-    def release(self) -> None:
-        """Reset all sensor types, as the start or end of a program does."""
+    def reset_ports(self) -> None:
+        """Set every port to no sensor, as the firmware does when a program starts or ends."""
         for port in self._ports:
             self._configure(port, _NONE, _RAW)
 
@@ -98,7 +98,7 @@ class Inputs:
         if self.clock() < port.valid_s:
             return False
         if port.kind not in (_NONE, *_DIGITAL):
-            sensor = NothingAnalog() if isinstance(port.sensor, Digital) else port.sensor
+            sensor = EmptyPort() if isinstance(port.sensor, Digital) else port.sensor
             raw = sensor.counts(lit=port.kind == _LIGHT_ON)
             normalized = _normalized(raw, port.kind)
             port.boolean = _switched(normalized, port.boolean)

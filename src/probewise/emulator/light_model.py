@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from probewise.emulator.arm import Stand
+from probewise.emulator.arm import SensorPose
 from probewise.emulator.clock import Clock
 from probewise.emulator.table import Table
 from probewise.world import World
@@ -33,8 +33,8 @@ class LightModel:
         Simulates the sensor at `read_height_mm`.
     table
         The surface, and the sensor's rotation in its mount.
-    stand
-        Function that returns the sensor's present pose.
+    sensor_pose
+        Function that returns the sensor's current pose.
     read_height_mm
         Height at which the world's readings are taken.
     seed
@@ -48,33 +48,33 @@ class LightModel:
         self,
         world: World,
         table: Table,
-        stand: Callable[[], Stand],
+        sensor_pose: Callable[[], SensorPose],
         *,
         read_height_mm: float,
         seed: int,
         clock: Clock,
     ) -> None:
-        self._world, self._table, self._stand, self._clock = world, table, stand, clock
+        self._world, self._table, self._sensor_pose, self._clock = world, table, sensor_pose, clock
         self._read_height_mm, self._seed = read_height_mm, seed
         self._number, self._last = -1, (math.inf, math.inf, math.inf)
         self._rng = np.random.default_rng(seed)
 
     def __call__(self, lit: bool) -> float:
-        """Take a reading."""
-        stand = self._stand()
-        here = (stand.x_mm, stand.y_mm, stand.height_mm)
+        """Take a reading with the LED on (`lit`) or off."""
+        sensor_pose = self._sensor_pose()
+        here = (sensor_pose.x_mm, sensor_pose.y_mm, sensor_pose.height_mm)
         if math.dist(here, self._last) > _SAME_STAND_MM:
             self._number, self._last = self._number + 1, here
             self._rng = np.random.default_rng([self._seed, self._number])
         bright = self._world.read(
             self._table.surface,
-            stand.x_mm,
-            stand.y_mm,
-            stand.orientation_rad + self._table.turned_rad,
+            sensor_pose.x_mm,
+            sensor_pose.y_mm,
+            sensor_pose.orientation_rad + self._table.turned_rad,
             time_s=self._clock(),
             rng=self._rng,
         )
-        return (bright + _CUT_OFF) * (1 + lit * _led(stand.height_mm) / _led(self._read_height_mm)) / 2
+        return (bright + _CUT_OFF) * (1 + lit * _led(sensor_pose.height_mm) / _led(self._read_height_mm)) / 2
 
 
 def _led(height_mm: float) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
-class MotorNature:
+class MotorParameters:
     """Parameters of a motor under its load.
 
     Parameters
@@ -44,7 +44,7 @@ class MotorNature:
 class Motor:
     """State of a motor: angle and speed of the shaft, and angle of its load."""
 
-    nature: MotorNature = field(default_factory=MotorNature)
+    parameters: MotorParameters = field(default_factory=MotorParameters)
     angle_deg: float = 0.0
     speed_deg_s: float = 0.0
     driven_deg: float = 0.0
@@ -63,19 +63,19 @@ class Motor:
         battery_mv
             Voltage of the battery.
         """
-        nature = self.nature
+        parameters = self.parameters
         if power or brake:
-            asked = nature.full_speed_deg_s * (power / 100) * (battery_mv / nature.rated_mv)
-            speed = self.speed_deg_s + (asked - self.speed_deg_s) * seconds / nature.driven_s
+            asked = parameters.full_speed_deg_s * (power / 100) * (battery_mv / parameters.rated_mv)
+            speed = self.speed_deg_s + (asked - self.speed_deg_s) * seconds / parameters.driven_s
         else:
-            speed = self.speed_deg_s * (1 - seconds / nature.coasting_s)
+            speed = self.speed_deg_s * (1 - seconds / parameters.coasting_s)
         # Dry friction reduces the speed towards zero and never reverses it.
-        lost = nature.friction_deg_s2 * seconds
+        lost = parameters.friction_deg_s2 * seconds
         self.speed_deg_s = speed - lost if speed > lost else speed + lost if speed < -lost else 0.0
-        low, high = nature.stops_deg
+        low, high = parameters.stops_deg
         angle = self.angle_deg + self.speed_deg_s * seconds
         if not low <= angle <= high:
             angle, self.speed_deg_s = min(max(angle, low), high), 0.0
         self.angle_deg = angle
-        slack = nature.play_deg / 2
+        slack = parameters.play_deg / 2
         self.driven_deg = min(max(self.driven_deg, angle - slack), angle + slack)

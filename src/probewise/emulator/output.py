@@ -81,12 +81,12 @@ class Output:
         self.setting, self._settled = setting, False
         self._brake = bool(setting.mode & _BRAKE)
         if setting.mode & _ON:
-            self._order(setting.run_state, setting.power)
+            self._change_run_state(setting.run_state, setting.power)
             self._regulation = setting.regulation if setting.mode & _REGULATED else 0
             if self._regulation & _SPEED and not self.set_power and self.run_state != RunState.RAMP_DOWN:
                 self._error = self._error_sum = 0
         else:
-            self._order(RunState.IDLE, 0)
+            self._change_run_state(RunState.IDLE, 0)
             self._regulation = 0
         self._endless = not setting.tacho_limit
         forward = (self.set_power or self.target_power) > 0
@@ -157,12 +157,12 @@ class Output:
     def _shown_deg(self) -> int:
         """Reading of the motor's encoder: the nearest whole degree, so that home lies in the middle of count 0.
 
-        Where the edges of an encoder's counts lie is chance. With home at an edge every count would stand for half a
-        degree more than it says, on the average, and every place for the same fraction of a millimetre beside it.
+        A real encoder's count may change at any angle. If it changed at home, a count would mean an angle half a degree
+        larger on average, and every place would be off accordingly.
         """
         return math.floor(self.motor.angle_deg + 0.5)
 
-    def _order(self, run_state: int, power: int) -> None:
+    def _change_run_state(self, run_state: int, power: int) -> None:
         if run_state == self.run_state != RunState.IDLE and power == self.set_power:
             return
         if not self.target_power:
@@ -233,7 +233,7 @@ class Output:
             self.power = bounded(self.target_power, 100)
 
     def _fade(self) -> None:
-        """Coast: the power decreases by 1 per millisecond, so a host sees IDLE well before the motor rests."""
+        """Reduce the power by 1 per millisecond after a limit: a host sees IDLE well before the motor rests."""
         self._brake = False
         self.power -= _sign(self.power)
         self.target_power -= _sign(self.target_power)
@@ -248,12 +248,12 @@ class Output:
 
 
 def bounded(value: int, limit: int) -> int:
-    """Keep a value within +-limit."""
+    """Clip a value to +-limit."""
     return min(max(value, -limit), limit)
 
 
 def quotient(value: int, by: int) -> int:
-    """Divide as C does, towards 0."""
+    """Divide integers and round towards 0, as C does."""
     return value // by if value >= 0 else -(-value // by)
 
 

@@ -16,7 +16,7 @@ _WATCHED_TICKS = 10
 
 
 @dataclass
-class _Step:
+class _Synchronisation:
     """The firmware's state of a synchronised pair of motors."""
 
     lead: int = 0  # counts by which the first is ahead of the position given by the turn ratio
@@ -43,16 +43,16 @@ class Outputs:
     motors
         The motors at ports A, B, C.
     now_s
-        The clock's time.
+        Time of the clock now; the simulation starts there.
     watch
-        Called again and again while a motor turns.
+        Function called every 10 ms while a motor turns.
     """
 
     def __init__(self, motors: Sequence[Motor], *, now_s: float, watch: Callable[[], None] = lambda: None) -> None:
         self._watch = watch
         self.ports = tuple(Output(motor) for motor in motors)
         self._ticked_s = now_s
-        self._step = _Step()
+        self._synchronisation = _Synchronisation()
         self.commands: Mapping[int, Callable[..., bytes]] = {
             0x04: self._set_state,
             0x06: self._get_state,
@@ -73,7 +73,7 @@ class Outputs:
             moving = [port for port in moving if not port.is_at_rest]  # one at rest stays there without a command
 
     def release(self) -> None:
-        """Let all motors coast, as the start or end of a program does."""
+        """Let all motors coast, as the firmware does when a program starts or ends."""
         for port in self.ports:
             port.apply(OutputSetting())
 
@@ -86,7 +86,7 @@ class Outputs:
                 port.run_state = RunState.IDLE
         regulated = [port for port in moving if port.regulate()]
         if len(pair) == 2 and pair[0] in regulated:
-            self._step.correct(*pair)
+            self._synchronisation.correct(*pair)
 
     def _set_state(
         self, port: int, power: int, mode: int, regulation: int, turn_ratio: int, run_state: int, tacho_limit: int
@@ -95,7 +95,7 @@ class Outputs:
         for output in self.ports if port == _ALL else (self._port(port),):
             output.apply(setting)
             if output.is_synchronised:
-                self._step = _Step()
+                self._synchronisation = _Synchronisation()
         return b""
 
     def _get_state(self, port: int) -> bytes:

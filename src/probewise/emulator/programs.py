@@ -14,7 +14,7 @@ _SIZE = 59
 
 
 class Programs:
-    """Start and stop programs and exchange messages; every emulated program echoes each message.
+    """The brick's running program and its mailboxes; every emulated program echoes each message.
 
     Parameters
     ----------
@@ -63,16 +63,16 @@ class Programs:
         return b""
 
     def _read(self, box: int, local_box: int, remove: int) -> bytes:
-        def told(message: bytes) -> bytes:
+        def padded(message: bytes) -> bytes:
             return bytes((local_box, len(message))) + message.ljust(_SIZE, b"\0")
 
         if self.running is None:
-            raise Refused(Status.NO_PROGRAM, told(b""))
+            raise Refused(Status.NO_PROGRAM, padded(b""))
         if box >= _N_BOXES:
-            raise Refused(Status.ILLEGAL_MAILBOX, told(b""))
+            raise Refused(Status.ILLEGAL_MAILBOX, padded(b""))
         if not self._boxes[box]:
-            raise Refused(Status.MAILBOX_EMPTY, told(b""))
-        return told(self._boxes[box].popleft() if remove else self._boxes[box][0])
+            raise Refused(Status.MAILBOX_EMPTY, padded(b""))
+        return padded(self._boxes[box].popleft() if remove else self._boxes[box][0])
 
     def _name(self) -> bytes:
         return self._running_name()

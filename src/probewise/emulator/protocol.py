@@ -166,8 +166,8 @@ _PATIENCE_S = 0.61  # the firmware discards an incomplete frame after this silen
 
 
 @dataclass
-class Frames:
-    """Collect bytes in pieces of any size into whole telegrams."""
+class FrameAssembler:
+    """Assembles whole telegrams from bytes that come in pieces of any size."""
 
     _held: bytearray = field(default_factory=bytearray)
     _last_s: float = 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from probewise.emulator.brick import Brick
 from probewise.emulator.clock import Clock
 from probewise.emulator.faults import Faults
-from probewise.emulator.protocol import COMMANDS, Frames, Status, framed, parse, reply
+from probewise.emulator.protocol import COMMANDS, FrameAssembler, Status, framed, parse, reply
 
 Event: TypeAlias = Literal[">", "<", "!"]
 Trace: TypeAlias = Callable[[float, Event, str], None]
@@ -34,7 +34,7 @@ def no_trace(now_s: float, event: Event, text: str) -> None:
 
 
 class Radio:
-    """A link to a brick.
+    """A Bluetooth link to a brick, as its host sees it.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ class Radio:
     Attributes
     ----------
     faults
-        May be replaced at any time.
+        Rates of the faults; may be replaced at any time.
     mishaps
         Number of occurrences of each fault.
     """
@@ -77,7 +77,7 @@ class Radio:
 
     def reconnect(self) -> None:
         """Begin a new connection: bytes under way are lost, the brick's state is kept."""
-        self._frames = Frames()
+        self._frames = FrameAssembler()
         self._coming: deque[tuple[float, bytes]] = deque()
         self._held = b""  # a reply that waits for the next one
         self._last_s = 0.0
@@ -99,7 +99,7 @@ class Radio:
             data = data[: int(self._rng.integers(1, len(data)))]
         for telegram in self._frames.feed(data, self._clock()):
             if self.is_open:
-                self._arrived(telegram)
+                self._handle(telegram)
 
     def receive(self) -> bytes:
         """Return the bytes that have reached the host by now."""
@@ -108,7 +108,7 @@ class Radio:
             received += self._coming.popleft()[1]
         return bytes(received)
 
-    def _arrived(self, telegram: bytes) -> None:
+    def _handle(self, telegram: bytes) -> None:
         self._note(">", telegram)
         if self._occurs("deaf", self.faults.deaf):
             return

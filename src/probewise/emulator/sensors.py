@@ -20,7 +20,7 @@ class Analog(Protocol):
 
 
 @dataclass(frozen=True)
-class NothingAnalog:
+class EmptyPort:
     """An empty port: the pull-up resistor alone."""
 
     def counts(self, *, lit: bool) -> int:
@@ -29,7 +29,7 @@ class NothingAnalog:
 
 
 @dataclass
-class Light:
+class LightSensor:
     """The light sensor 9844: more light gives a lower voltage.
 
     Parameters

@@ -17,15 +17,15 @@ class Table:
     surface: Surface
     turned_rad: float = 0.0
 
-    def obey(self, wish: str) -> None:
-        """Execute a line: a scene in one of its forms, or `turn DEGREES` for the sensor.
+    def obey(self, line: str) -> None:
+        """Obey a line: a scene in one of its forms becomes the surface; `turn DEGREES` sets the rotation of the sensor.
 
         Raises
         ------
         ParameterError
             If it is neither; nothing changes then.
         """
-        verb, _, angle = wish.strip().partition(" ")
+        verb, _, angle = line.strip().partition(" ")
         try:
             if verb == "turn":
                 angle_deg = float(angle)
@@ -33,6 +33,6 @@ class Table:
                     raise ValueError(angle)
                 self.turned_rad = math.radians(angle_deg)
             else:
-                self.surface = parse_scene(wish.strip())
+                self.surface = parse_scene(line.strip())
         except ValueError as error:
-            raise ParameterError("line", wish, f"turn DEGREES; {'; '.join(FORMS)}; in mm and degrees") from error
+            raise ParameterError("line", line, f"turn DEGREES; {'; '.join(FORMS)}; in mm and degrees") from error

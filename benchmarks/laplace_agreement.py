@@ -36,7 +36,7 @@ _FIELDS = ("label", "n_gaussians", "gap", "error", "agree", "doubts")
 def weigh_case(task: Task, *, plan: str) -> dict[str, Any]:
     """Draw one case and, in the plan asked for, tell both evidences of each hypothesis that was weighed twice."""
     try:
-        case = draw_case(task.seed, task.number, surviving=NullRefit())
+        case = draw_case(task.seed, task.number, norm_after_refit=NullRefit())
     except NotConvergedError as error:  # no such effect can be so large
         return {"left_out": str(error)}
     if case.truth.plan != plan:

@@ -29,7 +29,7 @@ from probewise.world.challenge import (
     held_out_plans,
     stratum_of,
 )
-from probewise.world.challenge.candidates import CleanSetup
+from probewise.world.challenge.effect_samplers import CleanSetup
 from probewise.world.challenge.regions import Region, region_of
 from probewise.world.challenge.sensors import draw_spot
 from probewise.world.challenge.sizing import EffectSizer
@@ -244,7 +244,7 @@ def test_every_candidate_makes_effects_of_its_name(setup):
 def test_scans_can_be_drawn_that_cross_an_edge_and_their_mounting(setup):
     assert "edge_0" in setup.scans or "edge_0_out" in setup.scans
     assert not any(name.startswith(("white", "black", "quadrants")) for name in setup.scans)
-    mounting = setup.mounting_of(next(name for name in setup.scans if "90" in name))
+    mounting = setup.scans_at_orientation_of(next(name for name in setup.scans if "90" in name))
     assert all("90" in name for name in mounting)
 
 

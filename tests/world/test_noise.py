@@ -42,12 +42,12 @@ def ramp():
 
 @pytest.fixture(scope="module")
 def noise(ramp):
-    look = World(SPOT).look(ramp)
+    view = World(SPOT).view(ramp)
 
     def of(*concealed, noise_sd=0.6):
         world = World(SPOT, noise_sd=noise_sd, concealed=concealed)
-        made = world.simulate(ramp, rng=np.random.default_rng(5), look=look).readings
-        return (made - world.answer(look)) / noise_sd
+        made = world.simulate(ramp, rng=np.random.default_rng(5), view=view).readings
+        return (made - world.noise_free_readings(view)) / noise_sd
 
     return of
 

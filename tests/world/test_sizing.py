@@ -8,7 +8,7 @@ import pytest
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.world import World, gaussian_spot
 from probewise.world.challenge import EffectSizer, amplitude_of_size
-from probewise.world.challenge.candidates import CleanSetup
+from probewise.world.challenge.effect_samplers import CleanSetup
 from probewise.world.challenge.sizing import noise_size
 from probewise.world.concealed import (
     AmbientGradient,
@@ -104,9 +104,9 @@ def test_the_cosine_is_that_of_the_surviving_parts(sizer, plan):
 )
 def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, plan, sizer):
     """Second route: simulate, and take the mean of the log ratio of the two densities."""
-    look = World(SPOT).look(plan)
-    rng, n, rows = np.random.default_rng(4), len(plan), look.rows
-    z = np.stack([effect.disturb(rng.standard_normal(n), rows, look.seen, rng) for _ in range(3000)])
+    view = World(SPOT).view(plan)
+    rng, n, rows = np.random.default_rng(4), len(plan), view.rows
+    z = np.stack([effect.disturb(rng.standard_normal(n), rows, view.seen, rng) for _ in range(3000)])
 
     def log_normal(z, variance):
         return -0.5 * (np.log(2 * np.pi * variance) + z**2 / variance)
@@ -117,7 +117,7 @@ def test_the_size_of_noise_is_the_log_likelihood_that_the_truth_gains(effect, pl
         fresh = np.where(rows.starts_scan(), 1.0, 1 - effect.rho**2)
         true = log_normal(z - effect.rho * before, fresh)
     elif isinstance(effect, SignalDependentNoise):
-        true = log_normal(z, 1 + effect.ratio * look.seen)
+        true = log_normal(z, 1 + effect.ratio * view.seen)
     else:
         wide = np.exp(log_normal(z, 1 + effect.size**2))
         true = np.log((1 - effect.share) * np.exp(log_normal(z, 1.0)) + effect.share * wide)
@@ -132,4 +132,4 @@ def test_lost_readings_count_by_how_far_off_they_are(plan, sizer):
 
 def test_noise_without_a_name_has_no_size(plan):
     with pytest.raises(ParameterError, match="vocabulary"):
-        noise_size(HeavyTails(4.0), World(SPOT).look(plan), np.zeros(len(plan)), 1.0)
+        noise_size(HeavyTails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)

@@ -20,7 +20,7 @@ from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.investigation import investigate
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.challenge import Case, EffectSizer, Hidden, draw_case, stratum_of
-from probewise.world.challenge.candidates import CleanSetup
+from probewise.world.challenge.effect_samplers import CleanSetup
 from probewise.world.concealed import Disturbs, Quantisation
 
 _OWN = 1_000  # child of the case's seed sequence that drawing the case does not use

@@ -17,7 +17,7 @@ from probewise.world.painting import Covered, Oval, Surface, paint
 from probewise.world.rays import seen_white
 from probewise.world.rows import Rows
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
-from probewise.world.world import Look, World, simulate
+from probewise.world.world import View, World, simulate
 
 __all__ = [
     "AmbientGradient",
@@ -27,13 +27,13 @@ __all__ = [
     "CorrelatedNoise",
     "Covered",
     "GainDrift",
-    "Look",
     "Nonlinearity",
     "Oval",
     "Rows",
     "Saturation",
     "Spot",
     "Surface",
+    "View",
     "World",
     "gaussian_spot",
     "paint",
@@ -44,3 +44,6 @@ __all__ = [
     "simulate",
     "tailed_spot",
 ]
+
+Look = View
+"""The old name of `View`."""

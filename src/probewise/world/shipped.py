@@ -1,6 +1,6 @@
-"""Regenerate the recordings that ship with the package from their seeds; their truth.
+"""The recordings that ship with the package: their truth, and how to regenerate them from their seeds.
 
-`python -m probewise.world.shipped FOLDER` writes both into a folder, bit for bit as they ship.
+`python -m probewise.world.shipped FOLDER` writes both recordings into a folder, bit for bit as they ship.
 No diagnosis may import this module, since it holds the truth.
 """
 
@@ -65,7 +65,7 @@ def truth(name: str) -> World:
     return replace(world, concealed=(CANDIDATES[int(choice.integers(len(CANDIDATES)))],))
 
 
-def make(name: str) -> Recording:
+def regenerate(name: str) -> Recording:
     """Regenerate a shipped recording.
 
     Readings are rounded to 0.001, far below the noise, so that floating-point differences between machines vanish.
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path, help="an existing folder")
     folder: Path = parser.parse_args(arguments).folder
     for name in SHIPPED:
-        write_recording(make(name), folder / f"{name}.csv")
+        write_recording(regenerate(name), folder / f"{name}.csv")
 
 
 if __name__ == "__main__":

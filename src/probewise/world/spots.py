@@ -17,7 +17,7 @@ Density = Callable[[FloatArray, FloatArray], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """A footprint: the share of the light that each pixel contributes.
+    """A footprint: the share of the seen light that comes from each pixel.
 
     Parameters
     ----------

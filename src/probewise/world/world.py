@@ -10,15 +10,16 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_rng
+from probewise._renamed import renamed_arguments
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
 from probewise.world.concealed.stages import (
     STAGES,
     Changes,
+    ChangesFootprint,
     Concealed,
     Disturbs,
-    Glimpse,
-    Looks,
+    FootprintPart,
     Retouches,
     Stage,
 )
@@ -33,17 +34,17 @@ _Surfaces = Sequence[tuple[Surface, IntArray]]
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """The sensor's view before its response: the costly part of a simulated reading.
+class View:
+    """What the sensor sees at each reading, before its response: the costly part of a simulation.
 
     Parameters
     ----------
     seen
         Seen white fraction u, shape (n_points,).
     dimming
-        Factor on the signal at the true height, shape (n_points,).
+        Factor on the signal, from the true height, shape (n_points,).
     rows
-        True poses of the sensor.
+        Table of the readings with the sensor's true poses.
     """
 
     seen: FloatArray
@@ -132,26 +133,26 @@ class World:
             across=np.array([across_edge(surface)]),
             edge_mm=edge_distance(surface, np.array([x_mm]), np.array([y_mm])),
         )
-        look = self._look([(surface, np.zeros(1, dtype=np.int64))], rows, height_mm)
-        return float(self._with_noise(look, rng)[0])
+        view = self._view([(surface, np.zeros(1, dtype=np.int64))], rows, height_mm)
+        return float(self._with_noise(view, rng)[0])
 
-    def look(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> Look:
-        """Simulate a plan up to the seen white fraction: the part of `expected` that integrates light.
+    def view(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> View:
+        """Compute the seen white fraction of a plan: the part of `expected` that integrates light.
 
-        It does not depend on effects from the stage "response" on, so `answer` may be called on a world that differs
-        in those only.
+        It does not depend on effects from the stage "response" on: a world that differs in those only may turn the same
+        view into readings.
         """
         found = self._surfaces(plan, surfaces)
         across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
         for surface, chosen in found:
             across[chosen] = across_edge(surface)
             edge_mm[chosen] = edge_distance(surface, plan.x_mm[chosen], plan.y_mm[chosen])
-        return self._look(found, Rows.of(plan, across, edge_mm))
+        return self._view(found, Rows.of(plan, across, edge_mm))
 
-    def answer(self, look: Look) -> FloatArray:
-        """Return the noise-free readings, not rounded, shape (n_points,)."""
-        rows = look.rows
-        signal = (self.white - self.black) * self._through_changes("response", look.seen, rows) * look.dimming
+    def noise_free_readings(self, view: View) -> FloatArray:
+        """Turn a view into noise-free readings, not rounded, shape (n_points,)."""
+        rows = view.rows
+        signal = (self.white - self.black) * self._through_changes("response", view.seen, rows) * view.dimming
         reading = self.black + self._through_changes("gain", signal, rows)
         for stage in ("offset", "lag", "saturation"):
             reading = self._through_changes(stage, reading, rows)
@@ -172,15 +173,18 @@ class World:
         ParameterError
             If the plan reads over a pattern that is not described.
         """
-        return self.answer(self.look(plan, surfaces))
+        return self.noise_free_readings(self.view(plan, surfaces))
 
+    look, answer = view, noise_free_readings  # their old names
+
+    @renamed_arguments(look="view")
     def simulate(
         self,
         plan: Plan,
         *,
         rng: np.random.Generator | None,
         surfaces: Mapping[str, Surface] | None = None,
-        look: Look | None = None,
+        view: View | None = None,
     ) -> Recording:
         """Simulate the recording of a plan.
 
@@ -192,17 +196,17 @@ class World:
             Generator of the noise; None: readings without noise, but rounded.
         surfaces
             Surfaces by name of the pattern, in place of the plan's descriptions.
-        look
-            Result of `look`, if already computed.
+        view
+            Result of `view`, if already computed.
 
         Raises
         ------
         ParameterError
             If the plan reads over a pattern that is not described.
         """
-        return Recording(plan, self._with_noise(self.look(plan, surfaces) if look is None else look, rng))
+        return Recording(plan, self._with_noise(self.view(plan, surfaces) if view is None else view, rng))
 
-    def _look(self, surfaces: _Surfaces, sent: Rows, height_mm: float | None = None) -> Look:
+    def _view(self, surfaces: _Surfaces, sent: Rows, height_mm: float | None = None) -> View:
         place = self._through_changes("place", sent.place_mm, sent)
         there = replace(sent, place_mm=place, orientation_rad=self._through_changes("turn", sent.orientation_rad, sent))
         pattern = self._through_changes("pattern", np.zeros_like(place), there)
@@ -224,22 +228,22 @@ class World:
                 pattern_mm=pattern[chosen],
                 retouch=retouch,
             )
-            for glimpse in self._glimpses():
-                x_mm, y_mm = (center[chosen] + glimpse.shift_mm).T
-                seen[chosen] += glimpse.share * white(glimpse.spot, x_mm, y_mm)
+            for part in self._footprint_parts():
+                x_mm, y_mm = (center[chosen] + part.shift_mm).T
+                seen[chosen] += part.share * white(part.spot, x_mm, y_mm)
         there = replace(there, edge_mm=edge_mm)
         # Illumination by the LED falls with the inverse square of the distance.
-        return Look(self._through_changes("seen", seen, there), scale**-2.0, there)
+        return View(self._through_changes("seen", seen, there), scale**-2.0, there)
 
-    def _with_noise(self, look: Look, rng: np.random.Generator | None) -> FloatArray:
-        readings = self.answer(look)
+    def _with_noise(self, view: View, rng: np.random.Generator | None) -> FloatArray:
+        readings = self.noise_free_readings(view)
         if rng is not None:
-            noise = self._through_disturbances("noise", rng.standard_normal(len(readings)), look, rng)
+            noise = self._through_disturbances("noise", rng.standard_normal(len(readings)), view, rng)
             readings = readings + self.noise_sd * noise
-        readings = self._through_changes("quantisation", readings, look.rows)
+        readings = self._through_changes("quantisation", readings, view.rows)
         if self.step is not None:
             readings = np.round(readings / self.step) * self.step
-        return readings if rng is None else self._through_disturbances("loss", readings, look, rng)
+        return readings if rng is None else self._through_disturbances("loss", readings, view, rng)
 
     def _through_changes(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
         for effect in self.concealed:
@@ -253,19 +257,19 @@ class World:
                 albedo = effect.retouch(albedo, x_mm, y_mm)
         return albedo
 
-    def _glimpses(self) -> tuple[Glimpse, ...]:
-        glimpses: tuple[Glimpse, ...] = (Glimpse(1.0, self.spot),)
+    def _footprint_parts(self) -> tuple[FootprintPart, ...]:
+        parts: tuple[FootprintPart, ...] = (FootprintPart(1.0, self.spot),)
         for effect in self.concealed:
-            if isinstance(effect, Looks):
-                glimpses = effect.look(glimpses)
-        return glimpses
+            if isinstance(effect, ChangesFootprint):
+                parts = effect.change_footprint(parts)
+        return parts
 
     def _through_disturbances(
-        self, stage: Stage, values: FloatArray, look: Look, rng: np.random.Generator
+        self, stage: Stage, values: FloatArray, view: View, rng: np.random.Generator
     ) -> FloatArray:
         for effect in self.concealed:
             if effect.stage == stage and isinstance(effect, Disturbs):
-                values = effect.disturb(values, look.rows, look.seen, rng)
+                values = effect.disturb(values, view.rows, view.seen, rng)
         return values
 
     def _surfaces(self, plan: Plan, surfaces: Mapping[str, Surface] | None) -> _Surfaces:

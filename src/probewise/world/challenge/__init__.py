@@ -5,8 +5,8 @@ same world. The size of an effect is what a refit of the null model leaves of it
 """
 
 from probewise.world.challenge.cases import ALIASES, Case, draw_case, held_out
-from probewise.world.challenge.inside import INSIDE, NEEDS_SENSOR, NO_PHYSICS, SINGLES
-from probewise.world.challenge.outsiders import OUTSIDE
+from probewise.world.challenge.in_vocabulary import INSIDE, NEEDS_SENSOR, NO_PHYSICS, SINGLES
+from probewise.world.challenge.out_of_vocabulary import OUTSIDE
 from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
 from probewise.world.challenge.regions import Region
 from probewise.world.challenge.sensors import NOISE_LEVELS, NOISE_MODELS, NOISE_NAMES, SSFS, draw_sensor, with_noise

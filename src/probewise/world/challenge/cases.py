@@ -9,9 +9,9 @@ import numpy as np
 
 from probewise.errors import NotConvergedError
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.world.challenge.candidates import CleanSetup
-from probewise.world.challenge.inside import INSIDE, PAIRABLE, SINGLES
-from probewise.world.challenge.outsiders import OUTSIDE
+from probewise.world.challenge.effect_samplers import CleanSetup
+from probewise.world.challenge.in_vocabulary import INSIDE, PAIRABLE, SINGLES
+from probewise.world.challenge.out_of_vocabulary import OUTSIDE
 from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
 from probewise.world.challenge.regions import region_of
 from probewise.world.challenge.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise
@@ -30,8 +30,8 @@ ALIASES: tuple[tuple[str, str], ...] = (
 )
 """Pairs of effects that may be aliased in the paper's plan; either may be concealed."""
 
-_HONEST_NATS = 3.0  # below it two effects are aliased (diagnosis, section 3)
-_APART = 0.5  # upper bound on the cosine of a pair
+_ALIASED_NATS = 3.0  # below it two effects are aliased (diagnosis, section 3)
+_MOST_COSINE = 0.5  # upper bound on the cosine of a pair
 _ATTEMPTS = 6
 
 
@@ -77,20 +77,20 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     NotConvergedError
         If no effect drawn can have the requested size in this plan.
     """
-    stratum, turn = stratum_of(number)
+    stratum, n_earlier = stratum_of(number)
     drawing, laying, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
     rng = np.random.default_rng(drawing)
     ssf = "gaussian" if stratum.kind == "ssf_order" else str(rng.choice(list(SSFS)))
     level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
     sensor = draw_sensor(ssf, level, rng=rng)
     plan_names = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
-    plan_name, setup, secret = _settle(
-        stratum, turn, plan_names, sensor, norm_after_refit, rng=rng, laying=np.random.default_rng(laying)
+    plan_name, setup, chosen = _draw_until_sized(
+        stratum, n_earlier, plan_names, sensor, norm_after_refit, rng=rng, laying=np.random.default_rng(laying)
     )
-    if any(isinstance(hidden.effect, Disturbs) for hidden in secret.hidden):
+    if any(isinstance(hidden.effect, Disturbs) for hidden in chosen.hidden):
         model = "white"  # only one noise fault at a time
     plan = replace(setup.plan, instrumentation=_instrumentation_of(setup.plan, model))
-    concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in secret.hidden))
+    concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in chosen.hidden))
     world = with_noise(concealing, model, duration_s=setup.duration_s)
     truth = Truth(
         seed=seed,
@@ -103,9 +103,9 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
         noise_sd=world.noise_sd,
         black=world.black,
         white=world.white,
-        hidden=secret.hidden,
-        cosine=secret.cosine,
-        alias=secret.alias,
+        hidden=chosen.hidden,
+        cosine=chosen.cosine,
+        alias=chosen.alias,
     )
     recording = world.simulate(plan, rng=np.random.default_rng(noise))
     return Case(recording, truth, world, held_out_plans(plan, rng=np.random.default_rng(test)), test_noise)
@@ -121,7 +121,7 @@ def held_out(case: Case) -> dict[str, Recording]:
 
 
 @dataclass(frozen=True)
-class _Secret:
+class _ConcealedEffects:
     """Effects chosen for a case, with the cosine of a pair or the alias."""
 
     hidden: tuple[Hidden, ...] = ()
@@ -129,67 +129,75 @@ class _Secret:
     alias: Alias | None = None
 
 
-def _settle(
+def _draw_until_sized(
     stratum: Stratum,
-    turn: int,
+    n_earlier: int,
     plan_names: list[str],
     sensor: World,
     norm_after_refit: NormAfterRefit,
     *,
     rng: np.random.Generator,
     laying: np.random.Generator,
-) -> tuple[str, CleanSetup, _Secret]:
-    """Draw plans, and a few effects in each, until an effect can have the requested size."""
+) -> tuple[str, CleanSetup, _ConcealedEffects]:
+    """Draw plans, and the stratum's effects a few times in each, until all have the requested size.
+
+    Return the plan's name, the plan with its world, and the effects.
+    """
     failure = NotConvergedError("no plan to try")
     for plan_name in plan_names:
         setup = CleanSetup(draw_plan(plan_name, rng=laying), sensor)
         if stratum.kind == "clean":
-            return plan_name, setup, _Secret()
+            return plan_name, setup, _ConcealedEffects()
         sizer = EffectSizer(setup, norm_after_refit)
         for _ in range(_ATTEMPTS):
             try:
-                return plan_name, setup, _conceal(stratum, turn, setup, sizer, rng)
+                return plan_name, setup, _draw_effects(stratum, n_earlier, setup, sizer, rng)
             except NotConvergedError as error:
                 failure = error
     raise failure
 
 
-def _conceal(stratum: Stratum, turn: int, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator) -> _Secret:
-    """Draw the effects of a stratum once."""
+def _draw_effects(
+    stratum: Stratum, n_earlier: int, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
+) -> _ConcealedEffects:
+    """Draw the effects of a stratum once.
 
-    def one(name: str) -> Hidden:
+    Raises NotConvergedError if they cannot have the size, a pair is too similar, or an alias is none.
+    """
+
+    def of_size(name: str) -> Hidden:
         return _hidden_of_size(name, stratum.size, setup, sizer, rng)
 
     match stratum.kind:
         case "single":
-            return _Secret((one(SINGLES[turn % len(SINGLES)]),))
+            return _ConcealedEffects((of_size(SINGLES[n_earlier % len(SINGLES)]),))
         case "outside":
-            return _Secret((one(list(OUTSIDE)[turn % len(OUTSIDE)]),))
+            return _ConcealedEffects((of_size(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),))
         case "pair":
-            first, second = (one(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
+            first, second = (of_size(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
             cosine = sizer.cosine(first.effect, second.effect)
-            if abs(cosine) >= _APART:
+            if abs(cosine) >= _MOST_COSINE:
                 raise NotConvergedError(f"{first.name} and {second.name} are too similar: cosine {cosine:.2f}")
-            return _Secret((first, second), cosine=cosine)
+            return _ConcealedEffects((first, second), cosine=cosine)
         case "alias":
-            hidden, other = (one(str(name)) for name in rng.permutation(ALIASES[turn % len(ALIASES)]))
+            hidden, other = (of_size(str(name)) for name in rng.permutation(ALIASES[n_earlier % len(ALIASES)]))
             cosine = sizer.cosine(hidden.effect, other.effect)
-            if stratum.size**2 * (1 - cosine**2) / 2 >= _HONEST_NATS:
+            if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
                 raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
-            return _Secret((hidden,), alias=Alias(other.effect, cosine))
+            return _ConcealedEffects((hidden,), alias=Alias(other.effect, cosine))
         case _:
-            return _Secret((one(stratum.kind),))
+            return _ConcealedEffects((of_size(stratum.kind),))
 
 
 def _hidden_of_size(
     name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
 ) -> Hidden:
-    candidate = INSIDE.get(name) or OUTSIDE[name]
-    of_amplitude = candidate.draw(setup, rng)
-    amplitude = candidate.first
-    if candidate.sized:
+    sampler = INSIDE.get(name) or OUTSIDE[name]
+    of_amplitude = sampler.draw(setup, rng)
+    amplitude = sampler.first
+    if sampler.sized:
         amplitude = amplitude_of_size(
-            lambda a: sizer.size(of_amplitude(a)), wanted, first=candidate.first, limit=candidate.limit
+            lambda a: sizer.size(of_amplitude(a)), wanted, first=sampler.first, limit=sampler.limit
         )
     effect = of_amplitude(amplitude)
     return Hidden(effect, sizer.size(effect), region_of(effect, sizer))

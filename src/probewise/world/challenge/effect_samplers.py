@@ -38,7 +38,7 @@ class CleanSetup:
 
     @property
     def fastest_hz(self) -> float:
-        """Half the median rate of the readings."""
+        """Half the median rate of the readings: the highest frequency that they determine."""
         return 0.5 / float(np.median(np.diff(self.plan.time_s)))
 
     @cached_property
@@ -51,14 +51,15 @@ class CleanSetup:
             and not isinstance(self.plan.patterns[self.plan.pattern_names[self.plan.pattern[rows[0]]]], Uniform)
         )
 
-    def mounting_of(self, scan: str) -> tuple[str, ...]:
-        """Return the names of all scans with the orientation of this one, in order of time."""
+    def scans_at_orientation_of(self, scan: str) -> tuple[str, ...]:
+        """Return the names of all scans with the same sensor orientation as `scan`, in the order they were taken."""
         first = {name: rows[0] for name, rows in zip(self.plan.scan_names, self.plan.rows_by_scan(), strict=True)}
         turn = self.plan.orientation_rad
         return tuple(name for name, row in first.items() if turn[row] == turn[first[scan]])
 
 
 Draw: TypeAlias = Callable[[CleanSetup, np.random.Generator], OfAmplitude]
+"""Draws all parameters of an effect except its amplitude."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class EffectSampler:
     shows_in
         Covariates along which its residual is visible.
     draw
-        Draws all parameters except the amplitude.
+        Function that draws all parameters except the amplitude.
     first
         First amplitude of the search for a size.
     limit
@@ -96,13 +97,13 @@ def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
-def plain(make: OfAmplitude) -> Draw:
-    """Draw nothing: the amplitude is the only parameter."""
+def amplitude_only(make: OfAmplitude) -> Draw:
+    """Make the `Draw` of an effect whose amplitude is its only parameter: nothing is drawn."""
     return lambda setup, rng: make
 
 
-def signed(make: OfAmplitude) -> Draw:
-    """Draw the sign of the amplitude."""
+def random_sign(make: OfAmplitude) -> Draw:
+    """Make the `Draw` of an effect whose only drawn parameter is the sign of its amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s = sign(rng)

@@ -8,20 +8,20 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from probewise.world import concealed
-from probewise.world.challenge.candidates import (
+from probewise.world.challenge.effect_samplers import (
     CleanSetup,
     Draw,
     EffectSampler,
     OfAmplitude,
+    amplitude_only,
     log_uniform,
-    plain,
+    random_sign,
     sign,
-    signed,
 )
 
 
 def _sloping(make: Callable[[float, float], concealed.Concealed]) -> Draw:
-    """Draw a direction within 60 degrees of X, which every plan moves along."""
+    """Make the `Draw` of a gradient: its direction, within 60 degrees of X, which every plan moves along."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, angle = sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
@@ -68,18 +68,18 @@ def _scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitu
 
 
 def _in_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
-    """Draw one scan, or every scan of one mounting."""
+    """Make the `Draw` of an effect on one scan, or on all scans at that scan's orientation, with its sign."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, scan = sign(rng), str(rng.choice(setup.scans))
-        scans = setup.mounting_of(scan) if rng.random() < 0.5 else (scan,)
+        scans = setup.scans_at_orientation_of(scan) if rng.random() < 0.5 else (scan,)
         return lambda a: make(s * a, scans)
 
     return draw
 
 
 def _place(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Draw the place of a stain or glint, near the scans along X, and its sd."""
+    """Draw the place x, y of a stain or glint, near the scans along X, and its sd."""
     return rng.uniform(-40, 40), rng.uniform(-4, 4), log_uniform(rng, 3.0, 10.0)
 
 
@@ -114,7 +114,7 @@ def _outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 def _dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    """Draw the number of lost readings too, since a single one is obvious."""
+    """Draw the value and the share of lost readings; one is obvious already, so that their size is not chosen."""
     value, factor = float(rng.choice([0.0, 100.0])), log_uniform(rng, 0.5, 5.0)
     return lambda a: concealed.Dropouts(factor * a, value)
 
@@ -122,38 +122,38 @@ def _dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 INSIDE: Mapping[str, EffectSampler] = {
     "ambient_gradient": EffectSampler(("place",), _sloping(concealed.AmbientGradient), 0.01, 2.0),
     "ambient_step": EffectSampler(("time",), _ambient_step, 0.5, 30.0),
-    "offset_drift": EffectSampler(("time",), signed(concealed.OffsetDrift), 5.0, 500.0),
+    "offset_drift": EffectSampler(("time",), random_sign(concealed.OffsetDrift), 5.0, 500.0),
     "gain_drift": EffectSampler(("time",), _gain_drift, 0.03, 0.9),
-    "battery_sag": EffectSampler(("battery_mv",), signed(concealed.BatterySag), 0.5, 10.0),
+    "battery_sag": EffectSampler(("battery_mv",), random_sign(concealed.BatterySag), 0.5, 10.0),
     "flicker": EffectSampler(("time",), _flicker, 0.3, 20.0),
     "saturation": EffectSampler(("level",), _saturation, 0.05, 0.9),
-    "nonlinearity": EffectSampler(("level",), signed(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5),
-    "quantisation": EffectSampler(("lattice",), plain(concealed.Quantisation), 1.0, 20.0),
-    "hysteresis": EffectSampler(("direction",), signed(concealed.Hysteresis), 0.3, 20.0),
-    "lag": EffectSampler(("slope", "direction"), plain(concealed.Lag), 0.5, 20.0),
-    "backlash": EffectSampler(("slope", "direction"), plain(concealed.Backlash), 0.5, 15.0),
+    "nonlinearity": EffectSampler(("level",), random_sign(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5),
+    "quantisation": EffectSampler(("lattice",), amplitude_only(concealed.Quantisation), 1.0, 20.0),
+    "hysteresis": EffectSampler(("direction",), random_sign(concealed.Hysteresis), 0.3, 20.0),
+    "lag": EffectSampler(("slope", "direction"), amplitude_only(concealed.Lag), 0.5, 20.0),
+    "backlash": EffectSampler(("slope", "direction"), amplitude_only(concealed.Backlash), 0.5, 15.0),
     "position_scale": EffectSampler(("place",), _position_scale, 0.02, 0.4),
     "periodic_position_error": EffectSampler(("place",), _periodic, 0.3, 10.0),
-    "edge_misplacement": EffectSampler(("slope",), signed(concealed.EdgeMisplacement), 0.3, 8.0),
+    "edge_misplacement": EffectSampler(("slope",), random_sign(concealed.EdgeMisplacement), 0.3, 8.0),
     "scan_misplacement": EffectSampler(("slope", "scan"), _scan_misplacement, 0.3, 8.0),
     "scan_angle_error": EffectSampler(("scan", "orientation"), _in_scans(concealed.ScanAngleError), 5.0, 45.0),
-    "orientation_error": EffectSampler(("orientation",), signed(concealed.OrientationError), 5.0, 45.0),
+    "orientation_error": EffectSampler(("orientation",), random_sign(concealed.OrientationError), 5.0, 45.0),
     "sensor_tilt": EffectSampler(("orientation", "slope"), _sloping(concealed.SensorTilt), 0.3, 8.0),
-    "height_gradient": EffectSampler(("place",), signed(concealed.HeightGradient), 0.01, 0.12),
+    "height_gradient": EffectSampler(("place",), random_sign(concealed.HeightGradient), 0.01, 0.12),
     "height_offset": EffectSampler(("scan",), _in_scans(concealed.HeightOffset), 0.3, 8.0),
     "albedo_gradient": EffectSampler(("place",), _sloping(concealed.AlbedoGradient), 5e-4, 0.012),
     "albedo_patch": EffectSampler(("place",), _albedo_patch, 0.05, 1.0),
-    "edge_blur": EffectSampler(("edge_distance",), plain(concealed.EdgeBlur), 1.0, 8.0),
+    "edge_blur": EffectSampler(("edge_distance",), amplitude_only(concealed.EdgeBlur), 1.0, 8.0),
     "edge_shadow": EffectSampler(("edge_distance",), _edge_shadow, 0.02, 0.6),
     "halo": EffectSampler(("edge_distance",), _halo, 0.05, 0.6),
     "glint": EffectSampler(("place",), _glint, 1.0, 40.0),
     "ssf_order": EffectSampler(("edge_distance",), _ssf_order, 0.05, 0.5),
-    "signal_dependent_noise": EffectSampler(("level",), plain(concealed.SignalDependentNoise), 1.0, 100.0),
-    "correlated_noise": EffectSampler(("scan",), plain(concealed.CorrelatedNoise), 0.3, 0.95),
+    "signal_dependent_noise": EffectSampler(("level",), amplitude_only(concealed.SignalDependentNoise), 1.0, 100.0),
+    "correlated_noise": EffectSampler(("scan",), amplitude_only(concealed.CorrelatedNoise), 0.3, 0.95),
     "outliers": EffectSampler((), _outliers, 5.0, 30.0),
     "dropouts": EffectSampler((), _dropouts, 0.01, 0.01, sized=False),
 }
-"""In the order of the diagnosis page, section 2."""
+"""Samplers of the vocabulary's effects by name, in the order of the diagnosis page, section 2."""
 
 NEEDS_SENSOR = frozenset({"orientation_error", "edge_blur"})
 """Effects that an SSF fitted to the same recording absorbs."""

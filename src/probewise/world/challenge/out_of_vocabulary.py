@@ -8,14 +8,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from probewise.world import concealed
-from probewise.world.challenge.candidates import (
+from probewise.world.challenge.effect_samplers import (
     CleanSetup,
     EffectSampler,
     OfAmplitude,
+    amplitude_only,
     log_uniform,
-    plain,
+    random_sign,
     sign,
-    signed,
 )
 
 
@@ -63,16 +63,16 @@ def _chirp(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 OUTSIDE: Mapping[str, EffectSampler] = {
-    "bent_rail": EffectSampler(("place",), signed(concealed.BentRail), 0.5, 20.0),
-    "twisted_rail": EffectSampler(("place",), signed(concealed.TwistedRail), 0.5, 20.0),
+    "bent_rail": EffectSampler(("place",), random_sign(concealed.BentRail), 0.5, 20.0),
+    "twisted_rail": EffectSampler(("place",), random_sign(concealed.TwistedRail), 0.5, 20.0),
     "place_step": EffectSampler(("place",), _place_step, 0.5, 10.0),
     "stick_slip": EffectSampler(("place",), _stick_slip, 0.5, 8.0),
     "slipped_paper": EffectSampler(("time",), _slipped_paper, 0.5, 10.0),
     "ghost": EffectSampler(("edge_distance",), _ghost, 0.03, 0.5),
     "thermal_gain": EffectSampler(("time",), _thermal_gain, 0.02, 0.5),
     "cross_talk": EffectSampler(("orientation",), _cross_talk, 0.03, 0.9),
-    "floor": EffectSampler(("level",), plain(concealed.DeadZone), 0.03, 0.6),
-    "peak_memory": EffectSampler(("level",), plain(concealed.PeakMemory), 0.05, 2.0),
+    "floor": EffectSampler(("level",), amplitude_only(concealed.DeadZone), 0.03, 0.6),
+    "peak_memory": EffectSampler(("level",), amplitude_only(concealed.PeakMemory), 0.05, 2.0),
     "after_glow": EffectSampler(("time",), _after_glow, 1.0, 40.0),
     "chirp": EffectSampler(("time",), _chirp, 0.3, 20.0),
 }

@@ -29,9 +29,9 @@ class _Scan:
 
 
 def draw_plan(name: str, *, rng: np.random.Generator) -> Plan:
-    """Displace and turn a plan's patterns at random (the plan says so), and give its readings times as an arm does."""
+    """Displace and turn a plan's patterns at random, as the plan then says, and give its readings an arm's times."""
     plan = PLANS[name]()
-    patterns = {key: _off_grid(pattern, rng) for key, pattern in plan.patterns.items()}
+    patterns = {key: _displaced(pattern, rng) for key, pattern in plan.patterns.items()}
     return jittered(replace(plan, patterns=patterns), rng=rng)
 
 
@@ -44,7 +44,7 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     """
     one_way = not (plan.direction[:, 0] < 0).any()
     line = np.stack([np.linspace(-50, 50, 101), np.zeros(101)], axis=-1)
-    boundary = _off_grid(HalfPlane(0.0, 0.0), rng)
+    boundary = _displaced(HalfPlane(0.0, 0.0), rng)
     angle = math.radians(rng.choice([0, 90, 180, 270]) + rng.uniform(25, 65))
     beside = [0.0, float(rng.uniform(4, 9))]
     if any(isinstance(pattern, Disc) for pattern in plan.patterns.values()):
@@ -53,7 +53,7 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
         )
         pattern: Pattern = Polygon(corners)
     else:
-        pattern = _off_grid(Disc((0.0, 0.0), 30.0), rng)
+        pattern = _displaced(Disc((0.0, 0.0), 30.0), rng)
     slant = math.radians(rng.uniform(30, 60))
     other = (
         _Scan("test_direction", boundary, line[::-1], 0.0)
@@ -74,7 +74,7 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     return plans
 
 
-def _off_grid(pattern: Pattern, rng: np.random.Generator) -> Pattern:
+def _displaced(pattern: Pattern, rng: np.random.Generator) -> Pattern:
     """Move a pattern by up to half a millimetre each way and turn a boundary by up to two degrees."""
     dx, dy, turn = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), math.radians(rng.uniform(-2, 2))
     match pattern:

@@ -36,8 +36,8 @@ class Region:
 def region_of(effect: Concealed, sizer: EffectSizer) -> Region | None:
     """Return the region of a local effect, or None for a global one.
 
-    For effects about a place or an edge, the region is where the effect has at least half its maximum, in scans along
-    X.
+    Of a step in time: the rest of the recording; of a saturation: the levels above it; of an edge shadow or an effect
+    about a place: the distances, or the range of X in scans along X, where it is at least half its maximum.
     """
     plan, clean = sizer.clean.plan, sizer.clean.readings
     match effect:

@@ -15,10 +15,10 @@ from scipy.stats import norm
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.recordings.plan import Recording
-from probewise.world.challenge.candidates import CleanSetup
+from probewise.world.challenge.effect_samplers import CleanSetup
 from probewise.world.concealed import Concealed, CorrelatedNoise, Disturbs, Dropouts, Outliers, SignalDependentNoise
-from probewise.world.concealed.stages import ANSWERING
-from probewise.world.world import Look
+from probewise.world.concealed.stages import AFTER_VIEW
+from probewise.world.world import View
 
 NormAfterRefit: TypeAlias = Callable[[Recording, Recording], float]
 """Norm of an effect after a refit of the null model: noise-free readings (without, with effect) to reading units.
@@ -98,7 +98,7 @@ def amplitude_of_size(
 
 @dataclass(frozen=True, eq=False)
 class EffectSizer:
-    """Computes the sizes of effects for one plan and sensor.
+    """Sizes lambda of effects in one plan and with one sensor, and the cosine of two.
 
     Parameters
     ----------
@@ -112,24 +112,24 @@ class EffectSizer:
     norm_after_refit: NormAfterRefit
 
     @cached_property
-    def _look(self) -> Look:
-        return self.setup.world.look(self.setup.plan)
+    def _view(self) -> View:
+        return self.setup.world.view(self.setup.plan)
 
     @cached_property
     def clean(self) -> Recording:
-        """Noise-free readings without any effect."""
-        return self.setup.world.simulate(self.setup.plan, rng=None, look=self._look).unlimited()
+        """Recording of noise-free readings without any effect."""
+        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._view).unlimited()
 
     def recording(self, *concealed: Concealed) -> Recording:
-        """Return the noise-free readings with these effects."""
-        late = all(effect.stage in ANSWERING for effect in concealed)
+        """Return a recording of the noise-free readings with these effects."""
+        same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
         world = replace(self.setup.world, concealed=concealed)
-        return world.simulate(self.setup.plan, rng=None, look=self._look if late else None).unlimited()
+        return world.simulate(self.setup.plan, rng=None, view=self._view if same_view else None).unlimited()
 
     def size(self, *concealed: Concealed) -> float:
         """Return lambda of the effects together, in sds of the noise's Gaussian core."""
         if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
-            return noise_size(concealed[0], self._look, self.clean.readings, self.setup.world.noise_sd)
+            return noise_size(concealed[0], self._view, self.clean.readings, self.setup.world.noise_sd)
         return self.norm_after_refit(self.clean, self.recording(*concealed)) / self.setup.world.noise_sd
 
     def cosine(self, one: Concealed, other: Concealed) -> float:
@@ -138,7 +138,7 @@ class EffectSizer:
         return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
 
 
-def noise_size(effect: Disturbs, look: Look, readings: FloatArray, noise_sd: float) -> float:
+def noise_size(effect: Disturbs, view: View, readings: FloatArray, noise_sd: float) -> float:
     """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
 
     lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant
@@ -148,7 +148,7 @@ def noise_size(effect: Disturbs, look: Look, readings: FloatArray, noise_sd: flo
     ----------
     effect
         A noise effect of the vocabulary.
-    look, readings
+    view, readings
         View of the sensor, and the noise-free readings, shape (n_points,).
     noise_sd
         Sd of the noise's Gaussian core.
@@ -158,13 +158,13 @@ def noise_size(effect: Disturbs, look: Look, readings: FloatArray, noise_sd: flo
     ParameterError
         If the effect is not a noise effect of the vocabulary.
     """
-    n_points = len(look.seen)
+    n_points = len(view.seen)
     match effect:
         case CorrelatedNoise():
-            remembering = n_points - int(look.rows.starts_scan().sum())
-            return math.sqrt(-remembering * math.log(1 - effect.rho**2))
+            n_correlated = n_points - int(view.rows.starts_scan().sum())
+            return math.sqrt(-n_correlated * math.log(1 - effect.rho**2))
         case SignalDependentNoise():
-            variance = 1 + effect.ratio * look.seen
+            variance = 1 + effect.ratio * view.seen
             return math.sqrt(n_points * (math.log(variance.mean()) - float(np.log(variance).mean())))
         case Outliers():
             return math.sqrt(2 * n_points * _outlier_divergence(effect.share, effect.size))

@@ -33,14 +33,17 @@ WHEEL: tuple[Stratum, ...] = (
     Stratum("alias", 12.0),
     Stratum("ssf_order", 12.0),
 )
-"""A hundred cycles are 6,000 cases: 2,000 clean, 1,200 single at lambda 8, 500 at 20, 300 pairs, 500 outside."""
+"""The cycle of 60 cases. A hundred cycles have 2,500 clean cases (500 of them with other noise), 2,500 of one effect
+(1,300 at lambda 8, of these 100 with other noise; 500 at 20), 300 pairs, 500 outside the vocabulary, 100 aliases and 100
+with one more Gaussian.
+"""
 
 _STRIDE = 23  # coprime to the length of the cycle, so that successive cases differ in kind
 
 
 def stratum_of(number: int) -> tuple[Stratum, int]:
     """Return the stratum of a case and the number of earlier cases of that stratum."""
-    turn, slot = divmod(number, len(WHEEL))
+    cycle, slot = divmod(number, len(WHEEL))
     order = [WHEEL[k * _STRIDE % len(WHEEL)] for k in range(len(WHEEL))]
     stratum = order[slot]
-    return stratum, turn * order.count(stratum) + order[:slot].count(stratum)
+    return stratum, cycle * order.count(stratum) + order[:slot].count(stratum)

@@ -6,8 +6,8 @@ import dataclasses
 import json
 from dataclasses import dataclass
 
-from probewise.world.challenge.inside import INSIDE, NO_PHYSICS
-from probewise.world.challenge.outsiders import OUTSIDE
+from probewise.world.challenge.in_vocabulary import INSIDE, NO_PHYSICS
+from probewise.world.challenge.out_of_vocabulary import OUTSIDE
 from probewise.world.challenge.regions import Region
 from probewise.world.challenge.sensors import NOISE_NAMES
 from probewise.world.challenge.strata import Stratum
@@ -101,7 +101,7 @@ class Truth:
     def combination(self) -> tuple[str, ...]:
         """Answer of a perfect diagnosis: sorted names; () if clean; ("unknown",) outside the vocabulary.
 
-        The name of the noise model is among them.
+        A noise model that the vocabulary has is named among the effects.
         """
         if any(not hidden.in_vocabulary for hidden in self.hidden):
             return ("unknown",)

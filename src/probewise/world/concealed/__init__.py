@@ -38,7 +38,7 @@ from probewise.world.concealed.offsets import (
     Hysteresis,
     OffsetDrift,
 )
-from probewise.world.concealed.outside import (
+from probewise.world.concealed.out_of_vocabulary import (
     AfterGlow,
     BentRail,
     Chirp,
@@ -55,10 +55,10 @@ from probewise.world.concealed.outside import (
 from probewise.world.concealed.stages import (
     STAGES,
     Changes,
+    ChangesFootprint,
     Concealed,
     Disturbs,
-    Glimpse,
-    Looks,
+    FootprintPart,
     Retouches,
     Stage,
 )
@@ -75,6 +75,7 @@ __all__ = [
     "BatterySag",
     "BentRail",
     "Changes",
+    "ChangesFootprint",
     "Chirp",
     "Concealed",
     "CorrelatedNoise",
@@ -87,9 +88,9 @@ __all__ = [
     "EdgeMisplacement",
     "EdgeShadow",
     "Flicker",
+    "FootprintPart",
     "GainDrift",
     "Ghost",
-    "Glimpse",
     "Glint",
     "Halo",
     "HeavyTails",
@@ -97,7 +98,6 @@ __all__ = [
     "HeightOffset",
     "Hysteresis",
     "Lag",
-    "Looks",
     "Nonlinearity",
     "OffsetDrift",
     "OrientationError",
@@ -120,3 +120,9 @@ __all__ = [
     "ThermalGain",
     "TwistedRail",
 ]
+
+Glimpse = FootprintPart
+"""The old name of `FootprintPart`."""
+
+Looks = ChangesFootprint
+"""The old name of `ChangesFootprint`."""

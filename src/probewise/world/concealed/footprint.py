@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.concealed.stages import Glimpse, Stage
+from probewise.world.concealed.stages import FootprintPart, Stage
 from probewise.world.rows import Rows
 from probewise.world.spots import Blob, blurred, gaussian_spot
 
@@ -60,8 +60,8 @@ class EdgeBlur:
     stage: ClassVar[Stage] = "footprint"
     sd_mm: float
 
-    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        return tuple(replace(g, spot=blurred(g.spot, self.sd_mm)) for g in glimpses)
+    def change_footprint(self, parts: Sequence[FootprintPart]) -> tuple[FootprintPart, ...]:
+        return tuple(replace(g, spot=blurred(g.spot, self.sd_mm)) for g in parts)
 
 
 @dataclass(frozen=True)
@@ -73,12 +73,12 @@ class Halo:
     share: float
     r_mm: float
 
-    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        middle = np.sum([g.share * g.spot.moments()[0] for g in glimpses], axis=0)
+    def change_footprint(self, parts: Sequence[FootprintPart]) -> tuple[FootprintPart, ...]:
+        middle = np.sum([g.share * g.spot.moments()[0] for g in parts], axis=0)
         blob = Blob(1.0, (float(middle[0]), float(middle[1])), (self.r_mm, self.r_mm))
         # Rays resolve edges within pixels; the wide Gaussian is nearly linear over a third of its sd.
         skirt = gaussian_spot([blob], pixel_mm=self.r_mm / 3)
-        return (*(replace(g, share=g.share * (1 - self.share)) for g in glimpses), Glimpse(self.share, skirt))
+        return (*(replace(g, share=g.share * (1 - self.share)) for g in parts), FootprintPart(self.share, skirt))
 
 
 @dataclass(frozen=True)
@@ -92,10 +92,10 @@ class SSFOrder:
     v_mm: float
     sd_mm: float
 
-    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
+    def change_footprint(self, parts: Sequence[FootprintPart]) -> tuple[FootprintPart, ...]:
         blob = Blob(1.0, (self.u_mm, self.v_mm), (self.sd_mm, self.sd_mm))
-        more = gaussian_spot([blob], pixel_mm=glimpses[0].spot.pixel_mm)
-        return (*(replace(g, share=g.share * (1 - self.share)) for g in glimpses), Glimpse(self.share, more))
+        more = gaussian_spot([blob], pixel_mm=parts[0].spot.pixel_mm)
+        return (*(replace(g, share=g.share * (1 - self.share)) for g in parts), FootprintPart(self.share, more))
 
 
 @dataclass(frozen=True)

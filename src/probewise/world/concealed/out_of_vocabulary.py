@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.concealed.stages import Glimpse, Stage
+from probewise.world.concealed.stages import FootprintPart, Stage
 from probewise.world.rows import Rows
 
 
@@ -89,11 +89,11 @@ class Ghost:
     dx_mm: float
     dy_mm: float
 
-    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        first = (replace(g, share=g.share * (1 - self.share)) for g in glimpses)
+    def change_footprint(self, parts: Sequence[FootprintPart]) -> tuple[FootprintPart, ...]:
+        first = (replace(g, share=g.share * (1 - self.share)) for g in parts)
         second = (
             replace(g, share=g.share * self.share, shift_mm=(g.shift_mm[0] + self.dx_mm, g.shift_mm[1] + self.dy_mm))
-            for g in glimpses
+            for g in parts
         )
         return (*first, *second)
 

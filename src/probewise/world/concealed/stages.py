@@ -33,12 +33,12 @@ Stage: TypeAlias = Literal[
 STAGES: tuple[Stage, ...] = get_args(Stage)
 """In order: pose, scene, footprint, u, response, gain, offsets, lag, saturation, noise, rounding."""
 
-ANSWERING = STAGES[STAGES.index("response") :]
-"""The stages that come after the light is summed (World.look)."""
+AFTER_VIEW = STAGES[STAGES.index("response") :]
+"""The stages after `World.view`, in which the light is summed."""
 
 
 @dataclass(frozen=True, eq=False)
-class Glimpse:
+class FootprintPart:
     """One component of the footprint: a share of the light through a spot; `shift_mm` displaces it in the lab frame."""
 
     share: float
@@ -61,7 +61,7 @@ class Changes(Protocol):
     stage: ClassVar[Stage]
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Apply the effect."""
+        """Return the quantity with the effect on it."""
         ...
 
 
@@ -78,14 +78,14 @@ class Retouches(Protocol):
 
 
 @runtime_checkable
-class Looks(Protocol):
+class ChangesFootprint(Protocol):
     """An effect that changes the footprint, at the stage "footprint"."""
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
 
-    def look(self, glimpses: Sequence[Glimpse]) -> tuple[Glimpse, ...]:
-        """Return the new components of the footprint; shares sum to one."""
+    def change_footprint(self, parts: Sequence[FootprintPart]) -> tuple[FootprintPart, ...]:
+        """Return the changed components of the footprint; their shares sum to one."""
         ...
 
 
@@ -93,16 +93,16 @@ class Looks(Protocol):
 class Disturbs(Protocol):
     """An effect that changes the noise or loses readings.
 
-    By stage: "noise", independent standard normal draws, to become the noise in units of its sd; "loss", the finished
-    readings; shape (n_points,).
+    At the stage "noise", `values` are independent standard normal draws and become the noise in units of its sd; at
+    "loss" they are the finished readings. Shape (n_points,).
     """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
 
     def disturb(self, values: FloatArray, rows: Rows, seen: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Apply the effect; `seen` is the seen white fraction, (n_points,)."""
+        """Return the draws or readings with the effect on them; `seen` is the seen white fraction, (n_points,)."""
         ...
 
 
-Concealed: TypeAlias = Changes | Retouches | Looks | Disturbs
+Concealed: TypeAlias = Changes | Retouches | ChangesFootprint | Disturbs

@@ -112,7 +112,7 @@ class Drawn:
         return readings
 
     def size(self, effects: Sequence[Placed]) -> float:
-        """Return lambda: the norm that a full refit of the nominal model leaves, in sds."""
+        """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
         return math.sqrt(self.nominal.fit(self.changed(effects), self.at).squares)
 
 

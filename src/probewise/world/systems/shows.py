@@ -54,7 +54,7 @@ def _binned(values: FloatArray) -> FloatArray:
 
 
 def _share(left: FloatArray, groups: FloatArray | IntArray) -> float:
-    """Return the share of the sum of squares that group means explain, minus the share expected from noise."""
+    """Return the share of the residuals' sum of squares that group means explain, less that of noise: n_groups / n."""
     total, explained, n_groups = float(left @ left), 0.0, 0
     for group in np.unique(groups):
         own = left[groups == group]

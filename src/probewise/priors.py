@@ -49,7 +49,7 @@ class Prior(Protocol):
         ...
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Natural log of the density, shape (n_samples,); -inf outside the support."""
+        """Return the natural log of the density, shape (n_samples,); -inf outside the support."""
         ...
 
 
@@ -76,15 +76,15 @@ class Marginal(Protocol):
     """A distribution of one parameter."""
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape."""
+        """Evaluate the quantile function, any shape."""
         ...
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Cumulative distribution function, any shape: the inverse of `from_unit`."""
+        """Evaluate the cumulative distribution function, any shape: the inverse of `from_unit`."""
         ...
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Natural log of the density, any shape."""
+        """Return the natural log of the density, any shape."""
         ...
 
 
@@ -102,15 +102,15 @@ class Uniform:
             raise ParameterError("Uniform(low, high)", (self.low, self.high), "finite, low < high")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape: `u` in 0..1 -> low..high."""
+        """Evaluate the quantile function, any shape: `u` in 0..1 -> low..high."""
         return self.low + (self.high - self.low) * u
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Cumulative distribution function, any shape: low..high -> 0..1."""
+        """Evaluate the cumulative distribution function, any shape: low..high -> 0..1."""
         return np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Natural log of the density, any shape; -inf outside the bounds."""
+        """Return the natural log of the density, any shape; -inf outside the bounds."""
         inside = (value >= self.low) & (value <= self.high)
         return np.where(inside, -math.log(self.high - self.low), -np.inf)
 
@@ -132,16 +132,16 @@ class LogUniform:
             raise ParameterError("LogUniform(low, high)", (self.low, self.high), "0 < low < high, finite")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape: equal steps of `u` are equal ratios."""
+        """Evaluate the quantile function, any shape: equal steps of `u` are equal ratios."""
         return np.asarray(self.low * (self.high / self.low) ** u)
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Cumulative distribution function, any shape."""
+        """Evaluate the cumulative distribution function, any shape."""
         within = np.clip(value, self.low, self.high)
         return np.asarray(np.log(within / self.low) / math.log(self.high / self.low))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Natural log of the density, any shape; -inf outside the bounds."""
+        """Return the natural log of the density, any shape; -inf outside the bounds."""
         inside = (value >= self.low) & (value <= self.high)
         safe = np.where(inside, value, self.low)
         return np.where(inside, -np.log(safe) - math.log(math.log(self.high / self.low)), -np.inf)
@@ -164,15 +164,15 @@ class Normal:
             raise ParameterError("Normal(mean, sd)", (self.mean, self.sd), "finite, sd > 0")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape; 0 and 1 map to the infinities."""
+        """Evaluate the quantile function, any shape; 0 and 1 map to the infinities."""
         return self.mean + self.sd * np.asarray(ndtri(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Cumulative distribution function, any shape."""
+        """Evaluate the cumulative distribution function, any shape."""
         return np.asarray(ndtr((value - self.mean) / self.sd))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Natural log of the density, any shape."""
+        """Return the natural log of the density, any shape."""
         z = (value - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - math.log(self.sd * math.sqrt(2 * math.pi)))
 
@@ -182,7 +182,7 @@ class Normal:
 
 @dataclass(frozen=True)
 class LogNormal:
-    """Distribution of a positive number whose logarithm is normal: its median, and the sd of the logarithm."""
+    """Distribution of a positive number whose logarithm is normal, by its median and the sd of the logarithm."""
 
     median: float
     log_sd: float
@@ -194,16 +194,16 @@ class LogNormal:
             raise ParameterError("LogNormal(median, log_sd)", (self.median, self.log_sd), "greater than 0, finite")
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape."""
+        """Evaluate the quantile function, any shape."""
         return np.asarray(self.median * np.exp(self.log_sd * ndtri(u)))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Cumulative distribution function, any shape."""
+        """Evaluate the cumulative distribution function, any shape."""
         with np.errstate(divide="ignore"):
             return np.asarray(ndtr(np.log(np.maximum(value, 0.0) / self.median) / self.log_sd))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Natural log of the density, any shape; -inf at and below zero."""
+        """Return the natural log of the density, any shape; -inf at and below zero."""
         safe = np.where(value > 0, value, self.median)
         z = np.log(safe / self.median) / self.log_sd
         density = -0.5 * z * z - np.log(safe * self.log_sd * math.sqrt(2 * math.pi))
@@ -243,7 +243,7 @@ class Product:
         return np.stack([m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Sum of the marginals' log densities, (n_samples, n_params) -> (n_samples,)."""
+        """Return the sum of the marginals' log densities, (n_samples, n_params) -> (n_samples,)."""
         theta = _columns(theta, self.names)
         total = np.zeros(len(theta))
         for i, marginal in enumerate(self.marginals.values()):
@@ -280,7 +280,7 @@ class Joint:
         return np.concatenate([p.to_unit_cube(c) for p, c in self._split(theta)], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""
+        """Return the sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""
         theta = _columns(theta, self.names)
         total = np.zeros(len(theta))
         for part, columns in self._split(theta):
@@ -310,7 +310,7 @@ class Empty:
         return theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Zero for each sample: the only hypothesis has probability 1."""
+        """Return zero for each sample: the only hypothesis has probability 1."""
         return np.zeros(len(theta))
 
 

@@ -134,7 +134,7 @@ def test_the_pooled_sigma_predicts_what_integrating_over_it_gives() -> None:
     assert pooled.log_density(new, np.zeros((1, 2)))[0] == pytest.approx(by_hand, abs=1e-4)
     joint = math.log(weight @ (norm.pdf(new[0], 0, sigma) * norm.pdf(new[1], 0, sigma)))
     assert pooled.log_prob(new, np.zeros((1, 2)))[0] == pytest.approx(joint, abs=1e-4)
-    assert pooled.sd()[0] == pytest.approx(math.sqrt(weight @ sigma**2), rel=1e-4)
+    assert pooled.noise_sd()[0] == pytest.approx(math.sqrt(weight @ sigma**2), rel=1e-4)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
@@ -143,7 +143,7 @@ def test_the_pooled_sigma_of_few_readings_has_an_sd(n: int) -> None:
     weight = sigma ** (-float(n)) * np.exp(-0.5 * 0.4 / sigma**2) if n else np.ones_like(sigma)
     square = np.array([0.4 if n else 0.0])
     expected = math.sqrt((weight @ sigma**2) / weight.sum())
-    assert PooledSigma(square, n, 0.1, 10.0).sd()[0] == pytest.approx(expected, rel=1e-3)
+    assert PooledSigma(square, n, 0.1, 10.0).noise_sd()[0] == pytest.approx(expected, rel=1e-3)
 
 
 def test_gaussian_likelihoods_add_up_normal_densities() -> None:

@@ -288,7 +288,7 @@ class Geometry:
         return places[self.holds(places)]
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
-        """Forward kinematics: joint angles (n, 3) to place and height of the sensor's face in the lab frame, (n, 3)."""
+        """Solve the forward kinematics: joint angles to place and height of the sensor's face, lab frame; both (n, 3)."""
         return forward_kinematics_mm(
             angles_rad,
             self.links_mm,
@@ -307,7 +307,7 @@ class Geometry:
         return np.stack([np.zeros_like(both), both, lower_rise], axis=-1)
 
     def angles_rad(self, places_mm: FloatArray, height_mm: float) -> FloatArray:
-        """Inverse kinematics, elbow up.
+        """Solve the inverse kinematics, elbow up.
 
         Parameters
         ----------
@@ -376,7 +376,7 @@ class Geometry:
         return np.asarray(np.all(roomy, axis=0))
 
     def _ring_mm(self) -> tuple[float, float]:
-        """Smallest and largest distance from the axis, in whole mm, with room for the motors; NaN if there is none."""
+        """Return the least and greatest distance from the axis, in whole mm, with room for the motors; NaN: no room."""
         middle = (self.base.low_rad + self.base.high_rad) / 2
         away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
@@ -393,7 +393,7 @@ def forward_kinematics_mm(
     *,
     elbow_is_relative: bool,
 ) -> FloatArray:
-    """Forward kinematics for given lengths: joint angles (n, 3) to place and height in the lab frame, (n, 3)."""
+    """Compute place and height of the sensor in the lab frame from joint angles, both (n, 3), for given lengths."""
     base, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
     lower = shoulder + elbow if elbow_is_relative else elbow
     away = shoulder_mm[0] + links_mm[0] * np.cos(shoulder) + links_mm[1] * np.cos(lower) + sensor_mm[0]

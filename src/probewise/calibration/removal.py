@@ -103,7 +103,7 @@ class Removal:
         change = span * (one - others)
         parts = [off * off, off * change, change * change]
         shapes = [(*part.shape[:-1], -1) for part in parts]
-        sums = [self._likelihood.sums(part.reshape(-1, part.shape[-1])) for part in parts]
+        sums = [self._likelihood.sums_by_group(part.reshape(-1, part.shape[-1])) for part in parts]
         square, both, own = (part.reshape(shape) for part, shape in zip(sums, shapes, strict=True))
         return np.broadcast_to(square, own.shape), both, own
 

@@ -104,11 +104,11 @@ class GradedRegion:
         return max(self.region.n_regions, len(self.per_mm))
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         return self.region.albedo(points_mm) * self._brightness_factor(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over pixels, with the gradient's value at their centres: (n_regions, n_points)."""
+        """Return the mean albedo over pixels, with the gradient's value at their centres: (n_regions, n_points)."""
         return self.region.coverage(centers_mm, pixel_mm, turn_rad) * self._brightness_factor(centers_mm)
 
     def _brightness_factor(self, points_mm: FloatArray) -> FloatArray:
@@ -145,11 +145,11 @@ class PatchedRegion:
         return max(self.region.n_regions, len(self.patch))
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         return self.region.albedo(points_mm) + self._added_albedo(points_mm)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over pixels, with the patch's value at their centres: (n_regions, n_points)."""
+        """Return the mean albedo over pixels, with the patch's value at their centres: (n_regions, n_points)."""
         return self.region.coverage(centers_mm, pixel_mm, turn_rad) + self._added_albedo(centers_mm)
 
     def _added_albedo(self, points_mm: FloatArray) -> FloatArray:

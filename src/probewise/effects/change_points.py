@@ -49,7 +49,7 @@ class ChangePointEffect(NamedEffect[V]):
         return Product({**sizes, "at_s": Uniform(*self.open_s)})
 
     def bank(self) -> FloatArray:
-        """One entry with a column for each amplitude, its time in the middle of the open interval."""
+        """Return one entry with a column for each amplitude, its time in the middle of the open interval."""
         sizes = np.diag(list(self.sizes.values()))
         return np.column_stack([sizes, np.full(len(sizes), sum(self.open_s) / 2)])[None, :, :]
 
@@ -64,7 +64,7 @@ class ChangePointEffect(NamedEffect[V]):
         return np.asarray(plan.time_s > theta[:, -1:])
 
     def variants(self) -> tuple[Self, ...]:
-        """One variant for each pair of consecutive readings."""
+        """Return one variant for each pair of consecutive readings."""
         return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
 
     def coarse(self) -> Self:
@@ -73,7 +73,7 @@ class ChangePointEffect(NamedEffect[V]):
         return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
 
     def gates(self, plan: Plan) -> Gates:
-        """Mask of the readings after each candidate change point, taken at the middle of its interval."""
+        """Return the mask of the readings after each candidate change point, taken at the middle of its interval."""
         always = self.bank()[0]
         always[:, -1] = -np.inf
         middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]

@@ -11,13 +11,13 @@ from probewise._arrays import FloatArray
 
 
 def log_gaussian_density(readings: FloatArray, mean: FloatArray, sd: FloatArray) -> FloatArray:
-    """Natural log of the normal density, per unit of the reading; the arrays broadcast."""
+    """Return the natural log of the normal density, per unit of the reading; the arrays broadcast."""
     z = (readings - mean) / sd
     return np.asarray(-0.5 * z * z - np.log(sd) - 0.5 * math.log(2 * math.pi))
 
 
 def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float | FloatArray) -> FloatArray:
-    """Natural log of the Gaussian mass within half a step of each reading, divided by the step.
+    """Return the natural log of the Gaussian mass within half a step of each reading, divided by the step.
 
     The two tail masses are subtracted in logs, so the result stays finite however far the reading
     lies from the mean.

@@ -96,6 +96,6 @@ class BatterySag(LinearEffect[FloatArray]):
 
 
 def _volts_above_reference(plan: Plan) -> FloatArray:
-    """Battery voltage minus V0, 0 where it is not recorded, (n_points,)."""
+    """Return the battery voltage minus V0, 0 where it is not recorded, (n_points,)."""
     millivolts = plan.covariates.get(_BATTERY, np.full(len(plan), _REFERENCE_MV))
     return np.where(np.isfinite(millivolts), (millivolts - _REFERENCE_MV) / 1000, 0.0)

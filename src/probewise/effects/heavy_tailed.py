@@ -41,7 +41,7 @@ class HeavyTailed:
         return self.typical * np.geomspace(self.smallest, SMALLEST_AND_LARGEST[1], _N_SCALES)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Natural log of the density, any shape."""
+        """Return the natural log of the density, any shape."""
         x = np.asarray(value, dtype=np.float64)[..., None] / self._sds
         terms = np.exp(-0.5 * x * x) / (self._sds * math.sqrt(2 * math.pi))
         with np.errstate(divide="ignore"):
@@ -51,11 +51,11 @@ class HeavyTailed:
         return np.where(np.asarray(value) >= 0, density + math.log(2.0), -np.inf)
 
     def _upper_tail(self, x: FloatArray) -> FloatArray:
-        """Probability above x of the two-sided mixture."""
+        """Return the probability above x of the two-sided mixture."""
         return np.asarray(0.5 * erfc(x[..., None] / (self._sds * math.sqrt(2))).mean(axis=-1))
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape: a table lookup, then Newton steps on the log of the tail."""
+        """Evaluate the quantile function, any shape: a table lookup, then Newton steps on the log of the tail."""
         u = np.asarray(u, dtype=np.float64)
         if self.positive:
             tail, sign = (1.0 - u) / 2, np.ones_like(u)
@@ -65,7 +65,7 @@ class HeavyTailed:
         return np.asarray(sign * self.typical * _quantiles(self.smallest).at(goal))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Cumulative distribution function, any shape."""
+        """Evaluate the cumulative distribution function, any shape."""
         value = np.asarray(value, dtype=np.float64)
         tail = self._upper_tail(np.abs(value))
         if self.positive:
@@ -117,15 +117,15 @@ class LogHeavyTailed:
         return HeavyTailed(self.typical_log, smallest=self.smallest)
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Quantile function, any shape."""
+        """Evaluate the quantile function, any shape."""
         return np.exp(self._log.from_unit(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
-        """Cumulative distribution function, any shape."""
+        """Evaluate the cumulative distribution function, any shape."""
         return self._log.to_unit(np.log(value))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
-        """Natural log of the density, any shape; -inf at and below zero."""
+        """Return the natural log of the density, any shape; -inf at and below zero."""
         value = np.asarray(value, dtype=np.float64)
         safe = np.where(value > 0, value, 1.0)
         return np.where(value > 0, self._log.log_prob(np.log(safe)) - np.log(safe), -np.inf)

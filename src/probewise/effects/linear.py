@@ -42,7 +42,7 @@ class LinearEffect(NamedEffect[V]):
         return Product(dict.fromkeys(self.parameters, size))
 
     def bank(self) -> FloatArray:
-        """One entry with a column for each parameter, (1, n_params, n_params)."""
+        """Return one entry with a column for each parameter, (1, n_params, n_params)."""
         return self._typical * np.eye(len(self.parameters))[None, :, :]
 
 

@@ -187,7 +187,7 @@ class NoisePerRun(NoiseEffect):
         return Product({f"values[{run}]": LogHeavyTailed(0.3) for run in self.runs})
 
     def bank(self) -> FloatArray:
-        """One entry, 1 in every run: `weighed_nodes` finds the values from a fit's residuals."""
+        """Return one entry, 1 in every run: `weighed_nodes` finds the values from a fit's residuals."""
         return np.ones((1, 1, len(self.runs)))
 
     def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:

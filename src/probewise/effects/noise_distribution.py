@@ -23,7 +23,7 @@ class NoiseRows:
 
 
 def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Natural log of each reading's marginal density, (n_samples, n_points), per unit of the reading.
+    """Return the natural log of each reading's marginal density, (n_samples, n_points), per unit of the reading.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) 
 
 
 def variance(level: NoiseLevel) -> FloatArray:
-    """Variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
+    """Return the variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
     level = _with_walk(level)
     wide = 1 + level.wide_share * (level.wide_times**2 - 1)
     return np.asarray(level.sd**2 * wide + level.step**2 / 12)

@@ -26,7 +26,7 @@ _LEAST_PLACES = 8
 
 
 def bell(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
-    """exp(-d^2 / 2 r^2); the arrays broadcast."""
+    """Return exp(-d^2 / 2 r^2); the arrays broadcast."""
     return np.exp(-0.5 * squared_distance / radius**2)
 
 
@@ -45,7 +45,7 @@ class ScanLine:
         return self.high_mm - self.low_mm
 
     def place(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """X and Y of places given by their position along the line and distance from it."""
+        """Return X and Y of places given by their position along the line and distance from it."""
         c, s, n = np.cos(self.angle_rad), np.sin(self.angle_rad), self.offset_mm + beside_mm
         return c * along_mm - s * n, s * along_mm + c * n
 
@@ -124,7 +124,7 @@ class PatchPrior:
         return self._by_line.to_unit_cube(self._seen_by_scan(theta))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Natural log of the density, (n_samples, 4) -> (n_samples,)."""
+        """Return the natural log of the density, (n_samples, 4) -> (n_samples,)."""
         shown = self._seen_by_scan(theta)
         # d(on_line, beside) / d(height, y) = exp(-beside^2 / 2) / r
         return self._by_line.log_prob(shown) - 0.5 * shown[:, 2] ** 2 - np.log(shown[:, 3])
@@ -153,7 +153,7 @@ class PatchEffect(NamedEffect[V]):
         return PatchPrior(self.size, self.typical, self.line)
 
     def variants(self) -> tuple[Self, ...]:
-        """One variant for each scanned line."""
+        """Return one variant for each scanned line."""
         return tuple(replace(self, line=line) for line in self.lines)
 
     def bank(self) -> FloatArray:

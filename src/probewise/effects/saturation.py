@@ -65,7 +65,7 @@ class Saturation(NamedEffect[FloatArray]):
         return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
 
     def bank(self) -> FloatArray:
-        """Entries of one column: sharp limits, denser near the top, and soft limits."""
+        """Return entries of one column: sharp limits, denser near the top, and soft limits."""
         span = (self.highest - self.lowest) / 1.1
         top = self.highest - 0.3 * span
         sharp = [(top - share * 0.8 * span, self.sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]

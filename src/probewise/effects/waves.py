@@ -112,7 +112,7 @@ class PeriodicPositionError(_Wave[Poses]):
         return replace(value, x_mm=value.x_mm + theta[:, :1] * wave)
 
     def bank(self) -> FloatArray:
-        """Sine and cosine of periods evenly spaced in wave number up to the range, then in log period beyond it."""
+        """Return sines and cosines, their periods evenly spaced in wave number up to the range, then in log period."""
         n_even = self.n_periods - 8
         waves = np.linspace(1.0, self.longest_mm / 2 / self.shortest_mm, n_even + 1)[1:]
         periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))

@@ -40,7 +40,7 @@ class GaussianKnown:
         object.__setattr__(self, "sd", sd)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of each hypothesis, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         sd = np.asarray(self.sd)
         if sd.ndim == 1 and sd.size != readings.size:
@@ -54,7 +54,7 @@ class GaussianKnown:
 
 @dataclass(frozen=True, eq=False)
 class GaussianInferred:
-    """An inference problem whose last parameter is the sd of the Gaussian noise; see `SensorProblem`.
+    """An inference problem whose last parameter is the sd of the Gaussian noise; otherwise as `SensorProblem`.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class GaussianInferred:
         return Joint((self.sensor_prior, Product({self.sd_name: self.sd_prior})))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log likelihood of the usable readings, (n_samples, n_params) -> (n_samples,)."""
+        """Return the log likelihood of the usable readings, (n_samples, n_params) -> (n_samples,)."""
         usable = self.recording.usable
         predicted = self.model.predict(theta[:, :-1], self.recording.plan)[:, usable]
         readings = self.recording.readings[usable]
@@ -90,7 +90,7 @@ class GaussianInferred:
 
 
 def log_prob_gaussian(readings: FloatArray, predicted: FloatArray, sd: FloatArray) -> FloatArray:
-    """Log likelihood with one sd per hypothesis, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
+    """Return the log likelihood for one sd each, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
     residual = residuals(readings, predicted)
     square = np.einsum("ij,ij->i", residual, residual)
     return np.asarray(-0.5 * square / sd**2 - readings.size * (np.log(sd) + 0.5 * _LOG_2PI))

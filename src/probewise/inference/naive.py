@@ -57,7 +57,7 @@ class Naive:
         return cls(*values)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,).
+        """Return the log likelihood of every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,).
 
         A prediction counts as white where it is nearer to `mu_white` than to `mu_black`.
         """

@@ -13,7 +13,7 @@ from probewise.recordings.plan import Recording
 
 
 def reading_span(recording: Recording) -> float:
-    """Range of the usable readings; if they are all equal, the declared range, or else 1."""
+    """Return the range of the usable readings; if they are all equal, the declared range, or else 1."""
     readings = recording.readings[recording.usable]
     span = float(np.ptp(readings)) if readings.size else 0.0
     if span > 0:
@@ -25,29 +25,29 @@ def reading_span(recording: Recording) -> float:
 
 
 def sd_floor(recording: Recording) -> float:
-    """Lower bound of the noise sd: the sd of rounding to the declared step, or a share of the readings' range.
+    """Return the lower bound of the noise sd: the sd of rounding to the declared step, at least a share of the range.
 
-    Where no step is declared, the step of the lattice on which all readings lie is used: otherwise readings at levels
-    on that lattice would have residual zero, which a heavy-tailed noise model would take for the noise.
+    Where no step is declared, that of the lattice on which all readings lie is used. Otherwise readings at levels on
+    that lattice would have residual zero, which a heavy-tailed noise model would take for the noise.
     """
     step = recording.plan.instrumentation.step or lattice_step(recording.readings[recording.usable])
     return max(step / math.sqrt(12.0), recording.least_share_of_span * reading_span(recording))
 
 
 def sd_ceiling(recording: Recording) -> float:
-    """Upper bound of the noise sd: the range of the readings, but at least ten times the floor."""
+    """Return the upper bound of the noise sd: the range of the readings, but at least ten times the floor."""
     return max(reading_span(recording), 10.0 * sd_floor(recording))
 
 
 def student_t(recording: Recording, groups: IntArray | None = None) -> StudentT:
-    """Build the likelihood of a recording's usable readings.
+    """Build the Student-t likelihood of a recording's usable readings, with the bounds of this module.
 
     Parameters
     ----------
     recording
         The recording.
     groups
-        Data set of each row of the plan, (n_points,); by default each scan is one.
+        Data set of each row of the plan, (n_points,); by default its scan.
     """
     rows = recording.plan.scan if groups is None else np.asarray(groups)
     return StudentT(rows[recording.usable], sd_floor(recording), sd_ceiling(recording))

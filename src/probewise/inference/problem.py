@@ -21,7 +21,7 @@ class Likelihood(Protocol):
     """A likelihood of readings given predictions."""
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         ...
 
 
@@ -34,7 +34,7 @@ class Problem(Protocol):
         ...
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log likelihood of a batch of hypotheses, (n_samples, n_params) -> (n_samples,)."""
+        """Return the log likelihood of a batch of hypotheses, (n_samples, n_params) -> (n_samples,)."""
         ...
 
 
@@ -44,8 +44,8 @@ def require_model(model: object) -> None:
     require_like("model", model, ("names", "predict"), allowed)
 
 
-def scores(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Score predictions (n_samples, n_points) by a likelihood: (n_samples,).
+def log_likelihoods(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Return the log likelihood of each prediction, (n_points,), (n_samples, n_points) -> (n_samples,).
 
     Raises ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
     """
@@ -82,8 +82,9 @@ class SensorProblem:
             raise ParameterError("prior.names", self.prior.names, f"the model's names {self.model.names}")
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Log likelihood of the usable readings; the whole plan is predicted, as lag and backlash need every row.
+        """Return the log likelihood of the usable readings, (n_samples, n_params) -> (n_samples,).
 
+        The whole plan is predicted, since lag and backlash need every row.
         Hypotheses are processed in blocks to bound the memory.
         """
         at_once = max(_MOST_NUMBERS // max(len(self.recording), 1), 1)
@@ -95,5 +96,5 @@ class SensorProblem:
         usable = self.recording.usable
         predicted = self.model.predict(theta, self.recording.plan)
         if usable.all():
-            return scores(self.likelihood, self.recording.readings, predicted)
-        return scores(self.likelihood, self.recording.readings[usable], predicted[:, usable])
+            return log_likelihoods(self.likelihood, self.recording.readings, predicted)
+        return log_likelihoods(self.likelihood, self.recording.readings[usable], predicted[:, usable])

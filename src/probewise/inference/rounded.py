@@ -20,10 +20,10 @@ _PER_SD = 50.0  # table entries per sd: linear interpolation errs by less than 1
 
 @dataclass(frozen=True)
 class Rounded:
-    """Probability of a reading's rounding cell: Gaussian noise of known sd, then rounding, then clipping.
+    """Likelihood of rounded readings: Gaussian noise of known sd, then rounding, then clipping.
 
-    Where the noise is not much wider than a step, a density at the rounded reading would overstate its
-    information.
+    It is the probability of a reading's rounding cell. Where the noise is not much wider than a step, a density at the
+    rounded reading would overstate its information.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ class Rounded:
             raise ParameterError("(low, high)", (self.low, self.high), "low < high")
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log probability of the readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log probability of the readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         away = np.abs(residuals(readings, predicted)) / self.sd
         at_end = (readings >= self.high) | (readings <= self.low)
@@ -60,7 +60,7 @@ class Rounded:
         return np.asarray(self._log_cell(away).sum(axis=1))
 
     def _log_cell(self, away: FloatArray) -> FloatArray:
-        """Tabulated log probability of a cell, by its distance from the prediction in sds."""
+        """Look up the log probability of a cell, by its distance from the prediction in sds."""
         position = np.minimum(away, _FAR - 1.0) * _PER_SD
         entry = position.astype(np.int64)
         below = self._table[entry]
@@ -71,7 +71,7 @@ class Rounded:
         return np.asarray(out)
 
     def _log_end(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log probability of a clipped reading: everything beyond that end of the scale."""
+        """Return the log probability of a clipped reading: everything beyond that end of the scale."""
         inward = np.where(readings >= self.high, predicted - readings, readings - predicted)
         return np.asarray(log_ndtr((inward + 0.5 * self.step) / self.sd))
 
@@ -81,6 +81,6 @@ class Rounded:
 
 
 def _log_between(away: FloatArray, half: float) -> FloatArray:
-    """Log probability that a standard normal is within `half` of `away`, from upper tails, for precision."""
+    """Return the log probability that a standard normal lies within `half` of `away` >= 0, from upper tails."""
     upper, lower = log_ndtr(half - away), log_ndtr(-half - away)
     return np.asarray(upper + np.log1p(-np.exp(lower - upper)))

@@ -27,7 +27,7 @@ _MANY_GROUPS = 16  # from here on, sums in place are cheaper than a product with
 
 
 def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float) -> FloatArray:
-    """Log of the integral of sigma^(-n-1) exp(-square / (2 sigma^2)) over sigma from `low` to `high`.
+    """Return the log of the integral of sigma^(-n-1) exp(-square / (2 sigma^2)) over sigma from `low` to `high`.
 
     With t = square / (2 sigma^2) it is (2 / square)^(n/2) / 2 times a difference of two incomplete
     gamma functions of order n/2. It is computed in log space from the tail in which both ends lie,
@@ -72,7 +72,7 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
 
 
 def _log_usual(s: FloatArray, a: FloatArray, t_low: FloatArray, t_high: FloatArray) -> FloatArray:
-    """Log of twice the integral, for t_low above a and t_high below."""
+    """Return the log of twice the integral, for t_low above a and t_high below."""
     share = gammainc(a, t_low) - gammainc(a, t_high)
     return np.asarray(gammaln(a) + np.log(share) + a * (math.log(2.0) - np.log(s)))
 
@@ -82,7 +82,7 @@ def _log_difference(large: FloatArray, small: FloatArray) -> FloatArray:
 
 
 def _log_lower_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
-    """Log of gamma(a, t) / t^a, finite at t = 0; for t below about a."""
+    """Return the log of gamma(a, t) / t^a, finite at t = 0; for t below about a."""
     share = gammainc(a, t)
     safe = np.where(share > _TINY, t, 1.0)
     out = np.log(np.maximum(share, _TINY)) + gammaln(a) - a * np.log(safe)
@@ -98,7 +98,7 @@ def _log_lower_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
 
 
 def _log_upper(a: FloatArray, t: FloatArray) -> FloatArray:
-    """Log of Gamma(a, t), for t above about a; -inf at t = inf."""
+    """Return the log of Gamma(a, t), for t above about a; -inf at t = inf."""
     share = gammaincc(a, t)
     out = np.log(np.maximum(share, _TINY)) + gammaln(a)
     rare = share <= _TINY
@@ -147,13 +147,13 @@ class StudentT:
 
     @cached_property
     def _starts(self) -> IntArray | None:
-        """First reading of each data set, where these are many and each is in one piece."""
+        """Index of each data set's first reading, if they are many, in one piece each and in order; otherwise None."""
         starts = np.flatnonzero(np.diff(self.groups, prepend=self.groups[:1] - 1))
         in_one_piece = starts.size == self.sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
         return starts if in_one_piece and starts.size > _MANY_GROUPS else None
 
-    def sums(self, square: FloatArray) -> FloatArray:
-        """Sum over each data set, (n_samples, n_points) -> (n_samples, n_groups)."""
+    def sums_by_group(self, square: FloatArray) -> FloatArray:
+        """Sum over the readings of each data set, (n_samples, n_points) -> (n_samples, n_groups)."""
         if self._starts is None:
             return square @ self._membership
         return np.asarray(np.add.reduceat(square, self._starts, axis=1))
@@ -164,13 +164,13 @@ class StudentT:
         return np.asarray(self._membership.sum(axis=0))
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of each hypothesis, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         residual = residuals(readings, predicted)
         if residual.shape[1] != self.groups.size:
             raise ShapeError(
                 f"groups has {self.groups.size} values for {residual.shape[1]} readings; allowed: one per reading"
             )
-        square = self.sums(np.square(residual, out=residual))
+        square = self.sums_by_group(np.square(residual, out=residual))
         integral = log_sigma_integral(square, self.sizes, self.sd_floor, self.sd_ceiling)
         constant = 0.5 * self.groups.size * _LOG_2PI + self.sizes.size * math.log(
             math.log(self.sd_ceiling / self.sd_floor)
@@ -178,16 +178,16 @@ class StudentT:
         return np.asarray(integral.sum(axis=1) - constant)
 
     def weights(self, residual: FloatArray) -> FloatArray:
-        """One over the noise variance of each reading as its data set's residuals tell it, both (n_samples, n_points).
+        """Return one over each reading's noise variance, from its data set's residuals; both (n_samples, n_points).
 
-        The gradient of `log_prob` by the predictions is the residual times this, but near the bounds of the sd.
+        The gradient of `log_prob` by the predictions is the residual times this, except near the bounds of the sd.
         """
-        variance = self.sums(np.square(residual)) / self.sizes
+        variance = self.sums_by_group(np.square(residual)) / self.sizes
         per_set = 1.0 / variance.clip(self.sd_floor**2, self.sd_ceiling**2)
         return np.asarray(per_set[:, np.unique(self.groups, return_inverse=True)[1]])
 
     def pooled(self, readings: FloatArray, predicted: FloatArray) -> PooledSigma:
-        """Posterior of one sigma shared by all data sets, for predicting a new one."""
+        """Return the posterior of one sigma that all data sets share, for predicting a new data set."""
         residual = residuals(readings, predicted)
         return PooledSigma((residual**2).sum(axis=1), residual.shape[1], self.sd_floor, self.sd_ceiling)
 
@@ -216,7 +216,7 @@ class PooledSigma:
         object.__setattr__(self, "square", frozen(self.square))
 
     def log_density(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Marginal log density of each new reading, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
+        """Return the marginal log density of each new reading, (n_points,), twice (n_samples, n_points)."""
         square = self.square[:, None]
         more = log_sigma_integral(
             square + residuals(readings, predicted) ** 2, self.n + 1, self.sd_floor, self.sd_ceiling
@@ -224,21 +224,23 @@ class PooledSigma:
         return np.asarray(more - self._log_norm()[:, None] - 0.5 * _LOG_2PI)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Joint log density of a new scan with one shared sigma, -> (n_samples,)."""
+        """Return the joint log density of a new scan, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         residual = residuals(readings, predicted)
         n_new = residual.shape[1]
         square = self.square + (residual**2).sum(axis=1)
         more = log_sigma_integral(square, self.n + n_new, self.sd_floor, self.sd_ceiling)
         return np.asarray(more - self._log_norm() - 0.5 * n_new * _LOG_2PI)
 
-    def sd(self) -> FloatArray:
-        """Predictive noise sd: the root of the posterior mean of sigma^2, (n_samples,)."""
+    def noise_sd(self) -> FloatArray:
+        """Return the predictive noise sd: the root of the posterior mean of sigma^2, (n_samples,)."""
         if self.n > 2:
             fewer = log_sigma_integral(self.square, self.n - 2, self.sd_floor, self.sd_ceiling)
             return np.asarray(np.exp(0.5 * (fewer - self._log_norm())))
         grid = np.linspace(math.log(self.sd_floor), math.log(self.sd_ceiling), 4001)
         height = -self.n * grid - self.square[:, None] / 2.0 * np.exp(-2.0 * grid)
         return np.asarray(np.exp(0.5 * (logsumexp(height + 2.0 * grid, axis=1) - logsumexp(height, axis=1))))
+
+    sd = noise_sd  # its old name
 
     def _log_norm(self) -> FloatArray:
         if self.n == 0:

@@ -124,7 +124,7 @@ class TabulatedShapes:
 
 def _by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
     if isinstance(region, MixtureOfRegions):
-        yield from region.rows()
+        yield from region.rows_and_regions()
     else:
         yield np.arange(region.n_regions), region
 

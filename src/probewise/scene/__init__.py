@@ -1,4 +1,4 @@
-"""What lies under the sensor, known or hypothesised.
+"""Scenes and shapes: what lies under the sensor, known or hypothesised.
 
 Paper, section "Robotic Arm Test Bed" (the circle's albedo, eq. 1 to 3) and section "Data
 Collection for SSF Estimation" (the patterns S_BW and S_a to S_d).
@@ -22,7 +22,7 @@ from probewise.scene.regions import (
     outlines,
 )
 from probewise.scene.scenes import HypothesisScene, KnownScene
-from probewise.scene.shapes import SHAPES, AnyOf, Circle, Ellipse, Field, Placed, Rectangle, RegularPolygon
+from probewise.scene.shapes import SHAPES, AnyOf, Circle, Ellipse, Field, PlacedPrior, Rectangle, RegularPolygon
 
 __all__ = [
     "SHAPES",
@@ -39,7 +39,7 @@ __all__ = [
     "ImageRegion",
     "KnownScene",
     "MixtureOfRegions",
-    "Placed",
+    "PlacedPrior",
     "PolygonRegion",
     "QuadrantRegion",
     "RampRegion",
@@ -55,3 +55,6 @@ __all__ = [
     "outlines",
     "region_of",
 ]
+
+Placed = PlacedPrior
+"""The old name of `PlacedPrior`."""

@@ -1,4 +1,4 @@
-"""How much of a turned square pixel lies on the inside of an edge."""
+"""The share of a turned square pixel that lies inside an edge or a polygon."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from probewise._arrays import FloatArray
 
 
 def share_behind_edge(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
-    """Share of a square on the positive side of a straight edge.
+    """Return the share of a square on the positive side of a straight edge.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def share_behind_edge(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: 
 
 
 def share_in_edges(edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-    """Share of each square inside a polygon, exactly.
+    """Return the share of each square inside a polygon, exactly.
 
     Green's theorem on the polygon clipped to the square: the sum over directed edges (inside
     on their left) of the area between the edge, clamped to the square, and its lower side.
@@ -52,7 +52,7 @@ def share_in_edges(edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float
     pixel_mm
         Side of the square.
     turn_rad
-        How far each square is turned, shape (n_points,).
+        Angle by which each square is turned, shape (n_points,).
 
     Returns
     -------
@@ -84,6 +84,6 @@ def share_in_edges(edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float
 
 
 def _integral_of_clip(y: FloatArray) -> FloatArray:
-    """Antiderivative of clip(y, -1/2, 1/2)."""
+    """Evaluate the antiderivative of clip(y, -1/2, 1/2)."""
     inner = np.clip(y, -0.5, 0.5)
     return 0.5 * inner**2 + 0.5 * np.abs(y - inner)

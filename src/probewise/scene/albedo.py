@@ -24,11 +24,11 @@ class Region(Protocol):
         ...
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) lab frame -> (n_regions, n_points)."""
+        """Return the albedo at points, (n_points, 2) lab frame -> (n_regions, n_points)."""
         ...
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over square pixels turned by `turn_rad` (n_points,): -> (n_regions, n_points)."""
+        """Return the mean albedo over square pixels turned by `turn_rad` (n_points,): -> (n_regions, n_points)."""
         ...
 
 
@@ -54,7 +54,7 @@ class Scene(Protocol):
         ...
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Region by pattern name, theta (n_samples, n_params)."""
+        """Return the region by pattern name, theta (n_samples, n_params)."""
         ...
 
 

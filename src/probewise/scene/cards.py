@@ -52,8 +52,8 @@ class Card:
         return PolygonRegion.simple(self.corners_mm[None])
 
     @property
-    def telling_mm(self) -> FloatArray:
-        """Most informative places for reading the card: its middle, and the middles of its sides, (5, 2)."""
+    def informative_mm(self) -> FloatArray:
+        """Places where readings of the card are most informative: its middle and the middles of its sides, (5, 2)."""
         half_x, half_y = self.width_mm / 2, self.height_mm / 2
         away = np.array([[0.0, 0.0], [-half_x, 0.0], [half_x, 0.0], [0.0, -half_y], [0.0, half_y]])
         return np.asarray(np.array([self.x_mm, self.y_mm]) + away)
@@ -72,18 +72,18 @@ class CardedRegion:
         return self.region.n_regions
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, (n_points, 2) -> (n_regions, n_points)."""
+        """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         covered = [card.region.albedo(points_mm) for card in self.cards]
-        return laid_over(self.region.albedo(points_mm), self.cards, covered)
+        return seen_with_cards(self.region.albedo(points_mm), self.cards, covered)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, (n_regions, n_points)."""
         covered = [card.region.coverage(centers_mm, pixel_mm, turn_rad) for card in self.cards]
-        return laid_over(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
+        return seen_with_cards(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
 
 
-def laid_over(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
-    """Combine the fraction seen without cards with the cards; `covered` is the share of the view on each card.
+def seen_with_cards(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
+    """Return the white fraction seen with cards: `seen` is that without, `covered` the share of the view on each card.
 
     Exact for a view that contains edges of cards only, or none of a card; with both, the albedo under the card is taken
     to be the mean albedo of the view.

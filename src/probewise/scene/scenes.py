@@ -37,7 +37,7 @@ class KnownScene:
         return Empty()
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Region by pattern name; theta (n_samples, 0) is ignored."""
+        """Return the region by pattern name; theta (n_samples, 0) is ignored."""
         return self._region_by_name
 
     @cached_property

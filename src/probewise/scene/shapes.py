@@ -37,7 +37,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Placed:
+class PlacedPrior:
     """Prior of a shape anywhere on a field: x_mm, y_mm, then the shape's own parameters.
 
     The own parameters have the prior `own`. The centre is uniform over the field or, given
@@ -69,7 +69,7 @@ class Placed:
         return np.concatenate([centre, self.own.to_unit_cube(theta[:, 2:])], axis=1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Natural log of the density, (n_samples,); -inf outside the support."""
+        """Return the natural log of the density, (n_samples,); -inf outside the support."""
         own = self.own.log_prob(theta[:, 2:])
         low, high = self._bounds_of_centre(theta[:, 2:])
         inside = ((theta[:, :2] >= low) & (theta[:, :2] <= high)).all(axis=1)
@@ -83,7 +83,7 @@ class Placed:
 
 
 def _require_fit(shape: str, name: str, bounds: Bounds, field: Field, *, reach: float | None) -> None:
-    """Raise ParameterError for bounds in a wrong order; with `reach`, times the upper one, if it leaves the field."""
+    """Raise ParameterError unless 0 < low < high and, with `reach`, a half width of `reach` x high fits the field."""
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = require_pair(name, bounds, "(low, high): its prior is even between them")
     if not 0 < low < high < math.inf:
@@ -116,9 +116,9 @@ class Circle:
         _require_fit("Circle", "radius_mm", self.radius_mm, self.field, reach=reach)
 
     @cached_property
-    def prior(self) -> Placed:
+    def prior(self) -> PlacedPrior:
         """Uniform over centre and radius."""
-        return Placed(
+        return PlacedPrior(
             self.field, Product({"radius_mm": Uniform(*self.radius_mm)}), _round_extent if self.inside else None
         )
 
@@ -128,7 +128,7 @@ class Circle:
 
 
 @dataclass(frozen=True)
-class _EllipseOwn:
+class _EllipseOwnPrior:
     """Uniform semi-major axis, semi-minor axis uniform below it, angle uniform over half a turn."""
 
     bounds_mm: Bounds
@@ -175,9 +175,9 @@ class Ellipse:
         _require_fit("Ellipse", "semi_axes_mm", self.semi_axes_mm, self.field, reach=reach)
 
     @cached_property
-    def prior(self) -> Placed:
+    def prior(self) -> PlacedPrior:
         """Uniform over centre, major axis and angle; the minor axis uniform below the major."""
-        return Placed(self.field, _EllipseOwn(self.semi_axes_mm), _ellipse_extent if self.inside else None)
+        return PlacedPrior(self.field, _EllipseOwnPrior(self.semi_axes_mm), _ellipse_extent if self.inside else None)
 
     def region(self, theta: FloatArray) -> EllipseRegion:
         """Build an ellipse for each hypothesis, theta (n_samples, 5)."""
@@ -206,11 +206,11 @@ class Rectangle:
         _require_fit("Rectangle", "sides_mm", self.sides_mm, self.field, reach=reach)
 
     @cached_property
-    def prior(self) -> Placed:
+    def prior(self) -> PlacedPrior:
         """Uniform over all five parameters."""
         side = Uniform(*self.sides_mm)
         own = Product({"width_mm": side, "height_mm": side, "angle_rad": Uniform(0.0, np.pi / 2)})
-        return Placed(self.field, own, _rectangle_extent if self.inside else None)
+        return PlacedPrior(self.field, own, _rectangle_extent if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a rectangle for each hypothesis, theta (n_samples, 5)."""
@@ -233,11 +233,11 @@ class RegularPolygon:
         _require_fit("RegularPolygon", "radius_mm", self.radius_mm, self.field, reach=reach)
 
     @cached_property
-    def prior(self) -> Placed:
+    def prior(self) -> PlacedPrior:
         """Uniform over centre, radius, and angle within the polygon's symmetry."""
         own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
         # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
-        return Placed(self.field, own, _round_extent if self.inside else None)
+        return PlacedPrior(self.field, own, _round_extent if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a polygon for each hypothesis, theta (n_samples, 4)."""
@@ -328,12 +328,13 @@ class _AnyOfPrior:
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
             values = theta[:, columns]
             taken = shape.prior.log_prob(values)
-            idle = shape.prior.own.log_prob(values[:, 2:]) if isinstance(shape.prior, Placed) and self.shared else taken
+            is_placed = isinstance(shape.prior, PlacedPrior) and self.shared
+            idle = shape.prior.own.log_prob(values[:, 2:]) if is_placed else taken
             total = total + np.where(which == k, taken, idle)
         return total
 
     def which(self, theta: FloatArray) -> IntArray:
-        """Index of each hypothesis' shape, (n_samples,)."""
+        """Return the index of each hypothesis' shape, (n_samples,)."""
         return np.clip(np.floor(theta[:, 0]), 0, len(self.shapes) - 1).astype(np.int64)
 
 
@@ -343,7 +344,7 @@ class AnyOf:
 
     Parameters: `shape`, whose floor is the index of the shape (continuous, so that a sampler can treat
     it like any other: uniform over [k, k + 1) for shape k, which has prior probability `weights[k]`);
-    x_mm, y_mm of the centre, shared where every shape has a `Placed` prior; then each shape's own
+    x_mm, y_mm of the centre, shared where every shape has a `PlacedPrior` prior; then each shape's own
     parameters, as "rectangle.width_mm".
     """
 
@@ -364,7 +365,7 @@ class AnyOf:
     @cached_property
     def prior(self) -> _AnyOfPrior:
         """Prior of index, centre, and the parameters of every shape."""
-        placed = all(isinstance(shape.prior, Placed) for shape in self.shapes.values())
+        placed = all(isinstance(shape.prior, PlacedPrior) for shape in self.shapes.values())
         return _AnyOfPrior(self.shapes, self.weights, ("x_mm", "y_mm") if placed else ())
 
     @property
@@ -373,7 +374,7 @@ class AnyOf:
         return tuple(self.shapes)
 
     def which(self, theta: FloatArray) -> IntArray:
-        """Index of each hypothesis' shape, (n_samples,)."""
+        """Return the index of each hypothesis' shape, (n_samples,)."""
         return self.prior.which(theta)
 
     def region(self, theta: FloatArray) -> MixtureOfRegions:

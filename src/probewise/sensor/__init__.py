@@ -4,10 +4,10 @@ Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_m
 (RwithSSF) and (discreteR) for R, (Ssf) for the mixture of Gaussians, and the naive sensor.
 """
 
-from probewise.sensor.bent import N_BENDS, N_FREE_FORM, bends_of, free_form, is_free_form
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
 from probewise.sensor.commanded import COMMANDED, raised
 from probewise.sensor.discrete import seen_discrete
+from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bends_of, free_form, is_free_form
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, seen
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (

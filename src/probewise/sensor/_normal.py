@@ -51,7 +51,7 @@ def normal_cdf_in_place(cells: FloatArray) -> None:
 
 
 def normal_cdf(z: FloatArray) -> FloatArray:
-    """Cumulative distribution of the standard normal, any shape, within 1e-10.
+    """Evaluate the cumulative distribution of the standard normal, any shape, within 1e-10.
 
     A parabola about each of the table's entries: the third-order term is at most 0.4 (h / 2)^3 / 6 =
     7.5e-11. Large arrays are processed in blocks that fit the cache.

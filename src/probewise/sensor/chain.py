@@ -207,7 +207,7 @@ class Chain:
         return self.look(theta, plan).seen
 
     def look(self, theta: FloatArray, plan: Plan) -> View:
-        """Compute the view of the scene: the stages of `predict` before SEEN."""
+        """Compute the sensor's view of the scene: the stages of `predict` before SEEN."""
         require_columns(theta, self.names)
         layout = self._layout_of(theta, plan)
         if isinstance(self.ssf, DiscreteSSF):
@@ -230,8 +230,8 @@ class Chain:
         found: Poses = self._applier(theta, plan)(Stage.POSE, told)
         return found
 
-    def _geometries(self, theta: FloatArray, footprint: Footprint) -> _Geometries | None:
-        """Group hypotheses that differ only in the weights of many Gaussians; None where grouping saves nothing."""
+    def _geometries(self, theta: FloatArray, footprint: Footprint) -> _GeometryGroups | None:
+        """Group hypotheses that differ only in the weights of their Gaussians; None where grouping saves nothing."""
         few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
         if few or footprint.weight.shape[1] > 1:
             return None
@@ -248,7 +248,7 @@ class Chain:
         first = np.unique(which, return_index=True)[1]
         # An effect may place a Gaussian by the weights of others, as a halo about their common centre.
         moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
-        return None if len(first) < len(theta) and any(moved) else _Geometries(first, which)
+        return None if len(first) < len(theta) and any(moved) else _GeometryGroups(first, which)
 
     def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
         """Place the scene under the poses; cached for the last plan where no hypothesis changes either."""
@@ -270,7 +270,7 @@ class Chain:
 
     @cached_property
     def _last_layout(self) -> dict[Plan, Layout]:
-        """The cache: the layout of the last plan."""
+        """Cache of the last plan's layout."""
         return {}
 
     def noise_level(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseLevel:
@@ -385,7 +385,7 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
     )
     poses = layout.poses
     for part in layout.straight:
-        part.see(footprint, out)
+        part.write_response(footprint, out)
     for rows, region in layout.others:
         if isinstance(region, UniformRegion):  # whatever the footprint
             level = region.level[:, None]
@@ -403,7 +403,7 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
 
 
 @dataclass(frozen=True, eq=False)
-class _Geometries:
+class _GeometryGroups:
     """Groups of hypotheses that differ only in the weights of their Gaussians, in which the response is linear.
 
     `first` is the first hypothesis of each group, (n_geometries,); `which` the group of each, (n_samples,).

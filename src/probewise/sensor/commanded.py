@@ -18,7 +18,7 @@ COMMANDED = ("height_mm", "led")
 
 
 def is_commanded(plan: Plan) -> bool:
-    """Whether a plan commands the LED or a height other than the description's."""
+    """Return whether a plan commands the LED, or a height other than the description's."""
     return "led" in plan.covariates or height_ratio(plan) is not None
 
 

@@ -19,7 +19,7 @@ from scipy.special import ndtr, owens_t
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, SlowWarning
 from probewise.scene.albedo import Region
-from probewise.scene.cards import CardedRegion, laid_over
+from probewise.scene.cards import CardedRegion, seen_with_cards
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -99,7 +99,7 @@ def seen(
     *,
     n_nodes: int = ACCURATE_NODES,
 ) -> FloatArray:
-    """Mean albedo under each Gaussian footprint (paper, eq. R for one Gaussian).
+    """Return the mean albedo under each Gaussian footprint (paper, eq. R for one Gaussian).
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def seen(
 
 @singledispatch
 def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
+    """Return the mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
 
     A region without a registered closed form is summed over square pixels, a quarter of the smaller
     standard deviation wide, each with its coverage: error about 1e-3, and a `SlowWarning` is issued.
@@ -240,7 +240,9 @@ _TRIANGLE_NODES = 8  # positive half of a 16-node rule: accurate to 1e-12
 
 
 def beyond_corner(z1: FloatArray, z2: FloatArray, rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Probability that two standard normals of correlation `rho` exceed z1 and z2, z1, and z2; arrays broadcast.
+    """Return the probabilities that two standard normals exceed z1 and z2, that the first exceeds z1, the second z2.
+
+    `rho` is their correlation; the arrays broadcast.
 
     In the frame in which the Gaussian is the unit one about the origin, the quadrant is the wedge between two rays from
     the corner (Owen 1956). The line of side 1 passes the origin at distance z1; the corner lies `along` it from its
@@ -282,7 +284,7 @@ def mass_in_quadrant(
 ) -> FloatArray:
     """Integrate Gaussians over quadrants; corner, direction and the Gaussians' arrays broadcast to any shape.
 
-    The bivariate normal, reflected so that the inside lies to the upper right.
+    The mass is a probability of the bivariate normal, reflected so that the inside lies to the upper right.
     """
     sd_x, sd_y = np.sqrt(gaussian.var_x), np.sqrt(gaussian.var_y)
     z1 = dx * (corner_x - gaussian.x_mm - gaussian.dx_mm) / sd_x
@@ -321,14 +323,14 @@ def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
 
 
 @seen_by_one.register
-def _(region: CardedRegion, spot: Spot, n_nodes: int) -> FloatArray:
-    """Of the region and of each card by itself, the cards laid over it."""
-    covered = [seen_by_one(card.region, spot, n_nodes) for card in region.cards]
-    return laid_over(seen_by_one(region.region, spot, n_nodes), region.cards, covered)
+def _(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+    """Integrate over the region and over each card by itself, then lay the cards over the region."""
+    covered = [seen_by_one(card.region, gaussian, n_nodes) for card in region.cards]
+    return seen_with_cards(seen_by_one(region.region, gaussian, n_nodes), region.cards, covered)
 
 
 def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Mass of the unit Gaussian beyond edges, (n_edges,), within the angle each spans: Owen's T from start to end.
+    """Return the unit Gaussian's mass beyond edges, (n_edges,), in the angle each spans: Owen's T from start to end.
 
     An end out of reach counts as infinitely far, where T is half the mass beyond the edge's line.
     """
@@ -344,7 +346,7 @@ def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> Floa
 
 @cache
 def _legendre(n_nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Nodes on (0, 1) and weights of the Gauss-Legendre rule on (-1, 1), the positive half."""
+    """Return the positive half of the Gauss-Legendre rule on (-1, 1): nodes and weights."""
     if n_nodes < 2 or n_nodes % 2:
         raise ParameterError("n_nodes", n_nodes, "an even number, 2 or more")
     node, weight = np.polynomial.legendre.leggauss(n_nodes)
@@ -377,7 +379,7 @@ def _(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
 def _seen_of_unit_disc(
     p: FloatArray, q: FloatArray, var_p: FloatArray, var_q: FloatArray, cov_pq: FloatArray, n_nodes: int
 ) -> FloatArray:
-    """Mass of Gaussians, arrays broadcasting to (n_samples, n_points), inside the unit circle.
+    """Return the mass of Gaussians, arrays broadcasting to (n_samples, n_points), inside the unit circle.
 
     Only the (sample, reading) pairs whose edge is within reach are integrated.
     """
@@ -456,7 +458,7 @@ def _blocks(rows: IntArray, n_nodes: int) -> Iterator[IntArray]:
 
 
 def _cumulative(z: FloatArray) -> FloatArray:
-    """Look up the normal cumulative, in place; by the table however few there are: no pair depends on others."""
+    """Look up the normal cumulative in the table, in place, however few values there are: none depends on others."""
     z *= PER_SD
     z += CENTRE
     normal_cdf_in_place(z)
@@ -515,14 +517,14 @@ def _long_chords(
 
 
 def _quarter_tangent(y: FloatArray) -> FloatArray:
-    """Tangent of a quarter of the arc sine."""
+    """Return the tangent of a quarter of the arc sine."""
     half = y / (1 + np.sqrt(1 - y * y))
     return np.asarray(half / (1 + np.sqrt(1 + half * half)))
 
 
 @cache
 def _hermite(n_nodes: int) -> tuple[FloatArray, FloatArray]:
-    """Nodes and weights for the mean over a standard normal."""
+    """Return nodes and weights for the mean over a standard normal."""
     node, weight = np.polynomial.hermite_e.hermegauss(n_nodes)
     return node, weight / weight.sum()
 
@@ -531,14 +533,14 @@ def _hermite(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 def _(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate each hypothesis by the rule for its kind of region."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
-    for rows, part in region.rows():
+    for rows, part in region.rows_and_regions():
         out[rows] = seen_by_one(part, gaussian.take(rows), n_nodes)
     return out
 
 
 @seen_by_one.register
 def _(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Exact along each row of pixels; Gauss-Legendre across it, panels within the footprint's scale."""
+    """Integrate each row of pixels exactly along x, and by Gauss-Legendre across it, in panels within the footprint."""
     shape = gaussian.shape
     out = np.empty(shape)
     x, y = (

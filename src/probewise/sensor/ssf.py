@@ -92,7 +92,7 @@ class FreeMixture:
         return mixture_names(self.n_gaussians)
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Mixture of each hypothesis, theta (n_samples, 6 n_gaussians)."""
+        """Return the mixture of each hypothesis, theta (n_samples, 6 n_gaussians)."""
         return footprint_of(theta, self.n_gaussians)
 
 
@@ -310,7 +310,7 @@ def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
 
 
 def total_variation(mixture: FixedMixture, field: SSFField) -> float:
-    """Total variation distance of a mixture and a field: the largest difference of any response.
+    """Return the total variation distance of a mixture and a field: the largest difference of any response.
 
     Both are compared on the field's pixels; the mixture's mass outside them counts in full.
     """

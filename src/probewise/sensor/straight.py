@@ -73,20 +73,20 @@ class StraightEdges:
         together = bool((np.diff(self.rows) == 1).all())
         return slice(int(self.rows[0]), int(self.rows[-1]) + 1) if together else None
 
-    def see(self, footprint: Footprint, out: FloatArray) -> None:
+    def write_response(self, footprint: Footprint, out: FloatArray) -> None:
         """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
         seen = np.empty((len(out), len(self.rows))) if self._contiguous_rows is None else out[:, self._contiguous_rows]
         if len(self.distance_mm) == 1 and not _varies(footprint):
-            self._views.see(footprint, seen)
+            self._views.write_response(footprint, seen)
         else:
-            self._see_each(footprint, seen)
+            self._write_each_share(footprint, seen)
             seen *= self.inside - self.outside
             seen += self.outside
         if self._contiguous_rows is None:
             out[:, self.rows] = seen
 
-    def _see_each(self, footprint: Footprint, share: FloatArray) -> None:
-        """Compute responses where the position varies with the hypothesis or the footprint with the reading."""
+    def _write_each_share(self, footprint: Footprint, share: FloatArray) -> None:
+        """Write the shares inside where the position varies with the hypothesis or the footprint with the reading."""
         weight, *moments = (self._own_columns(a) for a in (footprint.weight, *footprint.moments))
         varies = _varies(footprint)
         angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
@@ -142,12 +142,12 @@ class _EdgeViews:
         return cls(angles, which, views[1], view.reshape(-1), low, high - low)
 
     @cached_property
-    def _hand_out(self) -> FloatArray:
+    def _views_from_angles(self) -> FloatArray:
         """Matrix from the angles' (1/sd, mean/sd) to the views' table positions, (2 n_angles, n_views)."""
         own = np.eye(len(self.angle_rad))[:, self.which]
         return np.concatenate([own * self.distance_mm, own])
 
-    def see(self, footprint: Footprint, out: FloatArray) -> None:
+    def write_response(self, footprint: Footprint, out: FloatArray) -> None:
         """Write the responses to a footprint that is the same at all readings, (n_samples, n_rows).
 
         Gaussians are projected once per angle and mapped to the views by a matrix product, block by block.
@@ -165,7 +165,7 @@ class _EdgeViews:
         for start in range(0, n_samples, step):
             here = both[:, start : start + step]
             if n_angles <= _FEW_ANGLES:
-                cells = here @ self._hand_out
+                cells = here @ self._views_from_angles
             else:
                 cells = here[..., self.which] * self.distance_mm
                 cells += here[..., n_angles + self.which]
@@ -205,12 +205,12 @@ class StraightCorners:
     def _views(self) -> _CornerViews:
         return _CornerViews.of(self)
 
-    def see(self, footprint: Footprint, out: FloatArray) -> None:
+    def write_response(self, footprint: Footprint, out: FloatArray) -> None:
         """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
         poses = self.poses
         still = len(poses.x_mm) == len(poses.y_mm) == len(poses.orientation_rad) == 1
         if still and not _varies(footprint):
-            out[:, self.rows] = self._views.see(footprint)
+            out[:, self.rows] = self._views.response(footprint)
             return
         moved = turned(poses.orientation_rad[..., None], *(columns_of(a, self.rows) for a in footprint.moments))
         gaussians = LabGaussian(
@@ -226,15 +226,15 @@ class StraightCorners:
 class _CornerViews:
     """The distinct views of corners: the four quadrants about one corner share them.
 
-    The masses beyond the corner along x, along y and along both determine every quadrant. `turn_rad` is the sensor's
-    orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, (n_views,). `hand_out`
-    (3 n_views, n_rows) and `low` (n_rows,) turn the three masses into responses.
+    Three masses determine every quadrant: beyond the corner along both axes, along x, and along y. `turn_rad` is the
+    sensor's orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, (n_views,). Responses are
+    the masses times `readings_from_masses`, (3 n_views, n_rows), plus `low`, (n_rows,).
     """
 
     turn_rad: FloatArray
     x_mm: FloatArray
     y_mm: FloatArray
-    hand_out: FloatArray
+    readings_from_masses: FloatArray
     low: FloatArray
 
     @classmethod
@@ -253,7 +253,7 @@ class _CornerViews:
         turns = views[0] if np.ptp(views[0]) > 0 else views[0, :1]
         return cls(turns, views[1], views[2], np.concatenate([own * part for part in parts]), low)
 
-    def see(self, footprint: Footprint) -> FloatArray:
+    def response(self, footprint: Footprint) -> FloatArray:
         """Compute the responses to a footprint that is the same at all readings, (n_samples or 1, n_rows)."""
         weight, *moments = _samples_last(footprint)
         turn, x, y = (a[:, None, None] for a in (self.turn_rad, self.x_mm, self.y_mm))
@@ -262,11 +262,11 @@ class _CornerViews:
         shares = beyond_corner((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
         # Sum over the Gaussians: (n_views, n_gaussians, n_samples) each -> (3 n_views, n_samples).
         beyond = np.concatenate([(share * weight).sum(axis=1) for share in shares])
-        return np.asarray(beyond.T @ self.hand_out + self.low)
+        return np.asarray(beyond.T @ self.readings_from_masses + self.low)
 
 
 def _varies(footprint: Footprint) -> bool:
-    """Whether the Gaussians or their weights change with the reading."""
+    """Return whether the Gaussians or their weights change with the reading."""
     return any(a.shape[1] > 1 for a in (footprint.weight, *footprint.moments))
 
 

@@ -1,4 +1,4 @@
-"""The arrays that describe a batch of regions: their checks, and how many regions they are."""
+"""Checks and the common shape of the arrays that describe a batch of regions."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.scene.albedo import Region
 
 
-class OneRowEach(Region, Protocol):
-    """Base of regions whose first field has one row for each hypothesis, as `batch` leaves it."""
+class RegionBatch(Region, Protocol):
+    """Base of regions whose first field has a row for each hypothesis, after `broadcast_fields`."""
 
     @property
     def n_regions(self) -> int:
@@ -21,7 +21,7 @@ class OneRowEach(Region, Protocol):
         return len(getattr(self, first))
 
 
-def batch(region: object, **shapes: tuple[int, ...]) -> None:
+def broadcast_fields(region: object, **shapes: tuple[int, ...]) -> None:
     """Broadcast the named arrays of a region to (n_regions, *shape), check that they are finite, and freeze them."""
     arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
     lengths = set()

@@ -8,12 +8,12 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import OneRowEach, batch, require_positive
+from probewise.scene.regions.checks import RegionBatch, broadcast_fields, require_positive
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 
 @dataclass(frozen=True, eq=False)
-class EllipseRegion(OneRowEach):
+class EllipseRegion(RegionBatch):
     """The inside of an ellipse; a disc has equal semi-axes (paper, eq. 1).
 
     `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis)
@@ -27,16 +27,16 @@ class EllipseRegion(OneRowEach):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        batch(self, center_mm=(2,), semi_axes_mm=(2,), angle_rad=())
+        broadcast_fields(self, center_mm=(2,), semi_axes_mm=(2,), angle_rad=())
         require_positive("semi_axes_mm", self.semi_axes_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        """Albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""
+        """Return the albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""
         p, q = self._unit(points_mm)
         return np.where(p * p + q * q <= 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, the edge approximated by its tangent: (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, with its tangent for the edge: (n_regions, n_points)."""
         p, q = self._unit(centers_mm)
         a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
         level = np.hypot(p, q)
@@ -49,7 +49,7 @@ class EllipseRegion(OneRowEach):
         return self.outside + (self.inside - self.outside) * share
 
     def _unit(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Coordinates in which the edge is the unit circle, each (n_regions, n_points)."""
+        """Return coordinates in which the edge is the unit circle, each (n_regions, n_points)."""
         cosine, sine = np.cos(self.angle_rad)[:, None], np.sin(self.angle_rad)[:, None]
         dx = points_mm[:, 0] - self.center_mm[:, :1]
         dy = points_mm[:, 1] - self.center_mm[:, 1:]

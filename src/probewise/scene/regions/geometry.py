@@ -37,7 +37,7 @@ def outlines(region: Region, *, n_vertices: int = 96) -> list[FloatArray]:
 
 @singledispatch
 def edge_distance(region: Region, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Distance of places from the nearest edge of a region, mm.
+    """Return the distance of places from the nearest edge of a region, mm.
 
     Parameters
     ----------

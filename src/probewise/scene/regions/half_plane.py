@@ -8,12 +8,12 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import OneRowEach, batch
+from probewise.scene.regions.checks import RegionBatch, broadcast_fields
 from probewise.scene.regions.geometry import edge_distance
 
 
 @dataclass(frozen=True, eq=False)
-class HalfPlaneRegion(OneRowEach):
+class HalfPlaneRegion(RegionBatch):
     """The half-plane x cos(normal) + y sin(normal) > offset (paper, S_BW); fields (n_regions,)."""
 
     normal_rad: FloatArray
@@ -22,13 +22,13 @@ class HalfPlaneRegion(OneRowEach):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        batch(self, normal_rad=(), offset_mm=())
+        broadcast_fields(self, normal_rad=(), offset_mm=())
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return np.where(self._distance(points_mm) > 0, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         share = share_behind_edge(self._distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 

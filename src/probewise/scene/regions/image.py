@@ -41,7 +41,7 @@ class ImageRegion:
         return self._at(points_mm[:, 0], points_mm[:, 1])[None]
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, summed in strips along x: exact for pixels that are not turned."""
+        """Return the mean albedo over turned square pixels, from strips along x: exact for unturned pixels."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         steep, flat = np.maximum(np.abs(cosine), 1e-9), np.maximum(np.abs(sine), 1e-9)
         half = 0.5 * pixel_mm
@@ -70,7 +70,7 @@ class ImageRegion:
         return padded
 
     def _summed(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Integral of the albedo over the quadrant to the lower left, mm^2."""
+        """Return the integral of the albedo over the quadrant to the lower left, mm^2."""
         n_rows, n_columns = self.values.shape
         u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)
         v = np.clip((y_mm - self.origin_mm[1]) / self.pixel_mm, 0, n_rows)

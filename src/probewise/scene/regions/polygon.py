@@ -11,12 +11,12 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.scene._pixels import share_in_edges
-from probewise.scene.regions.checks import OneRowEach, batch
+from probewise.scene.regions.checks import RegionBatch, broadcast_fields
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 
 @dataclass(frozen=True, eq=False)
-class PolygonRegion(OneRowEach):
+class PolygonRegion(RegionBatch):
     """The inside of a polygon, given by its directed edges, with the inside on their left.
 
     `edges_mm` has shape (n_regions, n_edges, 2 ends, 2). Build it with `simple` from the vertices of
@@ -28,7 +28,7 @@ class PolygonRegion(OneRowEach):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        batch(self, edges_mm=(-1, 2, 2))
+        broadcast_fields(self, edges_mm=(-1, 2, 2))
 
     @classmethod
     def simple(cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0) -> PolygonRegion:
@@ -59,7 +59,7 @@ class PolygonRegion(OneRowEach):
         return np.where(_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         share = share_in_edges(self.edges_mm, centers_mm, pixel_mm, turn_rad)
         return self.outside + (self.inside - self.outside) * share
 

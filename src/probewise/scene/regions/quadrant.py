@@ -8,13 +8,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.scene.regions.checks import OneRowEach, batch
+from probewise.scene.regions.checks import RegionBatch, broadcast_fields
 from probewise.scene.regions.geometry import edge_distance
 from probewise.scene.regions.polygon import PolygonRegion
 
 
 @dataclass(frozen=True, eq=False)
-class QuadrantRegion(OneRowEach):
+class QuadrantRegion(RegionBatch):
     """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0 (paper, S_a to S_d).
 
     `corner_mm` and `direction` (entries +1 or -1) have shape (n_regions, 2).
@@ -26,7 +26,7 @@ class QuadrantRegion(OneRowEach):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        batch(self, corner_mm=(2,), direction=(2,))
+        broadcast_fields(self, corner_mm=(2,), direction=(2,))
         if not np.isin(self.direction, (-1.0, 1.0)).all():
             raise ParameterError("direction", self.direction.tolist(), "+1 or -1")
 
@@ -35,7 +35,7 @@ class QuadrantRegion(OneRowEach):
         return np.where(beyond.all(axis=-1), self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         reach = pixel_mm + max(1.0, float(np.abs(centers_mm[None] - self.corner_mm[:, None]).max(initial=0.0)))
         x, y = self.corner_mm[:, 0], self.corner_mm[:, 1]
         far_x, far_y = x + 2 * reach * self.direction[:, 0], y + 2 * reach * self.direction[:, 1]

@@ -7,23 +7,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.scene.regions.checks import OneRowEach, batch
+from probewise.scene.regions.checks import RegionBatch, broadcast_fields
 
 
 @dataclass(frozen=True, eq=False)
-class RampRegion(OneRowEach):
+class RampRegion(RegionBatch):
     """Albedo per_mm (x . n), unbounded; fields (n_regions,)."""
 
     normal_rad: FloatArray
     per_mm: FloatArray
 
     def __post_init__(self) -> None:
-        batch(self, normal_rad=(), per_mm=())
+        broadcast_fields(self, normal_rad=(), per_mm=())
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         normal = self.normal_rad[:, None]
         return self.per_mm[:, None] * (points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal))
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels: exactly the value at their centres."""
+        """Return the mean albedo over turned square pixels: exactly the value at their centres."""
         return self.albedo(centers_mm)

@@ -10,12 +10,12 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import OneRowEach, batch, require_positive
+from probewise.scene.regions.checks import RegionBatch, broadcast_fields, require_positive
 from probewise.scene.regions.geometry import edge_distance
 
 
 @dataclass(frozen=True, eq=False)
-class StripesRegion(OneRowEach):
+class StripesRegion(RegionBatch):
     """Stripes where frac((x . n - phase) / period) < duty; fields (n_regions,)."""
 
     normal_rad: FloatArray
@@ -26,7 +26,7 @@ class StripesRegion(OneRowEach):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        batch(self, normal_rad=(), period_mm=(), duty=(), phase_mm=())
+        broadcast_fields(self, normal_rad=(), period_mm=(), duty=(), phase_mm=())
         require_positive("period_mm", self.period_mm)
         if ((self.duty < 0) | (self.duty > 1)).any():
             raise ParameterError("duty", self.duty.tolist(), "0 to 1")
@@ -36,7 +36,7 @@ class StripesRegion(OneRowEach):
         return np.where(share - np.floor(share) < self.duty[:, None], self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Mean albedo over turned square pixels, exact: (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         period = self.period_mm[:, None]
         along = self._along(centers_mm)
         along = along - period * np.floor(along / period)

@@ -51,7 +51,7 @@ def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
     one
         The paper's a, u, v, A, B, C of the Gaussian, with a for the whole mass, (n_samples, 6).
     bends
-        Coefficients of the basis, shares of the mass of either sign, (n_samples, N_BENDS).
+        Coefficients of the basis of shares that keep mean and covariance, of either sign, (n_samples, N_BENDS).
 
     Returns
     -------
@@ -74,14 +74,14 @@ def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
 
 
 def bends_of(theta: FloatArray) -> FloatArray:
-    """Invert `free_form`: coefficients of mixtures, (n_samples, 6 N_FREE_FORM) -> (n_samples, N_BENDS)."""
+    """Return the coefficients `bends` of free forms, (n_samples, 6 N_FREE_FORM) -> (n_samples, N_BENDS)."""
     blocks = theta.reshape(len(theta), N_FREE_FORM, 6)
     mass = blocks[..., 0] / np.sqrt(blocks[..., 3] * blocks[..., 4] - blocks[..., 5] ** 2)
     return np.asarray(mass[:, 1:] / mass.sum(axis=1, keepdims=True) @ _DIRECTIONS)
 
 
 def is_free_form(theta: FloatArray) -> bool:
-    """Whether mixtures, (n_samples, 6 n), are free forms, judged by the number and relative widths of the Gaussians."""
+    """Return whether mixtures, (n_samples, 6 n), are free forms, by the number and relative widths of the Gaussians."""
     if theta.shape[1] != 6 * N_FREE_FORM:
         return False
     blocks = theta.reshape(len(theta), N_FREE_FORM, 6)

@@ -22,7 +22,7 @@ from probewise.recordings import Disc, HalfPlane, Image, Pattern, Polygon, Quadr
 if TYPE_CHECKING:
     from probewise.arm import Geometry, Pose
     from probewise.cli._marks import Look
-    from probewise.emulator import SensorPose
+    from probewise.emulator import Stand
     from probewise.recordings import Instrumentation
     from probewise.world import Surface, World
 
@@ -50,7 +50,7 @@ class Bench:
     def __init__(self, world: World, scene: str, *, scale: LegoScale, seed: int, n_taken: int = 0) -> None:
         self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
         self._table = Table(parse_scene(scene))
-        self._stand: Callable[[], SensorPose] | None = None
+        self._stand: Callable[[], Stand] | None = None
 
     def simulated(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
         """Return the simulated arm over it, which turns its sensor itself."""
@@ -69,7 +69,7 @@ class Bench:
         """Return the LEGO arm over it, on an emulated brick."""
         surface, seed = self._table.surface, self._seed + self._n_taken
         arm, bench = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
-        self._table, self._stand = bench.table, bench.arm.sensor_pose
+        self._table, self._stand = bench.table, bench.arm.stand
         return arm
 
     def look(self, look: Look) -> str:

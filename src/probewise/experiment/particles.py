@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
 from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
-from probewise.inference.problem import SensorProblem, log_likelihoods
+from probewise.inference.problem import SensorProblem, scores
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
 from probewise.nested.weights import n_effective, resampled
@@ -300,7 +300,7 @@ class _Bridge:
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0
-        best = log_likelihoods(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
+        best = scores(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
         return float(self.perfect - best)
 
     @property
@@ -308,7 +308,7 @@ class _Bridge:
         """Log likelihood of the last reading under a perfect prediction; zero if it is missing."""
         recording = self.problem.recording
         reading = recording.readings[-1:]
-        return float(log_likelihoods(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
+        return float(scores(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
 
     def weigh(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
@@ -321,7 +321,7 @@ class _Bridge:
         """Return the log likelihood of these readings; zero for none."""
         if not rows.any():
             return np.zeros(len(predicted))
-        return log_likelihoods(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
+        return scores(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
 
     def cloud(self, theta: FloatArray) -> _Cloud:
         """Evaluate samples; the model is not evaluated outside the prior."""

@@ -25,10 +25,10 @@ from probewise.effects import (
     GainStep,
     Glint,
     Halo,
-    HeavyTailed,
+    HeavyTailedPrior,
     HeightOffset,
     Lag,
-    LogHeavyTailed,
+    LogHeavyTailedPrior,
     MissingTooth,
     Nonlinearity,
     PeriodicPositionError,
@@ -160,21 +160,21 @@ def test_a_spot_shows_alike_on_its_line_however_far_beside_it_lies():
 
 
 def test_a_heavy_tail_is_exact_at_both_ends():
-    prior = HeavyTailed(0.5)
+    prior = HeavyTailedPrior(0.5)
     u = np.array([1e-9, 1e-3, 0.2, 0.5, 0.8, 0.999, 1 - 1e-9])
     x = prior.from_unit(u)
     np.testing.assert_allclose(x, -x[::-1], rtol=1e-6, atol=1e-12)
-    positive = HeavyTailed(0.5, positive=True)
+    positive = HeavyTailedPrior(0.5, positive=True)
     np.testing.assert_allclose(positive.from_unit(np.array([0.6])), prior.from_unit(np.array([0.8])), rtol=1e-9)
     assert positive.log_prob(np.array([-1.0]))[0] == -np.inf
     # Twenty-five typical sizes are no surprise: the density there is far above a normal's.
     assert prior.log_prob(np.array([12.5]))[0] > -8
-    assert LogHeavyTailed(0.1).from_unit(np.array([0.5]))[0] == pytest.approx(1.0)
+    assert LogHeavyTailedPrior(0.1).from_unit(np.array([0.5]))[0] == pytest.approx(1.0)
 
 
 def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
     """Sds from one typical size: an eighth lies below half of that, where the wide mixture has nearly a half."""
-    wide, shown = HeavyTailed(0.5, positive=True), HeavyTailed(0.5, positive=True, smallest=1.0)
+    wide, shown = HeavyTailedPrior(0.5, positive=True), HeavyTailedPrior(0.5, positive=True, smallest=1.0)
     u = np.linspace(0.01, 0.99, 25)
     np.testing.assert_allclose(shown.to_unit(shown.from_unit(u)), u, atol=1e-9)
     x = np.linspace(0.0, 120.0, 240_001)
@@ -185,9 +185,9 @@ def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
 
 def test_a_heavy_tail_refuses_a_size_of_zero():
     with pytest.raises(ParameterError, match="greater than 0"):
-        HeavyTailed(0.0)
+        HeavyTailedPrior(0.0)
     with pytest.raises(ParameterError, match="smallest"):
-        HeavyTailed(1.0, smallest=30.0)
+        HeavyTailedPrior(1.0, smallest=30.0)
 
 
 def test_an_effect_that_could_not_show_is_not_built():

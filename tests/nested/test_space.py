@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import multivariate_t
 
 from probewise.calibration import SSFPrior, default_prior
-from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.nested.space import space_of, unbounded
 from probewise.priors import Empty, Joint, LogUniform, Normal, Prior, Product, Uniform
 from probewise.recordings import Recording, paper_plan
@@ -27,9 +27,9 @@ PRIORS = {
     "uniform": Product({"a": Uniform(-2.0, 5.0)}),
     "log-uniform": Product({"a": LogUniform(1e-3, 40.0)}),
     "normal": Product({"a": Normal(3.0, 0.5)}),
-    "heavy-tailed": Product({"a": HeavyTailed(2.0)}),
-    "positive heavy-tailed": Product({"a": HeavyTailed(0.1, positive=True)}),
-    "log heavy-tailed": Product({"a": LogHeavyTailed(0.2)}),
+    "heavy-tailed": Product({"a": HeavyTailedPrior(2.0)}),
+    "positive heavy-tailed": Product({"a": HeavyTailedPrior(0.1, positive=True)}),
+    "log heavy-tailed": Product({"a": LogHeavyTailedPrior(0.2)}),
     "joint": Joint((Product({"a": Uniform(0, 1)}), Empty(), Product({"b": Normal(0, 1), "c": LogUniform(1, 2)}))),
     "circle": Circle().prior,
     "circle inside": Circle(inside=True).prior,

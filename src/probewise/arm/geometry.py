@@ -288,7 +288,7 @@ class Geometry:
         return places[self.holds(places)]
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
-        """Solve the forward kinematics: joint angles to place and height of the sensor's face, lab frame; both (n, 3)."""
+        """Compute place and height of the sensor's face in the lab frame from joint angles, both (n, 3)."""
         return forward_kinematics_mm(
             angles_rad,
             self.links_mm,

@@ -1,4 +1,4 @@
-"""The physics that a sensor model may leave out, each effect one function at one stage of the chain.
+"""Effects: physics that a sensor model may leave out, each one function at one stage of the chain.
 
 The paper's model (eq. modelI) holds the footprint and two levels and nothing else; these are the named
 departures from it. A new effect is one class (a `NamedEffect`) and one line in `VOCABULARY`.
@@ -15,7 +15,7 @@ from probewise.effects.extent import Extent
 from probewise.effects.faults import Dropouts, Outliers
 from probewise.effects.gain import BatterySag, GainDrift
 from probewise.effects.glint import Glint
-from probewise.effects.heavy_tailed import HeavyTailed, LogHeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior, LogHeavyTailedPrior
 from probewise.effects.height import HeightGradient, HeightOffset
 from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Estimated, Informed, Known
@@ -75,7 +75,7 @@ VOCABULARY: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
         )
     }
 )
-"""Every effect that the diagnosis weighs, by name."""
+"""Every effect that the diagnosis considers, by name."""
 
 UNNAMED: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType(
     {
@@ -89,11 +89,11 @@ EFFECTS: Mapping[str, type[NamedEffect[Any]]] = MappingProxyType({**VOCABULARY, 
 """Every effect that has a formula here, by name, in the vocabulary or out of it."""
 
 PROPOSAL = "formula:"
-"""Prefix of the names of proposed formulas: what a residual without a name may follow."""
+"""Prefix of the names of formulas that are proposed for a residual which no named effect explains."""
 
 
 def is_out_of_vocabulary(name: str) -> bool:
-    """Whether an effect has a formula but no name in the vocabulary."""
+    """Return whether an effect has a formula but no name in the vocabulary."""
     return name in UNNAMED or name.startswith(PROPOSAL)
 
 
@@ -107,18 +107,24 @@ def public_name(name: str) -> str:
 
 
 def spoken_name(name: str) -> str:
-    """Write a name with spaces for underscores, unless it is one of a user's own columns, parameters or states."""
+    """Write an effect's name with spaces for underscores, unless it holds a user's column, parameter or state."""
     own = public_name(name)
     return own if ":" in own else own.replace("_", " ")
 
 
 def first_of(name: str) -> str | None:
-    """Return the first copy, which a second copy requires; None for an effect that needs no other."""
+    """Return the name of the first copy if `name` is that of a second copy, otherwise None."""
     return name.removesuffix(AGAIN) if name.endswith(AGAIN) else None
 
 
 sign_of_move = sign_of_motion
 """The old name of `sign_of_motion`."""
+
+HeavyTailed = HeavyTailedPrior
+"""The old name of `HeavyTailedPrior`."""
+
+LogHeavyTailed = LogHeavyTailedPrior
+"""The old name of `LogHeavyTailedPrior`."""
 
 NUISANCES: Mapping[str, type[NoiseEffect]] = MappingProxyType({DriftingNoise.name: DriftingNoise})
 """Departures of the noise that have no name in the vocabulary; they only keep the tests of the mean valid."""
@@ -151,14 +157,14 @@ __all__ = [
     "GainStep",
     "Glint",
     "Halo",
-    "HeavyTailed",
+    "HeavyTailedPrior",
     "HeightGradient",
     "HeightOffset",
     "Hysteresis",
     "Informed",
     "Known",
     "Lag",
-    "LogHeavyTailed",
+    "LogHeavyTailedPrior",
     "MissingTooth",
     "NamedEffect",
     "NoiseEffect",

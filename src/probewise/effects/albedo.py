@@ -117,7 +117,7 @@ class GradedRegion:
 
 @seen_by_one.register
 def _(region: GradedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """By Stein's lemma: the field at the footprint's centre times the response, plus a central difference of it."""
+    """Integrate by Stein's lemma: response times field at the centre, plus a central difference of the response."""
     a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
     x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
     rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
@@ -159,7 +159,7 @@ class PatchedRegion:
 
 @seen_by_one.register
 def _(region: PatchedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """By the convolution of two Gaussians: the patch under N(m, C) is a bell of covariance C + r^2."""
+    """Integrate the region, then add the patch: under N(m, C) it is a bell of covariance C + r^2 about its centre."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
     from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
     var_x, var_y = gaussian.var_x + r**2, gaussian.var_y + r**2

@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.vocabulary import Gates, NamedEffect, V
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
@@ -45,7 +45,7 @@ class ChangePointEffect(NamedEffect[V]):
     @cached_property
     def prior(self) -> Product:
         """Sizes of either sign, and the time: uniform over the recording, or between two chosen readings."""
-        sizes = {name: HeavyTailed(size) for name, size in self.sizes.items()}
+        sizes = {name: HeavyTailedPrior(size) for name, size in self.sizes.items()}
         return Product({**sizes, "at_s": Uniform(*self.open_s)})
 
     def bank(self) -> FloatArray:
@@ -55,7 +55,7 @@ class ChangePointEffect(NamedEffect[V]):
 
     @property
     def open_s(self) -> tuple[float, float]:
-        """The interval in which the change point may lie, s."""
+        """Bounds of the interval in which the change point may lie, s."""
         return self.between_s or (self.times_s[0], self.times_s[-1])
 
     @staticmethod
@@ -80,7 +80,7 @@ class ChangePointEffect(NamedEffect[V]):
         return Gates(always, np.array([plan.time_s > at for at in middles]))
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw the time of change from all intervals by their weight."""
+        """Redraw the time of change over all intervals by their weight, theta (n_samples, n_params)."""
         times = np.array(self.times_s)
         chosen = rng.choice(len(weights), len(theta), p=weights)
         at_s = times[chosen] + np.diff(times)[chosen] * rng.random(len(theta))

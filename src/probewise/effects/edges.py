@@ -1,4 +1,4 @@
-"""Effects at the edges between black and white: blur, shadow, and a halo that sees edges from afar."""
+"""Effects at the edges between black and white: blur, shadow, and a halo of light scattered from farther away."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.patches import bell
 from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
@@ -154,7 +154,7 @@ class EdgeShadow(NamedEffect[View]):
 
     @cached_property
     def prior(self) -> Product:
-        return Product({"amp": HeavyTailed(self.typical), "w": LogUniform(self.narrowest_mm, self.widest_mm)})
+        return Product({"amp": HeavyTailedPrior(self.typical), "w": LogUniform(self.narrowest_mm, self.widest_mm)})
 
     def apply(self, value: View, theta: FloatArray, plan: Plan) -> View:
         everywhere = (1, len(plan))

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
 from probewise.priors import LogUniform, Product
@@ -42,7 +42,7 @@ class GainDrift(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        return Product({"frac": HeavyTailed(self.typical), "tau_s": LogUniform(self.shortest_s, self.longest_s)})
+        return Product({"frac": HeavyTailedPrior(self.typical), "tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         # A negative time would let the exponential overflow.

@@ -19,7 +19,7 @@ _N_SCALES = 9
 
 
 @dataclass(frozen=True)
-class HeavyTailed:
+class HeavyTailedPrior:
     """Scale mixture of normal distributions about zero, with sds from 0.05 to 25 times a typical size.
 
     The weights are equal, so the density falls about as 1/abs(x) over three decades and is
@@ -32,9 +32,11 @@ class HeavyTailed:
 
     def __post_init__(self) -> None:
         if not 0 < self.typical < math.inf:
-            raise ParameterError("HeavyTailed(typical)", self.typical, "greater than 0, finite")
+            raise ParameterError("HeavyTailedPrior(typical)", self.typical, "greater than 0, finite")
         if not 0 < self.smallest < SMALLEST_AND_LARGEST[1]:
-            raise ParameterError("HeavyTailed(smallest)", self.smallest, f"0 < smallest < {SMALLEST_AND_LARGEST[1]:g}")
+            raise ParameterError(
+                "HeavyTailedPrior(smallest)", self.smallest, f"0 < smallest < {SMALLEST_AND_LARGEST[1]:g}"
+            )
 
     @cached_property
     def _sds(self) -> FloatArray:
@@ -106,15 +108,15 @@ def _quantiles(smallest: float) -> _Quantiles:
 
 
 @dataclass(frozen=True)
-class LogHeavyTailed:
+class LogHeavyTailedPrior:
     """Prior of a factor or exponent near one: its logarithm is heavy-tailed about zero."""
 
     typical_log: float
     smallest: float = SMALLEST_AND_LARGEST[0]
 
     @cached_property
-    def _log(self) -> HeavyTailed:
-        return HeavyTailed(self.typical_log, smallest=self.smallest)
+    def _log(self) -> HeavyTailedPrior:
+        return HeavyTailedPrior(self.typical_log, smallest=self.smallest)
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Evaluate the quantile function, any shape."""

@@ -1,4 +1,4 @@
-"""An effect whose parameters are known: exactly, or to within what a run has left open."""
+"""Effects whose parameters are known: fixed, or with the prior that an earlier run leaves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.wrapped import Wrapped
+from probewise.effects.wrapped_effect import WrappedEffect
 from probewise.errors import ParameterError
 from probewise.priors import Empty, Marginal, Prior, Product
 from probewise.recordings.plan import Plan
@@ -18,8 +18,8 @@ V = TypeVar("V")
 
 
 @dataclass(frozen=True)
-class Known(Wrapped[V]):
-    """Fix an effect's parameters, so that the robot can use a repaired sensor like any other.
+class Known(WrappedEffect[V]):
+    """An effect with fixed parameters, so that the robot can use a repaired sensor like any other.
 
     `values` are in the order of `effect.prior.names`.
     """
@@ -41,8 +41,8 @@ class Known(Wrapped[V]):
 
 
 @dataclass(frozen=True)
-class Informed(Wrapped[V]):
-    """An effect with another prior: what is known of its parameters already."""
+class Informed(WrappedEffect[V]):
+    """An effect whose prior is `own`, from what is known of its parameters, instead of its usual one."""
 
     effect: Effect[V]
     own: Prior
@@ -54,10 +54,10 @@ class Informed(Wrapped[V]):
 
 @dataclass(frozen=True)
 class Estimated(Known[V]):
-    """An effect fixed at an estimate of its parameters, which remembers how well they are known.
+    """An effect fixed at an estimate of its parameters, with their uncertainty.
 
-    `marginals` are what is known of each, in the order of `values`. A run that trusts its sensor takes the values;
-    one that doubts it infers them along with the shape (`informed`).
+    `marginals` are the distributions of the parameters, in the order of `values`. A run that trusts its sensor uses the
+    values; one that doubts it infers the parameters along with the shape (`informed`).
     """
 
     marginals: tuple[Marginal, ...] = ()

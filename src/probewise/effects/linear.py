@@ -1,4 +1,4 @@
-"""Bases of effects that are linear in all their parameters: the formula is all that is left to write."""
+"""Bases of effects that are linear in all their parameters; a subclass adds the formula."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.vocabulary import NamedEffect, V
 from probewise.priors import Product
 
@@ -38,7 +38,7 @@ class LinearEffect(NamedEffect[V]):
     @cached_property
     def prior(self) -> Product:
         """The same heavy-tailed prior for each parameter."""
-        size = HeavyTailed(self._typical, positive=self.positive)
+        size = HeavyTailedPrior(self._typical, positive=self.positive)
         return Product(dict.fromkeys(self.parameters, size))
 
     def bank(self) -> FloatArray:

@@ -15,7 +15,7 @@ def sign_of_motion(plan: Plan) -> FloatArray:
 
 
 def direction_varies(plan: Plan) -> bool:
-    """Whether the signs of motion differ: forward and back, or moving and at rest."""
+    """Return whether the signs of motion differ: forward and back, or moving and at rest."""
     return bool(np.ptp(sign_of_motion(plan)) > 0)
 
 

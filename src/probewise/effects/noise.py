@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import LogHeavyTailed
+from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
 from probewise.effects.noise_distribution import NoiseRows
 from probewise.effects.vocabulary import NoiseEffect, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
@@ -184,7 +184,7 @@ class NoisePerRun(NoiseEffect):
     @cached_property
     def prior(self) -> Product:
         """Independent priors of the runs' values."""
-        return Product({f"values[{run}]": LogHeavyTailed(0.3) for run in self.runs})
+        return Product({f"values[{run}]": LogHeavyTailedPrior(0.3) for run in self.runs})
 
     def bank(self) -> FloatArray:
         """Return one entry, 1 in every run: `weighed_nodes` finds the values from a fit's residuals."""

@@ -14,7 +14,7 @@ from typing import ClassVar, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.vocabulary import NamedEffect, V, entries
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -32,7 +32,7 @@ def bell(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class ScanLine:
-    """Places s t + offset_mm n, s from low_mm to high_mm; t at `angle_rad` to X, n a quarter turn further."""
+    """A line of places s t + offset_mm n, s from low_mm to high_mm; t at `angle_rad` to X, n a quarter turn further."""
 
     angle_rad: float
     offset_mm: float
@@ -45,12 +45,12 @@ class ScanLine:
         return self.high_mm - self.low_mm
 
     def place(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return X and Y of places given by their position along the line and distance from it."""
+        """Return X and Y of places given by their position along the line and their distance from it; all broadcast."""
         c, s, n = np.cos(self.angle_rad), np.sin(self.angle_rad), self.offset_mm + beside_mm
         return c * along_mm - s * n, s * along_mm + c * n
 
     def coordinates(self, x_mm: FloatArray, y_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Invert `place`."""
+        """Return the position along the line and the distance from it of places X, Y: the inverse of `place`."""
         c, s = np.cos(self.angle_rad), np.sin(self.angle_rad)
         return c * x_mm + s * y_mm, c * y_mm - s * x_mm - self.offset_mm
 
@@ -106,7 +106,7 @@ class PatchPrior:
         line, length = self.line, self.line.length_mm
         return Product(
             {
-                "on_line": HeavyTailed(self.typical),
+                "on_line": HeavyTailedPrior(self.typical),
                 "along": Uniform(line.low_mm - _MARGIN * length, line.high_mm + _MARGIN * length),
                 "beside": self.BESIDE,
                 "r": self.radius,

@@ -14,14 +14,14 @@ from probewise.sensor.stages import NoiseLevel
 
 @dataclass(eq=False)
 class PredictiveMixture:
-    """Accumulate the predictions of posterior samples, block by block: their mixture is the predictive distribution.
+    """The predictive distribution of readings: the mixture of posterior samples' predictions, added block by block.
 
     Parameters
     ----------
     readings
         Measured readings, (n_points,).
     scored
-        Which readings get a log density, (n_points,).
+        Whether each reading gets a log density, (n_points,).
     step
         The declared rounding step, if any.
     """

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.vocabulary import NamedEffect, give_or_take
 from probewise.priors import Product, Uniform
@@ -82,7 +82,7 @@ class MissingTooth(NamedEffect[Poses]):
     def prior(self) -> Product:
         """Jump, of either sign, its place, and its axis: 0 for X, 1 for Y."""
         axis = Uniform(self.along - 0.5, self.along + 0.5)
-        return Product({"amp_mm": HeavyTailed(self.typical_mm), "at_mm": Uniform(*self.between_mm), "axis": axis})
+        return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "at_mm": Uniform(*self.between_mm), "axis": axis})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         along_y = theta[:, 2:3] > 0.5

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
@@ -41,7 +41,7 @@ class Reflection(NamedEffect[Footprint]):
     @cached_property
     def prior(self) -> Product:
         reach = Uniform(-self.farthest_mm, self.farthest_mm)
-        return Product({"share": HeavyTailed(self.typical, positive=True), "dx_mm": reach, "dy_mm": reach})
+        return Product({"share": HeavyTailedPrior(self.typical, positive=True), "dx_mm": reach, "dy_mm": reach})
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         share = np.clip(theta[:, :1, None], 0.0, 1.0)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.heavy_tailed import LogHeavyTailed
+from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
 from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
@@ -35,7 +35,7 @@ class Nonlinearity(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        return Product({"gamma": LogHeavyTailed(self.typical_log)})
+        return Product({"gamma": LogHeavyTailedPrior(self.typical_log)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         return np.asarray(np.clip(value, 0.0, 1.0) ** theta[:, :1])

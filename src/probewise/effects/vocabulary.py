@@ -82,7 +82,7 @@ class NamedEffect(Effect[V], Protocol[V]):
         return cls()
 
     def is_of_the_ssf(self, plan: Plan) -> bool:
-        """Whether a free SSF absorbs the effect completely under this plan, so that it cannot be identified.
+        """Return whether a free SSF absorbs the effect completely under this plan, so that it cannot be identified.
 
         By default False.
         """
@@ -132,7 +132,7 @@ class NamedEffect(Effect[V], Protocol[V]):
         return self
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the parameter that names the variant from all variants by weight, theta (n_samples, n_params).
+        """Redraw the parameter that the variant determines, over all variants by weight, theta (n_samples, n_params).
 
         By default theta is returned as it is.
         """
@@ -181,7 +181,7 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
 
     @property
     def seen(self) -> FloatArray | None:
-        """Parameters (n_params,) that the readings show beyond doubt; by default None: a fit must show them."""
+        """Parameters (n_params,) that are certain from the readings alone; by default None: they take a fit."""
         return None
 
     def change(self, predicted: FloatArray) -> FloatArray:

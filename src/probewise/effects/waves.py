@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.heavy_tailed import HeavyTailed
+from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.vocabulary import NamedEffect, V, entries, give_or_take
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -23,7 +23,7 @@ _ORDERS = np.arange(1, 7)  # harmonics of a sawtooth; the slip takes a sixth of 
 _SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, damped against Gibbs overshoot
 
 
-class _Wave(NamedEffect[V]):
+class _WaveEffect(NamedEffect[V]):
     """Base of effects with an amplitude, a frequency or period, and a phase; a bank entry holds sine and cosine."""
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
@@ -32,7 +32,7 @@ class _Wave(NamedEffect[V]):
 
 
 @dataclass(frozen=True)
-class Flicker(_Wave[FloatArray]):
+class Flicker(_WaveEffect[FloatArray]):
     """One frequency in the light: reading + amp sin(2 pi alias_hz t + phase).
 
     The mains frequency aliased by the sampling, or a slow lamp: any frequency up to half the rate of readings.
@@ -63,7 +63,7 @@ class Flicker(_Wave[FloatArray]):
     @cached_property
     def prior(self) -> Product:
         frequency = Uniform(self.lowest_hz, self.highest_hz)
-        return Product({"amp": HeavyTailed(self.typical, positive=True), "alias_hz": frequency, "phase": _PHASE})
+        return Product({"amp": HeavyTailedPrior(self.typical, positive=True), "alias_hz": frequency, "phase": _PHASE})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         wave = np.sin(2 * np.pi * theta[:, 1:2] * plan.time_s + theta[:, 2:3])
@@ -82,7 +82,7 @@ class Flicker(_Wave[FloatArray]):
 
 
 @dataclass(frozen=True)
-class PeriodicPositionError(_Wave[Poses]):
+class PeriodicPositionError(_WaveEffect[Poses]):
     """A gear or lead screw that is not round: X + amp_mm sin(2 pi X / period_mm + phase)."""
 
     typical_mm: float = 0.3
@@ -104,7 +104,7 @@ class PeriodicPositionError(_Wave[Poses]):
 
     @cached_property
     def prior(self) -> Product:
-        amp = HeavyTailed(self.typical_mm, positive=True)
+        amp = HeavyTailedPrior(self.typical_mm, positive=True)
         return Product({"amp_mm": amp, "period_mm": LogUniform(self.shortest_mm, self.longest_mm), "phase": _PHASE})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -151,7 +151,7 @@ class StickSlip(NamedEffect[Poses]):
     def prior(self) -> Product:
         """Amplitude, of either sign, period (log-uniform), and phase in turns."""
         period = LogUniform(self.shortest_mm, self.longest_mm)
-        return Product({"amp_mm": HeavyTailed(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
+        return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         turns = 2 * np.pi * (value.x_mm / theta[:, 1:2] + theta[:, 2:3])

@@ -1,4 +1,4 @@
-"""Base of effects that change one thing of another effect: its parameters, its prior, or its time."""
+"""Base of effects that wrap another effect and change its parameters, its prior, or its time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from probewise.sensor.stages import Effect, Stage
 V = TypeVar("V")
 
 
-class Wrapped(Effect[V]):
-    """An effect that is as the one in `effect` but for what a subclass overrides."""
+class WrappedEffect(Effect[V]):
+    """An effect that passes everything on to `effect`, except what a subclass overrides."""
 
     effect: Effect[V]
 

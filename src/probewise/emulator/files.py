@@ -59,7 +59,7 @@ class Files:
         return self._capacity - promised - sum(len(content) for content in self._files.values())
 
     def exists(self, name: str) -> bool:
-        """Whether a file exists; names are not case-sensitive."""
+        """Return whether a file exists; names are not case-sensitive."""
         return self._matching_name(name) is not None
 
     def _open_read(self, name: bytes) -> bytes:

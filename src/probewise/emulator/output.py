@@ -180,7 +180,7 @@ class Output:
         self.run_state = run_state
 
     def _is_past(self, ramp: int, power: int) -> bool:
-        """Whether a ramp to this power, up or down, has already reached it."""
+        """Return whether a ramp to this power, up or down, has already reached it."""
         if ramp == RunState.RAMP_UP:
             return self.set_power != 0 and (self.set_power >= power if power > 0 else self.set_power <= power)
         return self.set_power <= power if self.target_power >= 0 else self.set_power >= power

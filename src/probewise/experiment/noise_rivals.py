@@ -12,7 +12,14 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.effects import CorrelatedNoise, HeavyTailed, Outliers, SignalDependentNoise, lattice_step, log_density
+from probewise.effects import (
+    CorrelatedNoise,
+    HeavyTailedPrior,
+    Outliers,
+    SignalDependentNoise,
+    lattice_step,
+    log_density,
+)
 from probewise.effects.density import log_gaussian_density
 from probewise.priors import LogUniform
 from probewise.sensor import NoiseLevel
@@ -209,7 +216,7 @@ def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, L
     dark, bright = ends
     low, high = sorted(ends)
     shares, sizes = Outliers().bank()[:, 0].T
-    amplitudes = HeavyTailed(0.01 * (high - low), positive=True).from_unit((np.arange(6) + 0.5) / 6)
+    amplitudes = HeavyTailedPrior(0.01 * (high - low), positive=True).from_unit((np.arange(6) + 0.5) / 6)
     return {
         "outliers": Tailed(sd, step, shares, sizes),
         "dropouts": Lost(sd, step, dark, low, high),

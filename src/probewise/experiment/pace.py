@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.effects.wrapped import Wrapped
+from probewise.effects.wrapped_effect import WrappedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor.stages import Effect, Poses
 
@@ -64,7 +64,7 @@ class Told(Effect[Any], Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Paced(Wrapped[FloatArray]):
+class Paced(WrappedEffect[FloatArray]):
     """An effect in time, in the run's own time: its prior, and its formula if the plan has that time."""
 
     effect: Told
@@ -87,7 +87,7 @@ class Paced(Wrapped[FloatArray]):
 
 
 @dataclass(frozen=True, eq=False)
-class FromRest(Wrapped[Any]):
+class FromRest(WrappedEffect[Any]):
     """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
 
     effect: Told

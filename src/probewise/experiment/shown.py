@@ -14,9 +14,9 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailed, LogHeavyTailed, NamedEffect
+from probewise.effects import HeavyTailedPrior, LogHeavyTailedPrior, NamedEffect
 from probewise.effects.patches import PatchPrior
-from probewise.effects.wrapped import Wrapped
+from probewise.effects.wrapped_effect import WrappedEffect
 from probewise.experiment.pace import EACH_S
 from probewise.priors import LogUniform, Prior, Product, Uniform
 
@@ -27,7 +27,7 @@ _SMALLEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Shown(Wrapped[Any]):
+class Shown(WrappedEffect[Any]):
     """An effect whose prior leaves out the sizes that a run on a field of this width and height cannot show."""
 
     effect: NamedEffect[Any]
@@ -40,7 +40,7 @@ class Shown(Wrapped[Any]):
         """The effect's prior, of sizes that show."""
         own = self.effect.prior
         if isinstance(own, PatchPrior):
-            size = HeavyTailed(own.typical, smallest=_SMALLEST)
+            size = HeavyTailedPrior(own.typical, smallest=_SMALLEST)
             x, y = (Uniform(0.0, length) for length in self.field_mm)
             return Product({own.size: size, "x": x, "y": y, "r": own.radius})
         if not isinstance(own, Product):
@@ -48,7 +48,7 @@ class Shown(Wrapped[Any]):
         return Product({name: self._marginal(name, marginal) for name, marginal in own.marginals.items()})
 
     def _marginal(self, name: str, marginal: Any) -> Any:
-        if isinstance(marginal, HeavyTailed | LogHeavyTailed):
+        if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
             return replace(marginal, smallest=_SMALLEST)
         return self.within_run.get(name, marginal)
 

@@ -44,7 +44,7 @@ def require_model(model: object) -> None:
     require_like("model", model, ("names", "predict"), allowed)
 
 
-def log_likelihoods(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+def scores(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return the log likelihood of each prediction, (n_points,), (n_samples, n_points) -> (n_samples,).
 
     Raises ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
@@ -96,5 +96,5 @@ class SensorProblem:
         usable = self.recording.usable
         predicted = self.model.predict(theta, self.recording.plan)
         if usable.all():
-            return log_likelihoods(self.likelihood, self.recording.readings, predicted)
-        return log_likelihoods(self.likelihood, self.recording.readings[usable], predicted[:, usable])
+            return scores(self.likelihood, self.recording.readings, predicted)
+        return scores(self.likelihood, self.recording.readings[usable], predicted[:, usable])

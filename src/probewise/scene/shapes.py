@@ -327,9 +327,9 @@ class _AnyOfPrior:
         total = np.where(inside, np.log(np.asarray(self.weights))[which], -np.inf)
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
             values = theta[:, columns]
-            taken = shape.prior.log_prob(values)
-            is_placed = isinstance(shape.prior, PlacedPrior) and self.shared
-            idle = shape.prior.own.log_prob(values[:, 2:]) if is_placed else taken
+            prior = shape.prior
+            taken = prior.log_prob(values)
+            idle = prior.own.log_prob(values[:, 2:]) if self.shared and isinstance(prior, PlacedPrior) else taken
             total = total + np.where(which == k, taken, idle)
         return total
 

@@ -227,8 +227,8 @@ class _CornerViews:
     """The distinct views of corners: the four quadrants about one corner share them.
 
     Three masses determine every quadrant: beyond the corner along both axes, along x, and along y. `turn_rad` is the
-    sensor's orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, (n_views,). Responses are
-    the masses times `readings_from_masses`, (3 n_views, n_rows), plus `low`, (n_rows,).
+    sensor's orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, (n_views,). The masses
+    times `readings_from_masses`, (3 n_views, n_rows), plus `low`, (n_rows,), are the responses.
     """
 
     turn_rad: FloatArray

@@ -68,5 +68,5 @@ class Rows:
         return np.isin(self.scan, chosen)
 
     def starts_scan(self) -> BoolArray:
-        """Whether each row is the first of its scan, shape (n_points,)."""
+        """Return whether each row is the first of its scan, shape (n_points,)."""
         return np.concatenate([[True], self.scan[1:] != self.scan[:-1]])

@@ -1,8 +1,8 @@
 """A null model whose sensor has a free-form SSF.
 
 The misfit of a few Gaussians to a real SSF looks like physics, and the evidence favours another Gaussian only if it
-gains ten nats or more. A free form (`probewise.sensor.free_form`) absorbs this misfit: small weights at many places, each
-with a normal prior, so that the evidence penalises only those used.
+gains ten nats or more. A free form (`probewise.sensor.free_form`) absorbs this misfit: small weights at many places,
+each with a normal prior, so that the evidence penalises only those used.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailed
+from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import Moments, with_unit
 from probewise.systems.table import RunTable
@@ -56,7 +56,7 @@ def drift(table: RunTable, time_unit: str) -> Modulation:
     """Linear drift in time as recorded: a t."""
     return Modulation(
         over=lambda theta, rows: theta[:, :1] * rows.time_s,
-        marginals=lambda size: {"a": HeavyTailed(size)},
+        marginals=lambda size: {"a": HeavyTailedPrior(size)},
         entries=_one,
         units=lambda unit: (f"{unit}/{time_unit}",),
         says=lambda what, unit, mean, sd: f"{what} drifts by {with_unit(mean[0], sd[0], unit)} per {time_unit}",
@@ -74,7 +74,7 @@ def column(name: str, table: RunTable) -> Modulation:
 
     return Modulation(
         over=over,
-        marginals=lambda size: {"a": HeavyTailed(size)},
+        marginals=lambda size: {"a": HeavyTailedPrior(size)},
         entries=_one,
         units=lambda unit: (f"{unit} per {name}",),
         says=lambda what, unit, mean, sd: f"{what} changes by {with_unit(mean[0], sd[0], unit)} per unit of {name}",
@@ -99,7 +99,7 @@ def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
 
     return Modulation(
         over=over,
-        marginals=lambda size: {"a": HeavyTailed(size), name: Uniform(at[0], at[-1])},
+        marginals=lambda size: {"a": HeavyTailedPrior(size), name: Uniform(at[0], at[-1])},
         entries=lambda size: np.array([[[size, 0.5 * (at[0] + at[-1])]]]),
         units=lambda unit: (unit, "row" if by_row else time_unit),
         says=says,
@@ -124,7 +124,7 @@ def per_run(table: RunTable) -> Modulation:
 
     return Modulation(
         over=over,
-        marginals=lambda size: {f"values[{name}]": HeavyTailed(size) for name in names},
+        marginals=lambda size: {f"values[{name}]": HeavyTailedPrior(size) for name in names},
         entries=lambda size: size * np.eye(len(names))[None, :, :],
         units=lambda unit: (unit,) * len(names),
         says=says,
@@ -167,7 +167,7 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
     return Modulation(
         over=over,
         marginals=lambda size: {
-            "a": HeavyTailed(size, positive=True),
+            "a": HeavyTailedPrior(size, positive=True),
             "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
             "phase": _PHASE,
         },

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailed
+from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -149,7 +149,7 @@ def _switch(about: About, name: str) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {"a": HeavyTailed(typical), "at": Uniform(at[0], at[-1])},
+        {"a": HeavyTailedPrior(typical), "at": Uniform(at[0], at[-1])},
         (own.unit, name),
         (name,),
         act,
@@ -186,7 +186,7 @@ def _square_wave(about: About) -> Iterator[Form]:
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
         {
-            "a": HeavyTailed(typical),
+            "a": HeavyTailedPrior(typical),
             "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
             "phase": Uniform(-1.0, 1.0),
             "share": Uniform(0.03, 0.97),
@@ -254,7 +254,7 @@ def _proposal(
     yield Form(
         f"formula:{side}:{target}:{term.text}",
         stage,
-        {"a": HeavyTailed(typical)},
+        {"a": HeavyTailedPrior(typical)},
         ("",),
         where,
         act,

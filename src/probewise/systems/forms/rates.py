@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailed
+from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -79,7 +79,7 @@ def _term(
     yield Form(
         name,
         Stage.RATE,
-        {"a": HeavyTailed(typical)},
+        {"a": HeavyTailedPrior(typical)},
         (unit,),
         (f"state:{other}", "time"),
         act,
@@ -132,7 +132,7 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
     if typical is None:
         return
     marginals = {
-        "a": HeavyTailed(typical, positive=True),
+        "a": HeavyTailedPrior(typical, positive=True),
         "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
         "phase": Uniform(-2 * np.pi, 2 * np.pi),
     }

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailed
+from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
@@ -120,7 +120,7 @@ def _settling(about: About) -> Iterator[Form]:
     yield Form(
         "settling",
         Stage.OFFSET,
-        {"a": HeavyTailed(typical), "tau_s": LogUniform(shortest, 2 * longest)},
+        {"a": HeavyTailedPrior(typical), "tau_s": LogUniform(shortest, 2 * longest)},
         (unit, time_unit),
         ("time", "run"),
         act,
@@ -231,7 +231,7 @@ def _hysteresis(about: About) -> Iterator[Form]:
     yield Form(
         "hysteresis",
         Stage.OFFSET,
-        {"a": HeavyTailed(about.sd)},
+        {"a": HeavyTailedPrior(about.sd)},
         (unit,),
         ("previous",),
         act,
@@ -266,7 +266,7 @@ def _bend(about: About) -> Iterator[Form]:
     yield Form(
         "nonlinearity",
         Stage.BEND,
-        {"a": HeavyTailed(typical), "power": LogUniform(0.4, 5.0)},
+        {"a": HeavyTailedPrior(typical), "power": LogUniform(0.4, 5.0)},
         ("1", "1"),
         ("level",),
         act,

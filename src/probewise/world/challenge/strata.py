@@ -34,8 +34,8 @@ WHEEL: tuple[Stratum, ...] = (
     Stratum("ssf_order", 12.0),
 )
 """The cycle of 60 cases. A hundred cycles have 2,500 clean cases (500 of them with other noise), 2,500 of one effect
-(1,300 at lambda 8, of these 100 with other noise; 500 at 20), 300 pairs, 500 outside the vocabulary, 100 aliases and 100
-with one more Gaussian.
+(1,300 at lambda 8, of these 100 with other noise; 500 at 20), 300 pairs, 500 outside the vocabulary, 100 aliases and
+100 with one more Gaussian.
 """
 
 _STRIDE = 23  # coprime to the length of the cycle, so that successive cases differ in kind

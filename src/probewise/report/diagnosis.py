@@ -301,7 +301,7 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
         return ()
     return (
         table(
-            ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree within a nat"),
+            ("explanation", "Gaussians", "ln Z, Laplace", "ln Z, nested sampling", "agree to a nat and the error"),
             (
                 (
                     hypothesis_in_words(w.effects),

@@ -18,7 +18,7 @@ from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant, Stripes, Uniform
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, GREY, VERMILLION
-from probewise.report.sheets import BOTTOM_MM, LEFT_MM, PAPERS_MM, Sheet, Tile, tiles_of
+from probewise.report.sheets import BOTTOM_MM, LEFT_MM, OVERLAP_MM, PAPERS_MM, Sheet, Tile, tiles_of
 from probewise.scene import region_of
 
 _MM_PER_IN = 25.4
@@ -90,8 +90,8 @@ def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Fi
     ax.text(LEFT_MM, top, title, fontsize=_LARGE, va="baseline")
     told = (
         "Print at 100 % (actual size; no 'fit to page'), on matt paper, and measure the ruler: it is 100 mm long.",
-        "A sheet of several pages: cut each page along the corner marks at its left and lower side, lay it on the",
-        "strip that its neighbour prints beyond the marks, mark on mark, and glue it there.",
+        "A sheet of several pages: cut each page along the corner marks at its left and lower side, and glue it, mark",
+        "on mark, on the strip that its neighbour prints beyond the marks. Each strip says which page lies there.",
         "Ticks in the margins show x = 0 and y = 0. All is seen from above, x to the right, y up (away from you).",
         "Lay a sheet so that these ticks are where `arm record` says that the origin is, the sheet's x axis along",
         "the field's. At orientation 0 the sensor's x' axis is along x, the photodiode on the side of y; it turns",
@@ -182,23 +182,26 @@ def _page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: s
         ax.plot([far_x + 0.5, far_x + 5.0], [y, y], **heavy)
         ax.text(x0 - 10.0, y, "y = 0", color=VERMILLION, rotation=90, **said)
     _ruler(ax, LEFT_MM, 6.5)
-    place = f", column {tile.column + 1}, row {tile.row + 1}" if len(tiles) > 1 else ""
+    place = f", {number}, column {tile.column + 1}, row {tile.row + 1}" if len(tiles) > 1 else ""
     ax.text(
         LEFT_MM + 3.0, tile.page_mm[1] - 6.0, f"{sheet.name}{place}: {sheet.lines[0]}", fontsize=_USUAL, va="center"
     )
     ax.text(tile.page_mm[0] - 10.0, 6.0, number, fontsize=_SMALL, ha="right", va="center")
-    joins = _joining_pages(tiles, tile, first)
-    ax.text(tile.page_mm[0] - 10.0, 10.0, joins, fontsize=_SMALL, ha="right", va="center")
+    _label_strips(ax, tiles, tile, first)
     return ax.figure  # type: ignore[return-value]
 
 
-def _joining_pages(tiles: Sequence[Tile], tile: Tile, first: int) -> str:
-    """Name the pages to be glued on this page's strips."""
-    at = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
-    right, above = at.get((tile.column + 1, tile.row)), at.get((tile.column, tile.row + 1))
-    said = [f"right strip: page {right}"] if right else []
-    said += [f"upper strip: page {above}"] if above else []
-    return "; ".join(said)
+def _label_strips(ax: Axes, tiles: Sequence[Tile], tile: Tile, first: int) -> None:
+    """Print on each strip the page to be glued on it: margins are cut off, strips are not."""
+    number = {(t.column, t.row): first + k for k, t in enumerate(tiles)}
+    (left, bottom), (right, top) = tile.on_page_mm(np.array([tile.low_mm, tile.high_mm])).tolist()
+    upright = ((tile.column + 1, tile.row), (right + OVERLAP_MM / 2, (bottom + top) / 2), 90.0)
+    level = ((tile.column, tile.row + 1), ((left + right) / 2, top + OVERLAP_MM / 2), 0.0)
+    white = {"boxstyle": "square,pad=0.2", "fc": "white", "ec": "none"}  # legible on black
+    text: dict[str, Any] = {"fontsize": _SMALL, "ha": "center", "va": "center", "bbox": white, "zorder": 5}
+    for neighbour, (x, y), rotation in (upright, level):
+        if neighbour in number:
+            ax.text(x, y, f"page {number[neighbour]} lies here", rotation=rotation, **text)
 
 
 def _ruler(ax: Axes, x_mm: float, y_mm: float) -> None:

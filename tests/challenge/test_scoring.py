@@ -3,39 +3,39 @@
 import pytest
 
 from probewise.challenge.scoring import (
-    accepted,
-    answers,
-    extras,
-    fits,
-    is_outside,
+    count_extras,
+    effects_to_name,
+    is_out_of_vocabulary,
     is_physics,
     leading_name_right,
-    stated,
+    leading_probability,
+    names_match,
+    right_names,
 )
 
 
 def test_what_fewer_than_three_nats_tell_apart_is_the_same(make):
     """lambda 12: 72 (1 - rho^2) is 2.87 at rho .98 and 4.26 at .97."""
-    found = accepted(make.hidden("lag", 12.0, cosines={"lag": 1.0, "backlash": 0.98, "halo": 0.97}))
+    found = right_names(make.hidden("lag", 12.0, cosines={"lag": 1.0, "backlash": 0.98, "halo": 0.97}))
     assert found == {"lag", "backlash"}
 
 
 def test_a_larger_effect_has_fewer_aliases(make):
     """lambda 20: 200 (1 - .98^2) is 7.9 nats."""
-    assert accepted(make.hidden("lag", 20.0, cosines={"lag": 1.0, "backlash": 0.98})) == {"lag"}
+    assert right_names(make.hidden("lag", 20.0, cosines={"lag": 1.0, "backlash": 0.98})) == {"lag"}
 
 
 def test_what_has_no_name_is_unknown_unless_it_is_like_one(make):
     chirp = make.outside(cosines={"flicker": 0.89})
-    assert is_outside(chirp)
-    assert answers(chirp, merged=True) == [{"unknown"}]
+    assert is_out_of_vocabulary(chirp)
+    assert effects_to_name(chirp, merged=True) == [{"unknown"}]
     like = make.outside(cosines={"flicker": 0.9})
-    assert not is_outside(like)
-    assert answers(like, merged=False) == [{"flicker"}]
+    assert not is_out_of_vocabulary(like)
+    assert effects_to_name(like, merged=False) == [{"flicker"}]
 
 
 def test_one_gaussian_more_is_nothing_to_name(make):
-    assert answers(make.case("ssf_order", 12.0, hides=[make.hidden("ssf_order", 12.0)]), merged=True) == []
+    assert effects_to_name(make.case("ssf_order", 12.0, hides=[make.hidden("ssf_order", 12.0)]), merged=True) == []
 
 
 @pytest.mark.parametrize(
@@ -43,12 +43,12 @@ def test_one_gaussian_more_is_nothing_to_name(make):
     [(("a", "c"), True), (("c", "b"), True), (("a",), False), (("a", "b"), False), (("a", "c", "d"), False)],
 )
 def test_names_stand_one_to_one(names, right):
-    assert fits(names, [{"a", "b"}, {"c"}]) is right
+    assert names_match(names, [{"a", "b"}, {"c"}]) is right
 
 
 @pytest.mark.parametrize(("names", "n"), [((), 0), (("a",), 0), (("a", "b"), 1), (("d", "c"), 1), (("a", "c", "d"), 1)])
 def test_a_name_that_stands_for_nothing_is_an_extra(names, n):
-    assert extras(names, [{"a", "b"}, {"c"}]) == n
+    assert count_extras(names, [{"a", "b"}, {"c"}]) == n
 
 
 def test_clean_ahead_of_the_right_name_leaves_it_first_of_the_names(make):
@@ -69,9 +69,9 @@ def test_an_effect_on_the_noise_has_to_be_named_itself(make):
 
 def test_a_probability_is_held_against_the_exact_truth(make):
     alias = make.hidden("lag", cosines={"lag": 1.0, "backlash": 1.0})
-    assert stated(make.single(hide=alias, p=0.8)) == (0.8, True)
-    assert stated(make.single(hide=alias, said=["backlash"], p=0.8)) == (0.8, False)
-    assert stated(make.case(p=0.6)) == (0.6, True)
+    assert leading_probability(make.single(hide=alias, p=0.8)) == (0.8, True)
+    assert leading_probability(make.single(hide=alias, said=["backlash"], p=0.8)) == (0.8, False)
+    assert leading_probability(make.case(p=0.6)) == (0.6, True)
 
 
 def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
@@ -80,9 +80,9 @@ def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
     for hide, free in ((like, True), (unlike, False)):
         found = make.single("halo", hide=hide)
         assert is_physics(found) != free
-        assert fits((), answers(found, merged=True)) == free
-        assert fits(("halo",), answers(found, merged=True))
-        assert not fits((), answers(found, merged=False))
+        assert names_match((), effects_to_name(found, merged=True)) == free
+        assert names_match(("halo",), effects_to_name(found, merged=True))
+        assert not names_match((), effects_to_name(found, merged=False))
     # A hundredth for a name behind a clean verdict is no name that comes first, unless a name is due.
     hypotheses = [[[], 0.9], [["lag"], 0.07], [["halo"], 0.03]]
     assert leading_name_right(make.single("halo", hide=like, said=[], hypotheses=hypotheses))
@@ -91,5 +91,5 @@ def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
     both = make.case("pair", 12.0, truth=["halo", "lag"], hides=[like, make.hidden("lag", 12.0)], said=["lag"])
     assert leading_name_right(both)
     assert is_physics(both)
-    assert not fits(("halo",), answers(both, merged=True))
-    assert not fits(("lag", "glint"), answers(both, merged=True))
+    assert not names_match(("halo",), effects_to_name(both, merged=True))
+    assert not names_match(("lag", "glint"), effects_to_name(both, merged=True))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.challenge import Estimate, Row, by_effect, calibration_error, confusion, reliability, score
-from probewise.challenge.estimates import mean, resampled, share
+from probewise.challenge.estimates import bootstrapped, mean, share
 
 
 def row(results, name):
@@ -31,7 +31,7 @@ def test_a_mean_has_student_s_interval():
 
 def test_a_bootstrap_of_the_mean_agrees_with_its_standard_error():
     values = np.random.default_rng(1).standard_normal(400)
-    found = resampled(values, lambda v: float(v.mean()))
+    found = bootstrapped(values, lambda v: float(v.mean()))
     assert (found.high - found.low) / 2 == pytest.approx(1.96 * values.std() / 20, rel=0.1)
 
 

@@ -8,7 +8,7 @@ import pytest
 from probewise.arm import LegoScale, Request
 from probewise.calibration import predict, read_sensor
 from probewise.cli import main
-from probewise.cli._bench import Bench, moved, world_of
+from probewise.cli._bench import Bench, moved_pattern, world_of
 from probewise.errors import ParameterError
 from probewise.recordings import (
     Disc,
@@ -46,14 +46,14 @@ def test_a_pattern_that_was_moved_reads_at_its_new_place_as_it_did_at_its_old(pa
     world, _ = world_of(None)
     for x_mm, y_mm, turned_rad in ((0.0, 0.0, 0.0), (4.0, 1.0, 1.0), (-3.0, 6.0, 2.0)):
         here = world.read(pattern, x_mm, y_mm, turned_rad, time_s=0.0, rng=None)
-        there = world.read(moved(pattern, ORIGIN), x_mm + 300.0, y_mm + 200.0, turned_rad, time_s=0.0, rng=None)
+        there = world.read(moved_pattern(pattern, ORIGIN), x_mm + 300.0, y_mm + 200.0, turned_rad, time_s=0.0, rng=None)
         assert there == pytest.approx(here, abs=1e-6)
 
 
 def test_a_ramp_stays_where_it_is():
-    assert moved(Ramp(0.0, 0.1), (0.0, 0.0)) == Ramp(0.0, 0.1)
+    assert moved_pattern(Ramp(0.0, 0.1), (0.0, 0.0)) == Ramp(0.0, 0.1)
     with pytest.raises(ParameterError, match="0,0 with a ramp"):
-        moved(Ramp(0.0, 0.1), ORIGIN)
+        moved_pattern(Ramp(0.0, 0.1), ORIGIN)
 
 
 def test_a_bench_does_what_a_person_would_be_asked_for():

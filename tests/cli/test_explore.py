@@ -12,7 +12,7 @@ import pytest
 from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.cli._arm import Telling
+from probewise.cli._arm import ReportingInstrument
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
@@ -178,7 +178,7 @@ def test_what_was_found_is_written_as_a_table_with_its_samples(explore, tmp_path
 def test_the_bar_says_where_the_arm_moves_before_it_does():
     told = []
     arm = SimulatedArm(lambda pose, time_s, height_mm: 42.0)
-    with Telling(arm, told.append, told.append) as telling:
+    with ReportingInstrument(arm, told.append, told.append) as telling:
         reading = telling.measure(Pose(500.0, 200.0))
         assert telling.reachable(np.array([[500.0, 200.0], [0.0, 0.0]])).tolist() == [True, False]
     assert told == [Pose(500.0, 200.0), reading]

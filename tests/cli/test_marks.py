@@ -11,10 +11,10 @@ import pytest
 from probewise.arm import LegoArm, Rehearsal, Request, read_geometry, shipped_geometry
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
-from probewise.cli._arm import warn_of_goal
-from probewise.cli._hands import Hands
-from probewise.cli._marks import _place_after, bring
-from probewise.cli._sheet_watch import SheetWatch, shades
+from probewise.cli._arm import warn_of_place_sd
+from probewise.cli._marks import _place_after, bring_to_mark
+from probewise.cli._person import PersonAtBench
+from probewise.cli._sheet_check import SheetCheck, shades
 from probewise.emulator import parse_scene
 from probewise.emulator.scenes import scene_text
 from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
@@ -77,11 +77,11 @@ def test_an_arm_that_is_known_less_well_than_a_shape_is_to_be_says_so_before_it_
     shipped = read_geometry(shipped_geometry())
     for place_sd_mm, warned in ((4.5, True), (0.6, False)):
         rows = tuple((0.0,) * 9 for _ in range(9))
-        warn_of_goal(dataclasses.replace(shipped, accuracy=Accuracy(8, place_sd_mm, 1.0, 0.01, rows)), 4.0)
+        warn_of_place_sd(dataclasses.replace(shipped, accuracy=Accuracy(8, place_sd_mm, 1.0, 0.01, rows)), 4.0)
         assert (
             "lengths will not be known to 4 mm: the arm knows its place to 4.5 mm" in capsys.readouterr().err
         ) == warned
-    warn_of_goal(shipped, 4.0)
+    warn_of_place_sd(shipped, 4.0)
     assert capsys.readouterr().err == ""
 
 
@@ -101,7 +101,7 @@ def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     arm = LegoArm(Rehearsal(geometry, lambda text: None), geometry)
     said, answers = [], iter(["", "x 4 y -2", "sideways", "down 55", "up 3", "ok"])
     with arm:
-        met = bring(arm, (520.0, 260.0), 32.0, lambda look: next(answers), said.append, named="mark 1")
+        met = bring_to_mark(arm, (520.0, 260.0), 32.0, lambda look: next(answers), said.append, named="mark 1")
     homes = np.array([joint.home_rad for joint in geometry.joints])
     x, y, height = geometry.position_mm((np.array(met.turned_rad) + homes)[None, :])[0]
     assert (x, y, height) == pytest.approx((524, 258, 60 - 5 + 3), abs=1.0)
@@ -136,38 +136,38 @@ def edge(n=101):
 
 
 def test_a_scan_that_starts_over_the_wrong_side_is_told_of_at_the_first_reading_that_shows_it():
-    watch = SheetWatch(edge(), white_is_bright=True)
-    said = [watch.heard(row, 58.0 if row < 40 else 14.0) for row in range(101)]
+    watch = SheetCheck(edge(), white_is_bright=True)
+    said = [watch.check_reading(row, 58.0 if row < 40 else 14.0) for row in range(101)]
     first = next(k for k, text in enumerate(said) if text)
     assert first == 65  # the first that is all white, and dark
     assert "at (15, 0) mm it is white, and reads 14, where black read 58" in said[first]
 
 
 def test_a_level_that_jumps_within_black_is_told_of_before_any_white():
-    watch = SheetWatch(edge(), white_is_bright=True)
-    said = [watch.heard(row, 58.0 if row < 10 else 14.0) for row in range(30)]
+    watch = SheetCheck(edge(), white_is_bright=True)
+    said = [watch.check_reading(row, 58.0 if row < 10 else 14.0) for row in range(30)]
     assert [k for k, text in enumerate(said) if text] == [10]
 
 
 def test_a_right_scan_is_not_told_of():
     plan = edge()
     noise = np.random.default_rng(3).normal(0.0, 1.5, len(plan))
-    watch = SheetWatch(plan, white_is_bright=True)
+    watch = SheetCheck(plan, white_is_bright=True)
     levels = 14 + 44 / (1 + np.exp(-plan.x_mm / 3))
-    assert not any(watch.heard(row, float(value)) for row, value in enumerate(levels + noise))
+    assert not any(watch.check_reading(row, float(value)) for row, value in enumerate(levels + noise))
 
 
 def test_a_sheet_is_looked_at_over_its_white_and_its_black():
     plan = paper_plan()
-    watch = SheetWatch(plan, white_is_bright=True)
+    watch = SheetCheck(plan, white_is_bright=True)
     everywhere = lambda places: np.ones(len(places), dtype=bool)  # noqa: E731
     for name, pattern in plan.patterns.items():
-        places = watch.check_places(name, everywhere)
+        places = watch.places_to_check(name, everywhere)
         assert set(places) == {True, False}
         for is_white, place in places.items():
             assert shades(pattern, np.array([place]))[0] == is_white
-    assert watch.looked("boundary", {True: 55.0, False: 15.0}) is None
-    assert "reads 15 where it should be white and 55 where black" in watch.looked(
+    assert watch.check_levels("boundary", {True: 55.0, False: 15.0}) is None
+    assert "reads 15 where it should be white and 55 where black" in watch.check_levels(
         "quadrant_a", {True: 15.0, False: 55.0}
     )
 
@@ -185,7 +185,9 @@ def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet
     monkeypatch.setattr("sys.stdin", io.StringIO("\n\n\n"))
     plan = paper_plan()
     with arm:
-        hands = Hands(arm, plan, (524.0, 260.0), SheetWatch(plan, white_is_bright=True), looks=True, typed=True)
+        hands = PersonAtBench(
+            arm, plan, (524.0, 260.0), SheetCheck(plan, white_is_bright=True), check_sheets=True, emulated=True
+        )
         hands(Request("lay sheet 'quadrant_c'", pattern="quadrant_c"))
         hands(Request("turn the sensor", turned_rad=math.pi / 2))
     said = capsys.readouterr().err

@@ -14,7 +14,7 @@ from probewise._signals import ENDING, SAME_S, deferred
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
-from probewise.cli._stopping import Stopped, require_going_on, saying_what_is_kept, stoppable
+from probewise.cli._stopping import Stopped, raise_if_stopped, reporting_what_is_kept, stoppable
 from probewise.emulator import VirtualClock, VirtualLine, set_up
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
@@ -32,7 +32,7 @@ def test_a_signal_raises_and_gives_the_status_that_shells_expect(number):
         signal.raise_signal(number)
     assert stop.value.status == 128 + number
     assert [signal.getsignal(k) for k in ENDING] == before
-    require_going_on()  # answered: it does not interrupt what this process does next
+    raise_if_stopped()  # answered: it does not interrupt what this process does next
 
 
 def test_a_signal_that_is_ignored_stays_ignored():
@@ -63,13 +63,13 @@ def test_a_signal_whose_exception_is_swallowed_is_raised_again():
         with pytest.raises(Stopped):
             signal.raise_signal(signal.SIGTERM)
         with pytest.raises(Stopped):
-            require_going_on()
+            raise_if_stopped()
 
 
 @pytest.mark.parametrize("echo", [ValueError("Invalid affine transformation matrix"), OSError(5, "closed"), KeyError()])
 def test_whatever_a_signal_is_turned_into_is_the_stop(echo):
     def turned():
-        with stoppable(), saying_what_is_kept(lambda: "ten are kept"):
+        with stoppable(), reporting_what_is_kept(lambda: "ten are kept"):
             try:
                 signal.raise_signal(signal.SIGTERM)
             except Stopped:
@@ -81,9 +81,9 @@ def test_whatever_a_signal_is_turned_into_is_the_stop(echo):
 
 
 def test_an_error_without_a_signal_stays_what_it_is():
-    with pytest.raises(ValueError, match="own"), stoppable(), saying_what_is_kept(lambda: "kept"):
+    with pytest.raises(ValueError, match="own"), stoppable(), reporting_what_is_kept(lambda: "kept"):
         raise ValueError("own")
-    with pytest.raises(LinkError, match="dead; kept"), stoppable(), saying_what_is_kept(lambda: "kept"):
+    with pytest.raises(LinkError, match="dead; kept"), stoppable(), reporting_what_is_kept(lambda: "kept"):
         raise LinkError("dead")
 
 

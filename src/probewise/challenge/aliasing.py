@@ -55,15 +55,15 @@ def cosines(
         effect = kind.for_extent(extent)
         if effect is None or effect.stage is Stage.NOISE:
             continue
-        templates, taken = _taken_by_each(problem, found, effect, usable)
-        best = int(np.argmax(taken))
-        rho = float(np.sqrt(min(taken[best] / float(problem.residual @ problem.residual), 1.0)))
+        templates, explained = _explained_by_entry(problem, found, effect, usable)
+        best = int(np.argmax(explained))
+        rho = float(np.sqrt(min(explained[best] / float(problem.residual @ problem.residual), 1.0)))
         if rho > _WORTH_A_REFIT:
             adjusted = refit.without_null_residuals(clean, changed)
-            rho = _taken_up(found, _with_effect(problem, found, effect, templates, best, adjusted))
+            rho = _cosine(found, _with_effect(problem, found, effect, templates, best, adjusted))
         out[name] = rho
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
-        out["ssf_order"] = _taken_up(found, refit.with_one_more(found, clean, changed))
+        out["ssf_order"] = _cosine(found, refit.with_one_more(found, clean, changed))
     return out
 
 
@@ -94,15 +94,17 @@ def residual_with_one_named(
         effect = VOCABULARY[name].for_extent(Extent.of(clean))
         fits = [found]
         if effect is not None:
-            templates, taken = _taken_by_each(problem, found, effect, usable)
-            best = {int(templates.choice[k]): int(k) for k in np.argsort(taken)}  # fits of each variant, the best last
+            templates, explained = _explained_by_entry(problem, found, effect, usable)
+            best = {
+                int(templates.choice[k]): int(k) for k in np.argsort(explained)
+            }  # fits of each variant, the best last
             starts = [*best.values()][-_STARTS:]
             fits += [_with_effect(problem, found, effect, templates, at, adjusted) for at in starts]
         out[name] = min(float(np.linalg.norm(by.residuals)) for by in fits)
     return out
 
 
-def _taken_by_each(
+def _explained_by_entry(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
 ) -> tuple[EffectTemplates, FloatArray]:
     """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
@@ -127,7 +129,7 @@ def _with_effect(
     return fit(model, adjusted, start_z, white(len(found.residuals), least=floor), tolerance=0.02)
 
 
-def _taken_up(found: Fit, by: Fit) -> float:
+def _cosine(found: Fit, by: Fit) -> float:
     """Return the square root of the share of a fit's residual sum of squares that another fit explains."""
     left = float(by.residuals @ by.residuals) / float(found.residuals @ found.residuals)
     return float(np.sqrt(np.clip(1 - left, 0.0, 1.0)))

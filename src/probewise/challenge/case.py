@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from probewise.challenge.aliasing import cosines, residual_with_one_named
-from probewise.challenge.covering import place_overlap, sensor_truths_and_intervals, truths_and_intervals
+from probewise.challenge.coverage import place_overlap, sensor_truths_and_intervals, truths_and_intervals
 from probewise.challenge.held_out import log_densities
 from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
@@ -139,7 +139,7 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     named = [h for h in case.truth.hidden if h.name in diagnosis.combination and h.name in found]
     region = case.truth.hidden[0].region if len(case.truth.hidden) == 1 else None
     return {
-        **said(diagnosis),
+        **scored_statements(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
         "parameters": {h.name: truths_and_intervals(h.parameters, found[h.name]) for h in named},
@@ -161,13 +161,13 @@ def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, A
 
     begun_s = time.process_time()
     told = [
-        {**said(each.diagnosis), "readings": len(each.recording), "settled": each.settled}
+        {**scored_statements(each.diagnosis), "readings": len(each.recording), "settled": each.settled}
         for each in investigate(record, case.recording.plan, rounds=rounds, rng=thinking)
     ]
     return {**told[-1], "readings": len(case.recording), "rounds": told, "cpu_s": time.process_time() - begun_s}
 
 
-def said(diagnosis: Diagnosis) -> dict[str, Any]:
+def scored_statements(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the statements of a diagnosis that are scored."""
     return {
         "verdict": diagnosis.verdict,
@@ -186,4 +186,4 @@ def _diagnosed_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Gen
     if asked is None:
         return None
     more = case.world.simulate(asked.plan, rng=rng)
-    return {"readings": len(more), **said(diagnose([case.recording, more], rng=rng))}
+    return {"readings": len(more), **scored_statements(diagnose([case.recording, more], rng=rng))}

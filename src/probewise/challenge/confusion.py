@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.challenge.scoring import NOISE, answers, fits, leading, on_mean
+from probewise.challenge.scoring import NOISE, acts_on_mean, effects_to_name, leading, names_match
 from probewise.world.challenge import SINGLES
 
 OUTSIDE, SEVERAL = "outside", "several"
@@ -43,8 +43,10 @@ def confusion(
 
 def _stated_name(result: Mapping[str, Any], truth: str) -> str:
     names = leading(result, clean=True)[0]
-    if on_mean(result):
+    if acts_on_mean(result):
         names = tuple(name for name in names if name not in NOISE)
-    if truth not in ("clean", OUTSIDE) and fits(names, answers(result, merged=True, noise=not on_mean(result))):
+    if truth not in ("clean", OUTSIDE) and names_match(
+        names, effects_to_name(result, merged=True, noise=not acts_on_mean(result))
+    ):
         return truth
     return SEVERAL if len(names) > 1 else "".join(names) or "clean"

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray
-from probewise.challenge.scoring import HONEST_NATS, accepted
+from probewise.challenge.scoring import HONEST_NATS, right_names
 from probewise.effects import VOCABULARY
 
 _DRAWS = 400
@@ -26,7 +26,7 @@ Hidden = Mapping[str, Any]
 
 def oracle_name_rate(hidden: Hidden) -> float:
     """Return the probability that the right name or an alias of it ranks before its most similar rival."""
-    return _against_the_hardest(hidden, accepted(hidden))
+    return _against_the_hardest(hidden, right_names(hidden))
 
 
 def oracle_covariate_rate(hidden: Hidden) -> float:
@@ -45,7 +45,7 @@ def oracle_set_size(hidden: Hidden) -> float:
     """
     apart = _distances_of_rivals(hidden)
     d: FloatArray = np.array(list(apart.values()))
-    right = np.array([True, *(name in accepted(hidden) for name in apart)])
+    right = np.array([True, *(name in right_names(hidden) for name in apart)])
     rng = np.random.default_rng(len(d))
     log_odds = np.zeros((_DRAWS, len(d) + 1))
     log_odds[:, 1:] = -(d**2) / 2 - d * rng.standard_normal((_DRAWS, len(d)))

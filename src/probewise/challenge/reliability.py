@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.challenge.estimates import Estimate, resampled, share
-from probewise.challenge.scoring import stated
+from probewise.challenge.estimates import Estimate, bootstrapped, share
+from probewise.challenge.scoring import leading_probability
 
 _EDGES = np.linspace(0, 1, 11)
 
@@ -25,7 +25,7 @@ class Bin:
 
 def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
     """Bin cases by the probability of their leading hypothesis into ten bins; empty bins are left out."""
-    said = [stated(result) for result in results]
+    said = [leading_probability(result) for result in results]
     of_case = _bins_of(np.array([p for p, _ in said]))
     return tuple(
         Bin(
@@ -38,7 +38,9 @@ def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
 
 def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
     """Return the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
-    found = resampled(np.array([stated(result) for result in results], dtype=np.float64).reshape(-1, 2), _error)
+    found = bootstrapped(
+        np.array([leading_probability(result) for result in results], dtype=np.float64).reshape(-1, 2), _error
+    )
     return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found
 
 

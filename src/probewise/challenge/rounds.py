@@ -8,8 +8,17 @@ from typing import Any
 import numpy as np
 
 from probewise.challenge.estimates import Estimate, mean, share
-from probewise.challenge.scoring import NOISE, answers, extras, fits, leading, leading_name_right, names_of, on_mean
-from probewise.challenge.table import Row, alarms, singles_of
+from probewise.challenge.scoring import (
+    NOISE,
+    acts_on_mean,
+    count_extras,
+    effects_to_name,
+    leading,
+    leading_name_right,
+    names_match,
+    names_of,
+)
+from probewise.challenge.table import Row, rejection_rate, singles_of
 
 Result = Mapping[str, Any]
 
@@ -66,11 +75,16 @@ def _set_size(results: list[Result], size: float) -> Estimate:
 
 
 def _share_covered(results: list[Result]) -> Estimate:
-    return share([any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in results])
+    return share(
+        [
+            any(names_match(names_of(label), effects_to_name(r, merged=False)) for label in r["credible_set"])
+            for r in results
+        ]
+    )
 
 
 def _share_detected(results: list[Result]) -> Estimate:
-    return alarms([r for r in singles_of(results, 8.0) if on_mean(r)], 0.01)
+    return rejection_rate([r for r in singles_of(results, 8.0) if acts_on_mean(r)], 0.01)
 
 
 def _pairs(results: list[Result]) -> list[Result]:
@@ -85,7 +99,7 @@ def _pairs_extra(results: list[Result]) -> Estimate:
     def named(r: Result) -> list[str]:
         return [name for name in leading(r, clean=True)[0] if name not in NOISE]
 
-    return share([bool(extras(named(r), answers(r, merged=True, noise=False))) for r in _pairs(results)])
+    return share([bool(count_extras(named(r), effects_to_name(r, merged=True, noise=False))) for r in _pairs(results)])
 
 
 def _physics_on_clean(results: list[Result]) -> Estimate:

@@ -20,7 +20,7 @@ _LIKE = 0.9  # cosine from which an effect outside the vocabulary scores as the 
 Result = Mapping[str, Any]
 
 
-def accepted(hidden: Mapping[str, Any]) -> frozenset[str]:
+def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
     """Return all right names of one concealed effect: its own and its aliases."""
     cosines: Mapping[str, float] = hidden["cosines"]
     if hidden["in_vocabulary"]:
@@ -29,7 +29,7 @@ def accepted(hidden: Mapping[str, Any]) -> frozenset[str]:
     return frozenset(n for n, rho in cosines.items() if rho >= _LIKE) or frozenset({"unknown"})
 
 
-def answers(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
+def effects_to_name(result: Result, *, merged: bool, noise: bool = True) -> list[frozenset[str]]:
     """List the effects that have to be named, as one set of right names each.
 
     Parameters
@@ -42,11 +42,11 @@ def answers(result: Result, *, merged: bool, noise: bool = True) -> list[frozens
         Whether noise effects have to be named.
     """
     physics = [h for h in result["hidden"] if not h["on_noise"] and h["name"] not in NO_PHYSICS]
-    mean = [accepted(h) if merged or not h["in_vocabulary"] else frozenset({h["name"]}) for h in physics]
+    mean = [right_names(h) if merged or not h["in_vocabulary"] else frozenset({h["name"]}) for h in physics]
     return mean + [frozenset({name}) for name in result["truth"] if noise and name in NOISE]
 
 
-def fits(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
+def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
     """Return whether names match the wanted effects one to one; effects that are no physics may be unnamed."""
     needed = [right for right in wanted if not right & NO_PHYSICS]
     optional = [right for right in wanted if right & NO_PHYSICS]
@@ -58,7 +58,7 @@ def fits(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
     )
 
 
-def extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
+def count_extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
     """Count the names that match no wanted effect."""
     most = max(
         sum(name in right for name, right in zip(order, wanted, strict=False))
@@ -69,15 +69,15 @@ def extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
 
 def is_physics(result: Result) -> bool:
     """Return whether a concealed effect can be told from one more Gaussian in the SSF with this many readings."""
-    return any(not right & NO_PHYSICS for right in answers(result, merged=True))
+    return any(not right & NO_PHYSICS for right in effects_to_name(result, merged=True))
 
 
-def is_outside(result: Result) -> bool:
+def is_out_of_vocabulary(result: Result) -> bool:
     """Return whether a concealed effect is outside the vocabulary and has no alias in it."""
-    return frozenset({"unknown"}) in answers(result, merged=True)
+    return frozenset({"unknown"}) in effects_to_name(result, merged=True)
 
 
-def on_mean(result: Result) -> bool:
+def acts_on_mean(result: Result) -> bool:
     """Return whether every concealed effect, if any, changes the mean of the readings."""
     return not any(h["on_noise"] for h in result["hidden"])
 
@@ -94,8 +94,8 @@ def leading_name_right(result: Result) -> bool:
     If the mean is changed, names of noise effects are ignored. If one more Gaussian in the SSF absorbs the effect,
     clean is right too.
     """
-    if not on_mean(result):
-        return fits(leading(result, clean=False)[0], answers(result, merged=True))
+    if not acts_on_mean(result):
+        return names_match(leading(result, clean=False)[0], effects_to_name(result, merged=True))
     due = is_physics(result)
     joined: dict[Names, float] = {}
     for names, p in result["hypotheses"]:
@@ -103,13 +103,13 @@ def leading_name_right(result: Result) -> bool:
         if key or not due:
             joined[key] = joined.get(key, 0.0) + p
     first = max(joined, key=lambda key: joined[key], default=())
-    return fits(first, answers(result, merged=True, noise=False))
+    return names_match(first, effects_to_name(result, merged=True, noise=False))
 
 
-def stated(result: Result) -> tuple[float, bool]:
+def leading_probability(result: Result) -> tuple[float, bool]:
     """Return the probability of the most probable hypothesis, clean included, and whether it is exactly the truth."""
     names, probability = leading(result, clean=True)
-    return probability, fits(names, answers(result, merged=False))
+    return probability, names_match(names, effects_to_name(result, merged=False))
 
 
 def names_of(label: str) -> Names:

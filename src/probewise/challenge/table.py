@@ -11,7 +11,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import Estimate, mean, resampled, share
+from probewise.challenge.estimates import Estimate, bootstrapped, mean, share
 from probewise.challenge.oracle_baseline import (
     oracle_covariate_rate,
     oracle_name_rate,
@@ -21,16 +21,16 @@ from probewise.challenge.oracle_baseline import (
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     NOISE,
-    answers,
-    extras,
-    fits,
-    is_outside,
+    acts_on_mean,
+    count_extras,
+    effects_to_name,
+    is_out_of_vocabulary,
     is_physics,
     leading,
     leading_name_right,
+    leading_probability,
+    names_match,
     names_of,
-    on_mean,
-    stated,
 )
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
@@ -94,7 +94,7 @@ def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[E
     singles = singles_of([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
-    return {name: (alarms(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
+    return {name: (rejection_rate(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
 
 
 def _clean_rows(done: list[Result]) -> list[Row]:
@@ -102,10 +102,10 @@ def _clean_rows(done: list[Result]) -> list[Row]:
     white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
     models = sorted({r["noise_model"] for r in other})
     return [
-        Row("false alarms, clean, alpha .05", alarms(white, 0.05), 0.04, 0.06),
-        Row("false alarms, clean, alpha .01", alarms(white, 0.01), 0.006, 0.015),
-        Row("false alarms, other noise, alpha .05", alarms(other, 0.05), most=0.06),
-        *(Row(f"  {m}", alarms([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
+        Row("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.04, 0.06),
+        Row("false alarms, clean, alpha .01", rejection_rate(white, 0.01), 0.006, 0.015),
+        Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
+        *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
         Row("physics named, clean", share([names_physics(r) for r in clean]), most=0.005),
         Row(
             "physics named, one Gaussian more",
@@ -120,7 +120,7 @@ def _detection_rows(done: list[Result]) -> list[Row]:
     rows = [
         Row(
             f"detection, alpha .01, lambda {size:g}",
-            alarms(_distinguishable_from_ssf(singles_of(done, size)), 0.01),
+            rejection_rate(_distinguishable_from_ssf(singles_of(done, size)), 0.01),
             least,
         )
         for size, least in targets.items()
@@ -155,7 +155,9 @@ def _difference(before: Estimate, after: Estimate) -> Estimate:
 
 
 def _probability_rows(done: list[Result]) -> list[Row]:
-    covered = [any(fits(names_of(label), answers(r, merged=False)) for label in r["credible_set"]) for r in done]
+    covered = [
+        any(names_match(names_of(label), effects_to_name(r, merged=False)) for label in r["credible_set"]) for r in done
+    ]
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
         singles = singles_of(done, size)
@@ -173,20 +175,20 @@ def _probability_rows(done: list[Result]) -> list[Row]:
         Row("95 % credible set holds the truth", share(covered), 0.95),
         *rows,
         Row("expected calibration error", calibration_error(done), most=0.02),
-        Row("wrong name stated above .9", share([surely_wrong(r) for r in done]), most=0.005),
+        Row("wrong name stated above .9", share([confidently_wrong(r) for r in done]), most=0.005),
     ]
 
 
 def merged_size(result: Result) -> float:
     """Count the hypotheses of a credible set; the right one and its aliases count as one."""
-    right = sum(fits(names_of(label), answers(result, merged=True)) for label in result["credible_set"])
+    right = sum(names_match(names_of(label), effects_to_name(result, merged=True)) for label in result["credible_set"])
     return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
 def _place_rows(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.8, 20.0: 0.9}
     local = {size: [r["overlap"] for r in singles_of(done, size) if r["overlap"] is not None] for size in targets}
-    shown = [r for r in singles_of(done, 8.0) if on_mean(r)]
+    shown = [r for r in singles_of(done, 8.0) if acts_on_mean(r)]
     first = [bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
@@ -196,32 +198,36 @@ def _place_rows(done: list[Result]) -> list[Row]:
 
 
 def _interval_rows(done: list[Result]) -> list[Row]:
-    right = [r for r in done if fits(r["combination"], answers(r, merged=False)) and not is_outside(r)]
+    right = [
+        r
+        for r in done
+        if names_match(r["combination"], effects_to_name(r, merged=False)) and not is_out_of_vocabulary(r)
+    ]
     stated_of = [interval for r in right for own in r["parameters"].values() for interval in own.values()]
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
     sensors = [interval for r in gaussian for interval in r["sensor"].values()]
     return [
-        Row("95 % intervals of effect parameters cover", covering(stated_of), 0.93, 0.97),
-        Row("95 % intervals of SSF and levels cover", covering(sensors), 0.93),
+        Row("95 % intervals of effect parameters cover", share_covered(stated_of), 0.93, 0.97),
+        Row("95 % intervals of SSF and levels cover", share_covered(sensors), 0.93),
     ]
 
 
-def covering(intervals: list[list[float]]) -> Estimate:
+def share_covered(intervals: list[list[float]]) -> Estimate:
     """Estimate how often intervals [truth, low, high] cover the truth."""
     return share([low <= truth <= high for truth, low, high in intervals])
 
 
 def _held_out(done: list[Result]) -> list[Row]:
-    inside = [r for r in done if r["kind"] in ("single", "pair") and on_mean(r)]
+    inside = [r for r in done if r["kind"] in ("single", "pair") and acts_on_mean(r)]
     gains = _gains_of([r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right")
     white = [r for r in inside if r["noise_model"] == "white"]
     outside = [r for r in done if r["kind"] == "outside" and r["noise_model"] == "white"]
     worse = [_gains(r, _SCANS, "true")[0] < -1.0 for r in done]
     return [
-        Row("held-out gain, share of the right model's", resampled(gains, _ratio), 0.98),
-        *(Row(f"  a new {scan}", resampled(gains[:, k], _ratio)) for k, scan in enumerate(_SCANS)),
-        Row("  share of what the truth itself would gain", resampled(_gains_of(white, "true"), _ratio)),
-        Row("  the same, outside the vocabulary", resampled(_gains_of(outside, "true"), _ratio)),
+        Row("held-out gain, share of the right model's", bootstrapped(gains, _ratio), 0.98),
+        *(Row(f"  a new {scan}", bootstrapped(gains[:, k], _ratio)) for k, scan in enumerate(_SCANS)),
+        Row("  share of what the truth itself would gain", bootstrapped(_gains_of(white, "true"), _ratio)),
+        Row("  the same, outside the vocabulary", bootstrapped(_gains_of(outside, "true"), _ratio)),
         Row("held-out worse than the null by over 1 nat", share(worse), most=0.01),
         # The scatter that noise alone causes in the best gain possible with these readings.
         Row(
@@ -250,7 +256,7 @@ def _pair_rows(done: list[Result]) -> list[Row]:
     pairs = [r for r in done if r["kind"] == "pair"]
     both = [leading_name_right(r) for r in pairs]
     shown = [right for r, right in zip(pairs, both, strict=True) if _each_shows(r)]
-    more = [bool(extras(_mean_names(r), answers(r, merged=True, noise=False))) for r in pairs]
+    more = [bool(count_extras(_mean_names(r), effects_to_name(r, merged=True, noise=False))) for r in pairs]
     return [
         Row("two effects: both named", share(both), 0.95),
         Row("  where neither hides the other", share(shown)),
@@ -265,7 +271,7 @@ def _each_shows(result: Result) -> bool:
 
 def _out_of_vocabulary(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.9, 20.0: 0.97}
-    outside = [r for r in done if is_outside(r)]
+    outside = [r for r in done if is_out_of_vocabulary(r)]
     inside = [r for r in done if r["kind"] != "outside"]
     return [
         *(
@@ -285,8 +291,8 @@ def _alias_rows(done: list[Result]) -> list[Row]:
     settled = [r | r["settled"] if r["settled"] else r for r in aliased]
     return [
         Row("aliased pair: cannot tell", share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
-        Row("aliased pair: sure of the wrong name", share([surely_wrong(r) for r in aliased]), most=0.01),
-        Row("right name after the advised readings", share([stated(r)[1] for r in settled]), 0.95),
+        Row("aliased pair: sure of the wrong name", share([confidently_wrong(r) for r in aliased]), most=0.01),
+        Row("right name after the advised readings", share([leading_probability(r)[1] for r in settled]), 0.95),
         Row(
             "  readings advised, of those that repeating the plan needs",
             mean([r["settled"]["readings"] / readings_by_repeating(r) for r in aliased if r["settled"]]),
@@ -319,10 +325,10 @@ def _distinguishable_from_ssf(results: Sequence[Result]) -> list[Result]:
 
 def _on_mean(results: Sequence[Result]) -> list[Result]:
     """Keep the cases that the p-value tests: effects on the mean."""
-    return [r for r in results if on_mean(r)]
+    return [r for r in results if acts_on_mean(r)]
 
 
-def alarms(results: Sequence[Result], alpha: float) -> Estimate:
+def rejection_rate(results: Sequence[Result], alpha: float) -> Estimate:
     """Estimate how often the test of the mean rejects at a significance level."""
     return share([r["p_value"] <= alpha for r in results])
 
@@ -336,8 +342,8 @@ def _mean_names(result: Result) -> list[str]:
     return [name for name in leading(result, clean=True)[0] if name not in NOISE]
 
 
-def surely_wrong(result: Result) -> bool:
+def confidently_wrong(result: Result) -> bool:
     """Return whether a wrong effect is stated above .9; `clean` and `unknown` do not count."""
-    probability, right = stated(result)
+    probability, right = leading_probability(result)
     names = leading(result, clean=True)[0]
     return probability > 0.9 and not right and names not in ((), ("unknown",))

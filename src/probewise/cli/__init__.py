@@ -93,13 +93,13 @@ def main(argv: Sequence[str] | None = None) -> int:
                 return verb.run(arguments)
         except Stopped as stop:
             _complain(verb, f"stopped; {str(stop) or 'nothing was written'}")
-            _forget_lost_reader()
+            _discard_unwritable_output()
             return stop.status
         except (NotConvergedError, LinkError) as error:
             _complain(verb, str(error))
             return 1
         except BrokenPipeError:  # the reader of a pipe has closed it; written files are complete
-            _forget_lost_reader()
+            _discard_unwritable_output()
             return 1
         except (ProbewiseError, OSError) as error:
             _complain(verb, _one_line(error))
@@ -111,7 +111,7 @@ def _complain(verb: Verb, text: str) -> None:
         sys.stderr.write(f"probewise {verb.name}: {text}\n")
 
 
-def _forget_lost_reader() -> None:
+def _discard_unwritable_output() -> None:
     """Discard output that can no longer be written, which the interpreter would otherwise try to flush."""
     try:
         sys.stdout.flush()

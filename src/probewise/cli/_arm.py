@@ -89,7 +89,7 @@ def parse_arm(text: str) -> ArmName:
     raise ParameterError("--arm", text, ARMS + did_you_mean(kind, ("simulated", "emulator", "nxt")))
 
 
-def open_own(path: str, *, start_s: float = 0.0) -> OwnInstrument:
+def open_own_instrument(path: str, *, start_s: float = 0.0) -> OwnInstrument:
     """Load a user's file; its `connect()` returns the instrument when it is entered."""
     from probewise.arm import OwnInstrument
 
@@ -158,7 +158,7 @@ def warn_of_clearance(geometry: Geometry) -> None:
     )
 
 
-def warn_of_goal(geometry: Geometry, stop_sd_mm: float) -> None:
+def warn_of_place_sd(geometry: Geometry, stop_sd_mm: float) -> None:
     """Warn if the arm's place is known less well than the lengths of a shape are to be."""
     accuracy = geometry.accuracy
     if accuracy is None or accuracy.place_sd_mm < stop_sd_mm:
@@ -169,9 +169,9 @@ def warn_of_goal(geometry: Geometry, stop_sd_mm: float) -> None:
     )
 
 
-def in_steps(arm: LegoArm) -> LegoArm:
+def confirm_lowering(arm: LegoArm) -> LegoArm:
     """Return the arm with its first lowering confirmed step by step."""
-    ask = asker(arm)
+    ask = prompter(arm)
 
     def confirm(height_mm: float) -> None:
         ask(f"the sensor should be {height_mm:.0f} mm above the table; if so, and it may be lowered further")
@@ -206,7 +206,7 @@ def open_brick(port: str) -> Brick:
     return Brick.open(port)
 
 
-class Telling:
+class ReportingInstrument:
     """An instrument that reports each move before it starts, and each reading, since a real arm takes seconds."""
 
     def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
@@ -232,7 +232,7 @@ class Telling:
         return reading
 
 
-def require_choices(
+def require_declared(
     arm: Instrument, orientations_deg: Sequence[float] | None, heights_mm: Sequence[float] | None
 ) -> None:
     """Raise ParameterError for poses that a user's instrument (already entered) does not declare as possible.
@@ -256,7 +256,7 @@ def require_choices(
             )
 
 
-def asker(arm: Instrument) -> Callable[[str], None]:
+def prompter(arm: Instrument) -> Callable[[str], None]:
     """Return a function that prompts a person and waits for Enter, while keeping the arm awake."""
     answer_to = questioner(arm)
 
@@ -266,7 +266,7 @@ def asker(arm: Instrument) -> Callable[[str], None]:
     return ask
 
 
-def _line() -> str:
+def _read_line() -> str:
     """Read a line of standard input; "" if it has ended or cannot be read."""
     try:
         return "" if sys.stdin is None else sys.stdin.readline()
@@ -283,7 +283,7 @@ def questioner(arm: Instrument) -> Callable[[str], str]:
         sys.stderr.flush()
         answers: queue.Queue[str] = queue.Queue()
         # Reading a line cannot be interrupted, so it runs in a daemon thread.
-        threading.Thread(target=lambda: answers.put(_line()), daemon=True).start()
+        threading.Thread(target=lambda: answers.put(_read_line()), daemon=True).start()
         while True:
             try:
                 answer = answers.get(timeout=WAIT_S)

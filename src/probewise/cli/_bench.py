@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probewise.arm import LegoArm, LegoScale, OwnInstrument, Reading, Request, SimulatedArm
-from probewise.cli._arm import SCENE, ArmName, open_emulated, open_nxt, open_own
+from probewise.cli._arm import SCENE, ArmName, open_emulated, open_nxt, open_own_instrument
 from probewise.cli._common import DEFAULT_SEED
 from probewise.emulator import Table, parse_scene
 from probewise.errors import ParameterError
@@ -21,7 +21,7 @@ from probewise.recordings import Disc, HalfPlane, Image, Pattern, Polygon, Quadr
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry, Pose
-    from probewise.cli._marks import Look
+    from probewise.cli._marks import MarkQuestion
     from probewise.emulator import Stand
     from probewise.recordings import Instrumentation
     from probewise.world import Surface, World
@@ -72,7 +72,7 @@ class Bench:
         self._table, self._stand = bench.table, bench.arm.stand
         return arm
 
-    def look(self, look: Look) -> str:
+    def answer_at_mark(self, question: MarkQuestion) -> str:
         """Answer like a person who watches the emulated arm's sensor over a mark.
 
         Raises
@@ -83,8 +83,8 @@ class Bench:
         if self._stand is None:
             raise ParameterError("--arm", "simulated", "emulator: the simulated arm has no position error to see")
         stand = self._stand()
-        across = (look.mark_mm[0] - stand.x_mm, look.mark_mm[1] - stand.y_mm)
-        gap_mm = stand.height_mm - look.block_mm
+        across = (question.mark_mm[0] - stand.x_mm, question.mark_mm[1] - stand.y_mm)
+        gap_mm = stand.height_mm - question.block_mm
         words = [
             f"{axis} {round(2 * off) / 2:g}" for axis, off in zip("xy", across, strict=True) if abs(off) > _SEEN_MM
         ]
@@ -99,7 +99,7 @@ class Bench:
     def lay(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin there, or turn the sensor."""
         if isinstance(request, Request) and request.pattern is not None:
-            self._table.surface = moved(patterns[request.pattern], origin_mm)
+            self._table.surface = moved_pattern(patterns[request.pattern], origin_mm)
         if isinstance(request, Request) and request.turned_rad is not None:
             self._table.turned_rad = request.turned_rad
 
@@ -136,7 +136,7 @@ def open_arm(
     if chosen.kind == "nxt":
         return open_nxt(chosen.where, geometry, start_s=start_s), None
     if chosen.kind == "file":
-        return open_own(chosen.where, start_s=start_s), None
+        return open_own_instrument(chosen.where, start_s=start_s), None
     from probewise.experiment import scale_of
 
     world, instrumentation = world_of(sensor)
@@ -162,7 +162,7 @@ def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:
     return world_like(found), found.instrumentation
 
 
-def moved(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
+def moved_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
     """Return a pattern with its origin moved to `by_mm`."""
     x_mm, y_mm = by_mm
     match pattern:

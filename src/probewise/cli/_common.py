@@ -91,7 +91,7 @@ def add_path(
     parser: argparse._ActionsContainer, name: str, metavar: str, about: str, *, required: bool = False
 ) -> None:
     """Add an argument or option that takes the name of a file or directory; `required` is for options."""
-    action = parser.add_argument(name, type=a_path, metavar=metavar, help=about)
+    action = parser.add_argument(name, type=parse_path, metavar=metavar, help=about)
     action.required |= required
 
 
@@ -101,7 +101,7 @@ def add_out_directory(parser: argparse.ArgumentParser) -> None:
     add_path(parser, "--out", "DIR", about, required=True)
 
 
-def a_path(text: str) -> Path:
+def parse_path(text: str) -> Path:
     """Parse a path, for argparse; the empty string, such as an unset shell variable, is refused."""
     if not text:
         raise argparse.ArgumentTypeError("an empty text names no file or directory")
@@ -156,7 +156,7 @@ def caution(text: str) -> None:
     sys.stderr.flush()
 
 
-def keeps(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
+def kept_message(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
     """Return a message on how much of a run a file holds, and the command that resumes it."""
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from probewise.cli._common import say
 from probewise.cli._output import check_out_directory, staged
-from probewise.cli._simulator import read_tables, refuse_beside
+from probewise.cli._simulator import read_tables, refuse_sensor_options
 
 if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis
@@ -29,7 +29,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
     from probewise.report import diagnosis as report
     from probewise.systems import read_simulator
 
-    refuse_beside(arguments, "sensor")
+    refuse_sensor_options(arguments, "sensor")
     out = check_out_directory(arguments.out)
     simulator = read_simulator(arguments.simulator)
     table, notes = read_tables(simulator, arguments.recordings)
@@ -48,7 +48,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         drawn = report.figures(diagnosis)
         page = report.write_page(diagnosis, drawn, source=diagnosis.recording.source, seed=arguments.seed)
-    with staged(out, inputs=_to_be_kept(arguments, out, simulator.reading), outdated=_OF_ONE_RUN) as stage:
+    with staged(out, inputs=_files_to_keep(arguments, out, simulator.reading), outdated=_OF_ONE_RUN) as stage:
         write_results(diagnosis, stage.folder)
         for name, image in drawn.items():
             (stage / name).write_bytes(image)
@@ -73,7 +73,7 @@ def write_results(diagnosis: Diagnosis, folder: Path) -> None:
         (folder / diagnosis.apparatus.words.next_plan).write_text(write_run_table(asked), encoding="utf-8")
 
 
-def _to_be_kept(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
+def _files_to_keep(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
     """List files to keep: all input files, and the next.csv of an earlier run if readings were filled in."""
     from probewise.errors import FileError
     from probewise.recordings.table import read_table

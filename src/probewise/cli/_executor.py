@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
 
-from probewise.cli._common import keeps, positive_int
-from probewise.cli._stopping import saying_what_is_kept
+from probewise.cli._common import kept_message, positive_int
+from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError
 from probewise.progress import Progress
 
@@ -46,18 +46,22 @@ def campaign_running(
     from probewise._progress import progress_shown
 
     with (
-        saying_what_is_kept(lambda: campaign_keeps(path, noun, arguments)),
+        reporting_what_is_kept(lambda: campaign_kept_message(path, noun, arguments)),
         progress_shown(quiet=arguments.quiet) as progress,
         _executor_of(arguments) as executor,
     ):
         yield executor, progress
 
 
-def campaign_keeps(path: Path, noun: str, arguments: argparse.Namespace) -> str:
+def campaign_kept_message(path: Path, noun: str, arguments: argparse.Namespace) -> str:
     """Return a message on how many finished tasks a campaign's file holds, and how to resume."""
     from probewise.campaign import read_campaign
 
-    return keeps(path, len(read_campaign(path).results), noun, arguments) if path.exists() else "nothing was written"
+    return (
+        kept_message(path, len(read_campaign(path).results), noun, arguments)
+        if path.exists()
+        else "nothing was written"
+    )
 
 
 @contextlib.contextmanager

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from probewise import experiment as posing
-from probewise.cli._arm import open_emulated, open_nxt, open_own
+from probewise.cli._arm import open_emulated, open_nxt, open_own_instrument
 from probewise.cli._explore_inputs import Inputs
 from probewise.cli._geometry import parse_truth
 from probewise.errors import ParameterError
@@ -42,7 +42,7 @@ def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Readin
         if arguments.truth is not None:
             raise ParameterError("--truth", arguments.truth, "none with a real arm, whose target is unknown")
         if chosen.kind == "file":
-            return Site(open_own(chosen.where, start_s=start_s))
+            return Site(open_own_instrument(chosen.where, start_s=start_s))
         assert geometry is not None
         return Site(open_nxt(chosen.where, geometry, start_s=start_s))
     hidden = parse_truth(arguments.truth, arguments.shape, inputs.field, rng=inputs.streams.truth)

@@ -12,7 +12,7 @@ import numpy as np
 from probewise import experiment as posing
 from probewise.cli._explore_inputs import Inputs
 from probewise.cli._output import Stage
-from probewise.cli._stopping import require_going_on
+from probewise.cli._stopping import raise_if_stopped
 from probewise.recordings import write_bytes_atomically, write_text_atomically
 from probewise.report import exploration as report
 from probewise.report.animation import gif
@@ -43,7 +43,7 @@ class Pictures:
         if shadow is not None:
             self.shadows.append(shadow)
         self.frames.append(self._frame(step, shadow))
-        require_going_on()  # a signal may have damaged the picture
+        raise_if_stopped()  # a signal may have damaged the picture
         if step.number == 1 and not step.replayed:
             _remove_pictures(self.out)
         folder = self.out / "frames"

@@ -77,7 +77,9 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
         low, high = settings["options"]["reading_range"]
         declared = [None if value is None else float(value) for value in (step, low, high)]
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(path, f"unusable options: {_reason(error)}", "options as explore writes them", row=1) from error
+        raise FileError(
+            path, f"unusable options: {_error_text(error)}", "options as explore writes them", row=1
+        ) from error
     step, low, high = declared
     if not all(value is None or math.isfinite(value) for value in declared) or (step is not None and step <= 0):
         raise FileError(path, f"unusable options: step {step}, range {low} to {high}", "finite, a step above 0", row=1)
@@ -94,7 +96,7 @@ def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
         written, size = settings["shape"], settings["field"]
         field = Field(float(size["width_mm"]), float(size["height_mm"]))
     except (KeyError, TypeError, ValueError) as error:
-        raise FileError(path, f"unusable settings: {_reason(error)}", allowed, row=1) from error
+        raise FileError(path, f"unusable settings: {_error_text(error)}", allowed, row=1) from error
     for n in range(1, len(SHAPES) + 1):
         for names in itertools.permutations(SHAPES, n):
             shape: Shape = shape_named(names, field)
@@ -103,5 +105,5 @@ def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
     raise FileError(path, f"shape {written}", allowed, row=1, column="shape")
 
 
-def _reason(error: Exception) -> str:
+def _error_text(error: Exception) -> str:
     return f"{error} is missing" if isinstance(error, KeyError) else str(error)

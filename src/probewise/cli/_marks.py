@@ -22,7 +22,7 @@ _HELP = (
 )
 
 
-class Look(str):
+class MarkQuestion(str):
     """A question to the person who watches the sensor, as a sentence.
 
     Attributes
@@ -38,18 +38,18 @@ class Look(str):
     mark_mm: tuple[float, float]
     block_mm: float
 
-    def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> Look:
+    def __new__(cls, text: str, mark_mm: tuple[float, float], block_mm: float) -> MarkQuestion:
         """Build a question from its sentence."""
-        look = super().__new__(cls, text)
-        look.mark_mm, look.block_mm = mark_mm, block_mm
-        return look
+        question = super().__new__(cls, text)
+        question.mark_mm, question.block_mm = mark_mm, block_mm
+        return question
 
 
-def bring(
+def bring_to_mark(
     arm: LegoArm,
     mark_mm: tuple[float, float],
     block_mm: float,
-    eyes: Callable[[Look], str],
+    eyes: Callable[[MarkQuestion], str],
     tell: Callable[[str], None],
     *,
     named: str,
@@ -77,7 +77,7 @@ def bring(
     arm.go_down(*at)
     tell(_HELP)
     while True:
-        answer = eyes(Look(f"{named} ({mark_mm[0]:g}, {mark_mm[1]:g}): ", mark_mm, block_mm)).lower()
+        answer = eyes(MarkQuestion(f"{named} ({mark_mm[0]:g}, {mark_mm[1]:g}): ", mark_mm, block_mm)).lower()
         if answer == "skip":
             return None
         if answer in ("ok", "seen"):

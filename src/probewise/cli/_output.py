@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from probewise._signals import deferred
-from probewise.cli._stopping import require_going_on
+from probewise.cli._stopping import raise_if_stopped
 from probewise.errors import FileError, ParameterError
 
 _FOLDER, _COMMIT = ".writing", "commit.json"
@@ -108,7 +108,7 @@ def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = 
             folder.mkdir()
             stage = Stage(folder)
             yield stage
-            require_going_on()
+            raise_if_stopped()
             with deferred():
                 commit = _prepare_commit(out, folder, inputs, outdated)
                 stage.kept = {out / name: out / kept for name, kept in commit.aside.items()}

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from probewise.recordings import Plan
 
 
-def plan_named(text: str) -> Plan:
+def plan_of(text: str) -> Plan:
     """Read a plan from its file, or return a shipped one: paper, two_way."""
     from probewise.recordings import paper_plan, read_plan, two_way_plan
 
@@ -21,7 +21,9 @@ def plan_named(text: str) -> Plan:
     return shipped[text]() if text in shipped else read_plan(text)
 
 
-def read_by_own(plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None) -> Plan:
+def for_own_instrument(
+    plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
+) -> Plan:
     """Return the plan with the instrumentation of a user's own instrument, from its JSON or the options."""
     said: dict[str, object] = {} if unit is None else {"unit": unit}
     if unit is not None:  # the declared values have another unit
@@ -30,10 +32,10 @@ def read_by_own(plan: Plan, *, unit: str | None = None, range_: str | None = Non
         said |= dict(zip(("min", "max"), _numbers("--range", range_, 2), strict=True))
     if step is not None:
         (said["step"],) = _numbers("--step", step, 1)
-    return commanded(dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, **said)))  # type: ignore[arg-type]
+    return keep_commanded(dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, **said)))  # type: ignore[arg-type]
 
 
-def read_by_lego(plan: Plan, geometry: Geometry) -> Plan:
+def for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
     """Return the plan with the instrumentation of the LEGO arm: percent, at its reading height."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
@@ -44,10 +46,10 @@ def read_by_lego(plan: Plan, geometry: Geometry) -> Plan:
         sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",
         height_mm=geometry.read_height_mm,
     )
-    return commanded(dataclasses.replace(plan, instrumentation=instrumentation))
+    return keep_commanded(dataclasses.replace(plan, instrumentation=instrumentation))
 
 
-def commanded(plan: Plan) -> Plan:
+def keep_commanded(plan: Plan) -> Plan:
     """Keep only the covariates that can be commanded; others are measurements of an earlier recording."""
     can = {*plan.instrumentation.controls, "led", "height_mm"}
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})

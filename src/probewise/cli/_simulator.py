@@ -24,7 +24,7 @@ def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead 
     )
 
 
-def refuse_beside(arguments: argparse.Namespace, *names: str) -> None:
+def refuse_sensor_options(arguments: argparse.Namespace, *names: str) -> None:
     """Refuse options that apply only to light sensors.
 
     Raises ParameterError if one of them is given.

@@ -2,7 +2,7 @@
 
 The first signal raises `Stopped` in the main thread, so that `with` blocks release the motors and remove incomplete
 files. More signals within a second count as the same request; a later one raises again, which cuts clean-up short.
-Libraries may swallow or convert an exception: `require_going_on` raises it again, and any exception that ends a command
+Libraries may swallow or convert an exception: `raise_if_stopped` raises it again, and any exception that ends a command
 after a signal counts as the interruption.
 """
 
@@ -54,7 +54,7 @@ def stoppable() -> Iterator[None]:
     before = {number: handler for number, handler in before.items() if handler not in (None, signal.SIG_IGN)}
     try:
         for number in before:
-            signal.signal(number, _ask)
+            signal.signal(number, _on_signal)
         yield
     except Stopped:
         raise
@@ -68,14 +68,14 @@ def stoppable() -> Iterator[None]:
             signal.signal(number, handler)
 
 
-def require_going_on() -> None:
+def raise_if_stopped() -> None:
     """Raise `Stopped` again if a signal's exception was swallowed."""
     if _request.number is not None:
         raise Stopped(_request.number)
 
 
 @contextlib.contextmanager
-def saying_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> Iterator[None]:
+def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> Iterator[None]:
     """Add what is kept on disk to the final message of a run that a signal or a lost connection ends.
 
     Parameters
@@ -97,7 +97,7 @@ def saying_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> It
         raise
 
 
-def _ask(number: int, frame: FrameType | None) -> None:
+def _on_signal(number: int, frame: FrameType | None) -> None:
     """Raise `Stopped` unless this signal is part of the last request."""
     now_s = time.monotonic()
     if _request.number is not None and now_s - _request.at_s <= SAME_S:

@@ -13,13 +13,13 @@ from probewise.cli._arm import (
     ARMS,
     SCENE,
     add_geometry,
-    asker,
+    confirm_lowering,
     geometry_of,
-    in_steps,
     open_brick,
     open_nxt,
     parse_arm,
     parse_place,
+    prompter,
     questioner,
     warn_of_clearance,
 )
@@ -28,20 +28,20 @@ from probewise.cli._common import (
     CommandError,
     OneLineParser,
     Verb,
-    a_path,
     add_count,
     add_path,
     add_quiet,
     caution,
-    keeps,
+    kept_message,
+    parse_path,
     positive_int,
     positive_number,
     say,
     seed_number,
 )
 from probewise.cli._output import check_out_file
-from probewise.cli._plans import commanded, read_by_lego, read_by_own
-from probewise.cli._stopping import saying_what_is_kept
+from probewise.cli._plans import for_lego_arm, for_own_instrument, keep_commanded
+from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -73,8 +73,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     check = _task(tasks, "check", "Check a geometry file, and a brick; report and draw the arm's reach.")
     _add_arm(check)
-    check.add_argument("--out", type=a_path, metavar="REACH.png", help="file of the drawing (default: none)")
-    check.add_argument("--drawing", type=a_path, metavar="ARM.png", help="file of a drawing with the arm's lengths")
+    check.add_argument("--out", type=parse_path, metavar="REACH.png", help="file of the drawing (default: none)")
+    check.add_argument("--drawing", type=parse_path, metavar="ARM.png", help="file of a drawing with the arm's lengths")
 
     jog = _task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
     jog.add_argument(
@@ -91,7 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         moves=True,
         arms=_LEGO_ARMS,
     )
-    fit.add_argument("--out", type=a_path, required=True, metavar="ARM.toml", help="where the fitted geometry goes")
+    fit.add_argument("--out", type=parse_path, required=True, metavar="ARM.toml", help="where the fitted geometry goes")
     add_path(
         fit,
         "--marks",
@@ -148,7 +148,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     record.add_argument(
         "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER}, the paper's"
     )
-    record.add_argument("--out", type=a_path, required=True, metavar="REC.csv", help="where the recording goes")
+    record.add_argument("--out", type=parse_path, required=True, metavar="REC.csv", help="where the recording goes")
     record.add_argument(
         "--origin-mm",
         metavar="X,Y",
@@ -273,11 +273,11 @@ def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 warn_of_clearance(geometry)
             with _arm(arguments, geometry) as arm:
                 if arguments.steps and not arguments.dry_run:
-                    in_steps(arm)
+                    confirm_lowering(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
                 _say_position(arm, quiet=arguments.quiet)
                 if arguments.down:
-                    _asker(arguments, arm)("check the sensor's position; it will be raised again")
+                    _prompter(arguments, arm)("check the sensor's position; it will be raised again")
         case [joint, text] if joint in JOINTS:
             try:
                 by_rad = math.radians(float(text))
@@ -297,7 +297,7 @@ def _home(arguments: argparse.Namespace, geometry: Geometry) -> None:
         if arguments.here:
             angles = [f"{name} {math.degrees(j.home_rad):g}" for name, j in zip(JOINTS, geometry.joints, strict=True)]
             arm.release()
-            _asker(arguments, arm)(f"bring the arm home by hand, {', '.join(angles)} degrees")
+            _prompter(arguments, arm)(f"bring the arm home by hand, {', '.join(angles)} degrees")
             arm.set_home()
         else:
             arm.home()
@@ -336,7 +336,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
     from probewise.arm import LegoArm
     from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
     from probewise.arm.marks import marks_of
-    from probewise.cli._marks import bring
+    from probewise.cli._marks import bring_to_mark
 
     chosen = parse_arm(arguments.arm)
     if not chosen.is_lego:
@@ -354,21 +354,21 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
     assert isinstance(instrument, LegoArm)
 
     def said() -> str:
-        return keeps(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
+        return kept_message(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
 
-    with saying_what_is_kept(said), instrument as arm:
+    with reporting_what_is_kept(said), instrument as arm:
         answer = questioner(arm)
-        eyes = answer if bench is None else bench.look
+        eyes = answer if bench is None else bench.answer_at_mark
         tell = partial(say, quiet=bench is not None)
         if bench is None:
-            asker(arm)(
+            prompter(arm)(
                 f"lay the sheet of marks (probewise sheets {MARKS}) on the field, and on each cross in its turn a "
                 f"block {arguments.block_mm:g} mm high"
             )
         for number, mark in enumerate(marks, 1):
             if mark in done:
                 continue
-            met = bring(arm, mark, arguments.block_mm, eyes, tell, named=f"mark {number} of {len(marks)}")
+            met = bring_to_mark(arm, mark, arguments.block_mm, eyes, tell, named=f"mark {number} of {len(marks)}")
             if met is not None:
                 taken.append(met)
                 write_marks(taken, kept)
@@ -396,12 +396,12 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
     arguments.sensor = arguments.seed = arguments.scene = None
     instrument, bench = _instrument(arguments, geometry, scene=WHITE)
     assert isinstance(instrument, LegoArm)
-    _take_care(arguments, instrument, geometry)
+    _warn_and_confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
         if bench is None:
-            _asker(arguments, arm)("lay white matt paper, the same everywhere, over the field, or under each place")
+            _prompter(arguments, arm)("lay white matt paper, the same everywhere, over the field, or under each place")
 
-        def look(place: tuple[float, float], height_mm: float) -> HeightReading:
+        def light_at(place: tuple[float, float], height_mm: float) -> HeightReading:
             arm.go_down(*place, height_mm)
             values = np.array([arm.brightness() for _ in range(arguments.readings)])
             error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
@@ -409,12 +409,12 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
         arm.go_over(*places[0])
         lowest_mm = geometry.read_height_mm
-        curve = [look(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
-        looks = []
+        curve = [light_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
+        lights = []
         for place in places[1:]:
-            looks.append(look(place, lowest_mm))
+            lights.append(light_at(place, lowest_mm))
             if not arguments.dry_run:
-                found = check_heights(curve, looks)
+                found = check_heights(curve, lights)
                 say(_height_in_words(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
     if arguments.dry_run:
         return
@@ -462,7 +462,7 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         require_reach(geometry, places, "reading of the scan")
     names: list[str] = ["battery_mv"]
     instrument, _ = _instrument(arguments, geometry)
-    _take_care(arguments, instrument, geometry)
+    _warn_and_confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
         require_reach(bounds_of(arm), places, "reading of the scan")
         if isinstance(arm, LegoArm):
@@ -481,8 +481,8 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise._progress import progress_shown
     from probewise.arm import carry_out, recording_of
     from probewise.arm.carry_out import BY_HAND_S, duration_s
-    from probewise.cli._hands import Hands, is_pty
-    from probewise.cli._sheet_watch import SheetWatch
+    from probewise.cli._person import PersonAtBench, is_pty
+    from probewise.cli._sheet_check import SheetCheck
     from probewise.recordings import paper_plan, read_plan, read_recording, write_recording
 
     named = arguments.plan == PAPER
@@ -490,32 +490,34 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
     own = _is_own(arguments)
     asked = paper_plan() if named else read_plan(arguments.plan)
     if own:
-        plan = read_by_own(asked, unit=arguments.unit, range_=arguments.range, step=arguments.step)
+        plan = for_own_instrument(asked, unit=arguments.unit, range_=arguments.range, step=arguments.step)
     elif arguments.sensor is not None:
         plan = _simulated_sensor(asked, arguments.sensor)
     else:
         _refuse_options(arguments, "the LEGO arm: it is known", "unit", "range", "step")
-        plan = read_by_lego(asked, geometry)
+        plan = for_lego_arm(asked, geometry)
     width, height = (0.0, 0.0) if own else geometry.field_mm
     origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
-    taken = _taken_before(out, plan, resume=arguments.resume, dry=arguments.dry_run)
+    taken = _earlier_readings(out, plan, resume=arguments.resume, dry=arguments.dry_run)
     start_s = taken[-1].time_s if taken else 0.0
 
     def kept() -> str:
         if not out.exists():
             return "nothing was read"
-        return keeps(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
+        return kept_message(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
 
     instrument, bench = _instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
-    _take_care(arguments, instrument, geometry)
-    with saying_what_is_kept(kept), instrument as arm:
-        watch = SheetWatch(plan, white_is_bright=not own)
+    _warn_and_confirm_lowering(arguments, instrument, geometry)
+    with reporting_what_is_kept(kept), instrument as arm:
+        check = SheetCheck(plan, white_is_bright=not own)
         by_person = bench is None and not arguments.dry_run
         ask: Callable[[Request], None] = (
-            _asker(arguments, arm) if bench is None else partial(bench.lay, plan.patterns, origin)
+            _prompter(arguments, arm) if bench is None else partial(bench.lay, plan.patterns, origin)
         )
         if by_person:
-            ask = Hands(arm, plan, origin, watch, looks=not own, typed=not own and is_pty(_port(arguments.arm)))
+            ask = PersonAtBench(
+                arm, plan, origin, check, check_sheets=not own, emulated=not own and is_pty(_port(arguments.arm))
+            )
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             say(
                 f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; including {BY_HAND_S:g} s for "
@@ -526,7 +528,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
         with progress_shown(quiet=arguments.quiet, beat=False) as progress:
             progress("readings", len(taken), len(plan))
             for reading in readings:
-                wrong = watch.heard(len(taken), reading.value)
+                wrong = check.check_reading(len(taken), reading.value)
                 if wrong is not None and not arguments.dry_run:
                     caution(f"{wrong}; is the right sheet there, the right way round?")
                 taken.append(reading)
@@ -543,10 +545,10 @@ def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
 
     from probewise.calibration import read_sensor
 
-    return commanded(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
+    return keep_commanded(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
 
 
-def _taken_before(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
+def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
     """Read the readings of an earlier session, which must match the plan's first rows."""
     import numpy as np
 
@@ -615,7 +617,7 @@ def _instrument(
     return opened
 
 
-def _take_care(
+def _warn_and_confirm_lowering(
     arguments: argparse.Namespace, instrument: LegoArm | OwnInstrument | SimulatedArm, geometry: Geometry
 ) -> None:
     """Warn of a geometry with which the sensor may hit the table; lower in steps if a person can watch."""
@@ -628,7 +630,7 @@ def _take_care(
         return
     warn_of_clearance(geometry)
     if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
-        in_steps(instrument)
+        confirm_lowering(instrument)
 
 
 def _refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
@@ -652,8 +654,8 @@ def _port(name: str) -> str:
     return chosen.where
 
 
-def _asker(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
-    return (lambda text: say(f"ask: {text}")) if arguments.dry_run else asker(arm)
+def _prompter(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
+    return (lambda text: say(f"ask: {text}")) if arguments.dry_run else prompter(arm)
 
 
 def _say_position(arm: LegoArm, *, quiet: bool) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from probewise.cli._common import Verb, add_path, add_quiet, say
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_directory, staged
-from probewise.cli._simulator import add_simulator, refuse_beside
+from probewise.cli._simulator import add_simulator, refuse_sensor_options
 
 if TYPE_CHECKING:
     from probewise.diagnosis import PlanAudit
@@ -60,7 +60,7 @@ def _of_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanAudi
     from probewise.diagnosis import audit_system
     from probewise.systems import read_run_table, read_simulator
 
-    refuse_beside(arguments, "sensor")
+    refuse_sensor_options(arguments, "sensor")
     simulator = read_simulator(arguments.simulator)
     table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)
     progress("laying out effects")

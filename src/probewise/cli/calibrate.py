@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from probewise.cli._common import Verb, a_path, add_common, add_count, add_out_directory, positive_int, say
+from probewise.cli._common import Verb, add_common, add_count, add_out_directory, parse_path, positive_int, say
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_directory, staged
 from probewise.errors import ParameterError
@@ -17,7 +17,7 @@ MOST_LIVE = 100_000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
-    parser.add_argument("recording", type=a_path, metavar="REC.csv", help="recording, its JSON beside it")
+    parser.add_argument("recording", type=parse_path, metavar="REC.csv", help="recording, its JSON beside it")
     add_out_directory(parser)
     parser.add_argument(
         "--orders",

@@ -7,9 +7,9 @@ import shlex
 from functools import partial
 
 from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, say
-from probewise.cli._executor import add_executor, campaign_keeps, campaign_running
+from probewise.cli._executor import add_executor, campaign_running
 from probewise.cli._output import check_out_directory, staged
-from probewise.cli._stopping import saying_what_is_kept
+from probewise.cli._stopping import reporting_what_is_kept
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.rounds > 1:
         work, scored, of = Investigated(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
     cases = out / "cases.jsonl"
-    kept = partial(campaign_keeps, cases, "case", arguments)
+    kept = partial(campaign_kept_message, cases, "case", arguments)
     with campaign_running(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
             arguments.cases,
@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> int:
         ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
     )
     drawing = progress_shown(quiet=arguments.quiet)
-    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(rows))
         write_text_atomically(

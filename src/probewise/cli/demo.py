@@ -74,7 +74,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         calibration = _calibrate(seed, arguments.full, pool)
         sensor = calibration.sensor
         doubting = [pool.submit(search_with_a_fault, sensor, trust, truth, seed) for trust in TRUSTS.values()]
-        starting = [pool.submit(start_alike, sensor, model, truth, seed) for model in MODELS]
+        starting = [pool.submit(search_from_circle, sensor, model, truth, seed) for model in MODELS]
         searching = [pool.submit(_search, sensor, model, truth, seed) for model in MODELS]
         parts: tuple[Future[Any], ...] = (diagnosing, *doubting, *starting, *searching)
         for done, future in enumerate(parts, start=1):
@@ -146,14 +146,14 @@ def as_searches(
     from probewise.report.robot_search import RobotSearch
     from probewise.scene import outlines
 
-    means, circle = sensor.mean(), hypothesis()
+    means, circle = sensor.mean(), circle_on_field()
     known = dict(zip(circle.prior.names, truth, strict=True))
     outline_mm = outlines(circle.region(np.array([truth])))[0]
     levels = (means["I_min"], means["I_max"])
     return [RobotSearch(name, run, known, outline_mm, levels) for name, run in runs]
 
 
-def hypothesis() -> Circle:
+def circle_on_field() -> Circle:
     """Return the prior of the circle: entirely on the field, radius 50 to 150 mm."""
     from probewise.scene import Circle
 
@@ -164,7 +164,7 @@ def hidden_circle(seed: int) -> tuple[float, ...]:
     """Draw the hidden circle: x, y, radius in mm."""
     import numpy as np
 
-    drawn = hypothesis().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
+    drawn = circle_on_field().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
     return tuple(float(v) for v in drawn)
 
 
@@ -195,11 +195,11 @@ def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: 
     from probewise.world.shipped import truth as world_behind
 
     field, means = Field(), sensor.mean()
-    experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT)
+    experiment = experiment_for(sensor, circle_on_field(), field, model=model, n_live=N_LIVE_ROBOT)
     surface = surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         found = run(arm, experiment, rng=np.random.default_rng([seed, 2]), max_readings=MAX_READINGS)
-    outline_mm = outlines(hypothesis().region(np.array([truth])))[0]
+    outline_mm = outlines(circle_on_field().region(np.array([truth])))[0]
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
     levels = (means["I_min"], means["I_max"])
     name = MODEL_NAMES[model]
@@ -221,7 +221,7 @@ def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: 
     return found, frames
 
 
-def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
+def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
     """Search for the circle by the paper's rule, from a first reading on it that all models share."""
     import numpy as np
 
@@ -231,13 +231,15 @@ def start_alike(sensor: FittedSensor, model: Model, truth: tuple[float, ...], se
     from probewise.world.shipped import truth as world_behind
 
     field = Field()
-    experiment = experiment_for(sensor, hypothesis(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy())
-    first, surface = on_white(truth, seed), surface_of("circle", np.array(truth), field)
+    experiment = experiment_for(
+        sensor, circle_on_field(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy()
+    )
+    first, surface = place_on_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
 
 
-def on_white(truth: tuple[float, ...], seed: int) -> Pose:
+def place_on_circle(truth: tuple[float, ...], seed: int) -> Pose:
     """Draw a place on the circle, uniformly: the first reading of robots that are to start alike."""
     import numpy as np
 
@@ -262,9 +264,9 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
     from probewise.world.shipped import truth as world_behind
 
     field = Field()
-    experiment = experiment_for(sensor, hypothesis(), field, n_live=N_LIVE_ROBOT, trust=trust)
+    experiment = experiment_for(sensor, circle_on_field(), field, n_live=N_LIVE_ROBOT, trust=trust)
     world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
-    first, surface = on_white(truth, seed), surface_of("circle", np.array(truth), field)
+    first, surface = place_on_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world, surface, field, seed=seed) as arm:
         return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT)
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, a_path, add_common, add_out_directory, add_path, say
+from probewise.cli._common import Verb, add_common, add_out_directory, add_path, parse_path, say
 from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import is_journal, journal_recording, journal_sensor
 from probewise.cli._output import check_out_directory, staged
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
     parser.add_argument(
         "recordings",
-        type=a_path,
+        type=parse_path,
         nargs="+",
         metavar="REC.csv",
         help="recording, its JSON beside it, or the journal.jsonl of an explore run; with --simulator any table; "
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     out = check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
-        recordings, sensor, shape = _read(arguments, progress=progress)
+        recordings, sensor, shape = _read_inputs(arguments, progress=progress)
         diagnosis_rng, nested_rng, files_rng = generators(arguments.seed)
         joined = join(recordings)
         null = None
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         drawn = report.figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
-        with staged(out, inputs=_to_be_kept(arguments, out), outdated=OF_ONE_RUN) as stage:
+        with staged(out, inputs=_files_to_keep(arguments, out), outdated=OF_ONE_RUN) as stage:
             write_results(diagnosis, drawn, stage.folder, rng=files_rng)
             page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
             write_text_atomically(stage / "report.html", page)
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _read(
+def _read_inputs(
     arguments: argparse.Namespace, *, progress: Progress
 ) -> tuple[list[Recording], FittedSensor | None, Shape | None]:
     """Read the recordings and journals, the sensor, and the shape of a journal's run, if there is one."""
@@ -130,7 +130,7 @@ def generators(seed: int) -> Sequence[np.random.Generator]:
     return np.random.default_rng(seed).spawn(3)
 
 
-def _to_be_kept(arguments: argparse.Namespace, out: Path) -> list[Path]:
+def _files_to_keep(arguments: argparse.Namespace, out: Path) -> list[Path]:
     """List files to keep: all input files, and the next plan of an earlier run if readings were filled in."""
     from probewise.diagnosis import NEXT_PLAN
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import SCENE
-from probewise.cli._common import Verb, a_path, add_common, add_path, say
+from probewise.cli._common import Verb, add_common, add_path, parse_path, say
 from probewise.cli._output import check_out_file
-from probewise.cli._stopping import saying_what_is_kept
+from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError, ParameterError
 
 if TYPE_CHECKING:
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="minutes without KEEPALIVE until it switches itself off: 0 (never), 2, 5, 10, 30 or 60 (default 10)",
     )
     add_path(parser, "--link", "PATH", "a symbolic link to keep on the device, also after a disconnection")
-    parser.add_argument("--log", type=a_path, metavar="FILE", help="write every telegram and fault to a file")
+    parser.add_argument("--log", type=parse_path, metavar="FILE", help="write every telegram and fault to a file")
     add_common(parser)
 
 
@@ -95,7 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
             f"seed {arguments.seed}, scene {arguments.scene}; type another, `turn DEGREES` or `where`; end with Ctrl-C",
             quiet=arguments.quiet,
         )
-        with saying_what_is_kept(lambda: "the device is gone"):
+        with reporting_what_is_kept(lambda: "the device is gone"):
             serve(terminal, bench.radio, time.monotonic, on_move=say, meanwhile=_Listener(bench).listen)
     say(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
     return 0
@@ -119,9 +119,9 @@ class _Listener:
             self._is_heard = bool(typed)
             *lines, self._typed = (self._typed + typed).split(b"\n")
             for line in lines:
-                self._obey(line.decode(errors="replace"))
+                self._execute(line.decode(errors="replace"))
 
-    def _obey(self, line: str) -> None:
+    def _execute(self, line: str) -> None:
         if line.strip() == "where":
             say(_place(self._bench.arm.sensor_pose()))
             return

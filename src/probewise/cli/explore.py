@@ -9,20 +9,27 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import ARMS, Telling, add_geometry, require_choices, warn_of_clearance, warn_of_goal
+from probewise.cli._arm import (
+    ARMS,
+    ReportingInstrument,
+    add_geometry,
+    require_declared,
+    warn_of_clearance,
+    warn_of_place_sd,
+)
 from probewise.cli._common import (
     Verb,
-    a_path,
     add_common,
     add_count,
     add_out_directory,
     add_path,
-    keeps,
+    kept_message,
+    parse_path,
     positive_int,
     say,
 )
 from probewise.cli._output import check_out_directory, staged
-from probewise.cli._stopping import saying_what_is_kept
+from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError
 from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
 
@@ -46,7 +53,7 @@ class _ShapeNames:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
-    parser.add_argument("--sensor", type=a_path, required=True, metavar="S.json", help="sensor model")
+    parser.add_argument("--sensor", type=parse_path, required=True, metavar="S.json", help="sensor model")
     add_out_directory(parser)
     parser.add_argument("--model", choices=("ssf", "naive"), default=MODEL, help="the robot's sensor model")
     parser.add_argument(
@@ -166,23 +173,23 @@ def run(arguments: argparse.Namespace) -> int:
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     if inputs.geometry is not None and inputs.arm.is_apart:
         warn_of_clearance(inputs.geometry)
-        warn_of_goal(inputs.geometry, inputs.experiment.stop_sd_mm)
+        warn_of_place_sd(inputs.geometry, inputs.experiment.stop_sd_mm)
     pictures = Pictures(out, inputs, arguments.live, site.outline_mm)
     steps = pictures.steps
 
     def kept() -> str:
         if not journal.exists():
             return "nothing was read"
-        return keeps(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
+        return kept_message(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
 
     def tell(doing: str) -> None:
         believed = f"; widest sd {steps[-1].widest_mm:.1f} mm" if steps else ""
         progress("exploring", note=f"reading {len(steps) + 1}, {doing}{believed}")
 
     with (
-        saying_what_is_kept(kept),
+        reporting_what_is_kept(kept),
         progress_shown(quiet=arguments.quiet) as progress,
-        Telling(
+        ReportingInstrument(
             site.arm,
             lambda pose: tell(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
             lambda reading: tell(f"thinking about {reading.value:g}"),
@@ -195,14 +202,14 @@ def run(arguments: argparse.Namespace) -> int:
                 max_readings=arguments.max_readings,
                 journal=before or journal,
                 about={
-                    **posing.sensor_named(inputs.sensor, _seen_from(out, arguments.sensor)),
+                    **posing.sensor_named(inputs.sensor, _relative_path(out, arguments.sensor)),
                     **site.about,
                     "arm": arguments.arm.partition(":")[0],
                 },
             )
         ) as own,
     ):
-        require_choices(site.arm, arguments.orientations, arguments.heights)
+        require_declared(site.arm, arguments.orientations, arguments.heights)
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
@@ -212,7 +219,7 @@ def run(arguments: argparse.Namespace) -> int:
             pictures.add(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
     drawing = progress_shown(quiet=arguments.quiet)
-    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
         pictures.write_results(stage, result, seed=arguments.seed, known=site.known)
     for line in _closing_lines(result, inputs, site, journal):
@@ -239,7 +246,7 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Pat
         yield f"error        {report.errors_text(result, site.known)}"
 
 
-def _seen_from(folder: Path, path: Path) -> str:
+def _relative_path(folder: Path, path: Path) -> str:
     """Return a file's path relative to a folder, so that both can be moved together."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()

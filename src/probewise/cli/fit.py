@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 
-from probewise.cli._common import CommandError, Verb, a_path, add_common, add_out_directory, say
+from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, parse_path, say
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._simulator import add_simulator, read_tables
 
@@ -13,7 +13,7 @@ from probewise.cli._simulator import add_simulator, read_tables
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
     parser.add_argument(
-        "tables", type=a_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
+        "tables", type=parse_path, nargs="+", metavar="DATA.csv", help="table of readings; several are fitted together"
     )
     add_simulator(parser, replaces="")
     add_out_directory(parser)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probewise.cli._arm import ARMS, ArmName, add_geometry, asker, geometry_of, parse_arm, parse_place
+from probewise.cli._arm import ARMS, ArmName, add_geometry, geometry_of, parse_arm, parse_place, prompter
 from probewise.cli._common import (
     CommandError,
     Verb,
@@ -17,13 +17,13 @@ from probewise.cli._common import (
     add_count,
     add_out_directory,
     add_path,
-    keeps,
+    kept_message,
     positive_number,
     say,
 )
 from probewise.cli._output import check_out_directory, staged
-from probewise.cli._plans import plan_named, read_by_lego, read_by_own
-from probewise.cli._stopping import saying_what_is_kept
+from probewise.cli._plans import for_lego_arm, for_own_instrument, plan_of
+from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -130,12 +130,12 @@ def run(arguments: argparse.Namespace) -> int:
     folder = RoundsFolder(out / "rounds", settings, resume=arguments.resume)
 
     def kept() -> str:
-        return keeps(folder.path, folder.n_readings, "reading", arguments, "--resume")
+        return kept_message(folder.path, folder.n_readings, "reading", arguments, "--resume")
 
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
     rounds = []
     with contextlib.ExitStack() as stack:
-        stack.enter_context(saying_what_is_kept(kept))
+        stack.enter_context(reporting_what_is_kept(kept))
         if world is None:
             take = stack.enter_context(_recorder(arguments, chosen, folder, seed=noise))
         else:
@@ -155,7 +155,7 @@ def run(arguments: argparse.Namespace) -> int:
     found = Investigation(tuple(rounds))
     diagnosis = found.last.diagnosis
     drawing = progress_shown(quiet=arguments.quiet)
-    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out, outdated=OF_ONE_RUN) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out, outdated=OF_ONE_RUN) as stage:
         progress("drawing the report")
         drawn = of_a_diagnosis.figures(diagnosis)
         write_results(diagnosis, drawn, stage.folder, rng=np.random.default_rng(files_seed))
@@ -173,14 +173,14 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
     """Read the first plan, adapted to the chosen arm."""
-    plan = plan_named(arguments.plan)
+    plan = plan_of(arguments.plan)
     if chosen.kind == "simulated":
         return plan
     if arguments.no_hands and len(set(plan.pattern.tolist())) > 1:
         raise ParameterError(
             "--no-hands", True, f"a plan over one pattern; {arguments.plan} has several, which a person must exchange"
         )
-    return read_by_own(plan) if chosen.kind == "file" else read_by_lego(plan, geometry_of(arguments))
+    return for_own_instrument(plan) if chosen.kind == "file" else for_lego_arm(plan, geometry_of(arguments))
 
 
 @contextlib.contextmanager
@@ -198,7 +198,7 @@ def _recorder(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFold
         chosen, geometry, arguments.geometry, seed=seed, start_s=folder.ended_s, n_taken=folder.n_readings
     )
     with opened as arm:
-        by_hand, laid = asker(arm), list[str]()
+        by_hand, laid = prompter(arm), list[str]()
 
         def take(number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
             def ask(request: Request) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import Verb, a_path, add_common, add_path, say
+from probewise.cli._common import Verb, add_common, add_path, parse_path, say
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_file
 from probewise.cli._simulator import add_simulator
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json or calibrated.json",
     )
     add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
-    parser.add_argument("--out", type=a_path, required=True, metavar="P.csv", help="where the prediction goes")
+    parser.add_argument("--out", type=parse_path, required=True, metavar="P.csv", help="where the prediction goes")
     add_simulator(parser)
     add_common(parser)
 

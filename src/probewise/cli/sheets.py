@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, geometry_of
-from probewise.cli._common import CommandError, Verb, a_path, add_quiet, say
+from probewise.cli._common import CommandError, Verb, add_quiet, parse_path, say
 from probewise.cli._output import check_out_file
 from probewise.errors import ParameterError
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "black field; target, a white shape to cut out; marks, the crosses of `arm fit-geometry`; jig, the "
         "arm's links and base at their home angles, for `arm home --here`",
     )
-    parser.add_argument("--out", type=a_path, required=True, metavar="SHEETS.pdf", help="where the pages go")
+    parser.add_argument("--out", type=parse_path, required=True, metavar="SHEETS.pdf", help="where the pages go")
     parser.add_argument("--paper", type=str.lower, default="a4", metavar="PAPER", help="a4 (default) or letter")
     parser.add_argument(
         "--target",
@@ -60,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
-    from probewise.cli._plans import plan_named
+    from probewise.cli._plans import plan_of
     from probewise.recordings.description import read_description
     from probewise.report.sheets import field_sheet, jig_sheets, marks_sheet, plan_sheets, target_sheet
 
@@ -90,7 +90,7 @@ def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
         if not beside.exists():
             return plan_sheets(read_description(path).patterns)
         what = str(beside)
-    plan = plan_named(what)
+    plan = plan_of(what)
     return plan_sheets(plan.patterns, plan)
 
 

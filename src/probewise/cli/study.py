@@ -10,9 +10,9 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, say
-from probewise.cli._executor import add_executor, campaign_keeps, campaign_running
+from probewise.cli._executor import add_executor, campaign_running
 from probewise.cli._output import check_out_directory, staged
-from probewise.cli._stopping import saying_what_is_kept
+from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -85,13 +85,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--circles", arguments.circles, "2 or more: one circle gives no standard error")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "trials.jsonl"
-    kept = partial(campaign_keeps, trials, "run", arguments)
+    kept = partial(campaign_kept_message, trials, "run", arguments)
     with campaign_running(trials, "run", arguments) as (executor, progress):
         study = run_study(
             numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=progress
         )
     drawing = progress_shown(quiet=arguments.quiet)
-    with saying_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(study))
         page = report.write_page(study, command=_command(arguments))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from probewise._signals import deferred
 from probewise.errors import FileError
-from probewise.recordings.locking import remove_abandoned, try_lock
+from probewise.recordings.locking import remove_unless_locked, try_lock
 
 _SUFFIX = ".part"
 
@@ -30,7 +30,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
     path = Path(path)
     prefix = f".{path.name}."
     for left in path.parent.glob(f"{glob.escape(prefix)}*{_SUFFIX}"):
-        remove_abandoned(left)
+        remove_unless_locked(left)
     with deferred():
         try:
             handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=_SUFFIX)

@@ -46,7 +46,7 @@ def columns_of(table: Table) -> dict[str, Any]:
     return {str(name).strip(): table[name] for name in names}
 
 
-def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
+def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
     """Check one number per reading, shape (n_points,); a single number is repeated if `n_points` is given.
 
     Raises ParameterError if a value is not a number, ShapeError if the length is not n_points.
@@ -61,7 +61,7 @@ def column(name: str, values: ArrayLike, n_points: int | None = None) -> FloatAr
     return out
 
 
-def with_missing(values: ArrayLike) -> ArrayLike:
+def parse_texts(values: ArrayLike) -> ArrayLike:
     """Parse texts in a column as in a file: numbers, and "", "nan", "n/a" and the like for missing ones.
 
     A column without texts, or with a text that is neither, is returned unchanged.
@@ -84,7 +84,7 @@ def _number_or_missing(cell: Any) -> Any:
     return math.nan if cell.strip() in MISSING else float(cell)
 
 
-def seconds(values: ArrayLike) -> ArrayLike:
+def dates_to_seconds(values: ArrayLike) -> ArrayLike:
     """Convert dates to seconds since the first; numbers are returned unchanged."""
     array = np.asarray(values)
     cells = array.tolist() if array.dtype == np.object_ and array.ndim == 1 else []
@@ -108,7 +108,7 @@ def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> di
     for name in columns:
         if name in _KNOWN:
             raise ParameterError("covariates", name, "a name that is no column of a recording; see its own argument")
-    return {name: column(name, values, n_points) for name, values in columns.items()}
+    return {name: numbers_per_reading(name, values, n_points) for name, values in columns.items()}
 
 
 def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
@@ -136,7 +136,7 @@ def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArra
         if name in _KNOWN:
             continue
         try:
-            out[name] = column(name, with_missing(values))
+            out[name] = numbers_per_reading(name, parse_texts(values))
         except ParameterError:
             notes.append(f"column {name} holds no numbers, ignored")
     return out, tuple(notes)
@@ -196,11 +196,11 @@ def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, P
     code = {name: k for k, name in enumerate(known)}
     for cell in cells:
         if cell not in code:
-            raise ParameterError("pattern", cell, undescribed(cell, known))
+            raise ParameterError("pattern", cell, how_to_describe(cell, known))
     return np.array([code[cell] for cell in cells], dtype=np.int64)
 
 
-def undescribed(name: str, known: Sequence[str]) -> str:
+def how_to_describe(name: str, known: Sequence[str]) -> str:
     """Say, for an error message, what to do about a pattern that is named but not described."""
     listed = ", ".join(map(repr, known)) or "none"
     return f"one that is described ({listed}); {name!r} is named but not described: pass patterns={{{name!r}: ...}}"

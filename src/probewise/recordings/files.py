@@ -122,7 +122,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
         raise ParameterError(
             "scan", int(plan.scan[np.argmax(np.diff(plan.scan) < 0) + 1]), "scans in the order they were taken"
         )
-    names = _distinct_neighbours(plan)
+    names = _distinct_scan_names(plan)
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
@@ -155,7 +155,7 @@ def _cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]
     return [number_text(value) for value in values.tolist()]
 
 
-def _distinct_neighbours(plan: Plan) -> dict[int, str]:
+def _distinct_scan_names(plan: Plan) -> dict[int, str]:
     """Return the scans' names, made distinct where consecutive scans share one: a file would join them."""
     names: dict[int, str] = {}
     last = ""
@@ -216,12 +216,12 @@ def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list
         covariates=_covariates(table, notes),
         instrumentation=description.instrumentation,
     )
-    notes += [*_far_away(table, "x_mm", plan.x_mm), *_far_away(table, "y_mm", plan.y_mm)]
+    notes += [*_note_on_far_place(table, "x_mm", plan.x_mm), *_note_on_far_place(table, "y_mm", plan.y_mm)]
     readings = _readings(table, description) if "reading" in table.columns else None
     return plan, readings, notes
 
 
-def _far_away(table: Table, name: str, places_mm: FloatArray) -> list[str]:
+def _note_on_far_place(table: Table, name: str, places_mm: FloatArray) -> list[str]:
     """Return a note on a place so far from all others that it looks mistyped."""
     low, middle, high = np.quantile(places_mm, [0.05, 0.5, 0.95])
     k = int(np.argmax(np.abs(places_mm - middle)))

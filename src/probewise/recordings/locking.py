@@ -49,7 +49,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
             os.write(handle, b"%d" % os.getpid())
         yield
     finally:
-        _let_go(handle, lock)
+        _release(handle, lock)
 
 
 def _locked_file(lock: Path, path: Path) -> int | None:
@@ -87,7 +87,7 @@ def try_lock(handle: int) -> bool:
     return True
 
 
-def remove_abandoned(path: Path) -> None:
+def remove_unless_locked(path: Path) -> None:
     """Remove a file unless the process that locked it is alive."""
     with contextlib.suppress(OSError):
         if sys.platform == "win32":
@@ -109,7 +109,7 @@ if sys.platform == "win32":
         msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
         os.lseek(handle, 0, os.SEEK_SET)
 
-    def _let_go(handle: int, lock: Path) -> None:
+    def _release(handle: int, lock: Path) -> None:
         os.close(handle)  # Windows cannot remove an open file; one opened by another process stays
         with contextlib.suppress(OSError):
             os.unlink(lock)
@@ -120,7 +120,7 @@ else:
     def _lock(handle: int) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
-    def _let_go(handle: int, lock: Path) -> None:
+    def _release(handle: int, lock: Path) -> None:
         with contextlib.suppress(OSError):
             os.unlink(lock)
         os.close(handle)

@@ -16,18 +16,18 @@ from probewise._kinds import radians_meant, require_finite_number, require_kind
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
     Table,
-    column,
     columns_of,
     covariates_of,
+    dates_to_seconds,
+    how_to_describe,
     named_patterns,
+    numbers_per_reading,
     own_covariates,
+    parse_texts,
     pattern_codes,
     require_patterns,
     row_numbers,
     scan_codes,
-    seconds,
-    undescribed,
-    with_missing,
 )
 from probewise.recordings.patterns import Pattern
 
@@ -182,19 +182,19 @@ class Plan:
         (3, ('pattern',))
         """
         sizes = [np.size(values) for values in (x_mm, y_mm) if np.ndim(values) > 0]
-        x = column("x_mm", x_mm, sizes[0] if sizes else 1)
+        x = numbers_per_reading("x_mm", x_mm, sizes[0] if sizes else 1)
         n_points = len(x)
-        turns = column("orientation_rad", orientation_rad, n_points)
+        turns = numbers_per_reading("orientation_rad", orientation_rad, n_points)
         radians_meant("orientation_rad", turns)
         described = named_patterns(patterns)
         code, scan_names = scan_codes(scan, n_points)
         return cls(
             x_mm=x,
-            y_mm=column("y_mm", y_mm, n_points),
+            y_mm=numbers_per_reading("y_mm", y_mm, n_points),
             orientation_rad=turns,
             time_s=np.arange(n_points, dtype=np.float64)
             if time_s is None
-            else column("time_s", seconds(time_s), n_points),
+            else numbers_per_reading("time_s", dates_to_seconds(time_s), n_points),
             scan=code,
             scan_names=scan_names,
             pattern=pattern_codes(pattern, described, n_points),
@@ -349,9 +349,9 @@ class Recording(ShowsItself):
         """
         sizes = [np.size(places) for places in (x_mm, y_mm) if np.ndim(places) > 0]
         fitting = np.ndim(readings) == 0 or not sizes or np.size(readings) in sizes
-        values = column("readings", with_missing(readings), None if fitting else sizes[0])
+        values = numbers_per_reading("readings", parse_texts(readings), None if fitting else sizes[0])
         plan = Plan.from_arrays(
-            x_mm=column("x_mm", x_mm, len(values)),
+            x_mm=numbers_per_reading("x_mm", x_mm, len(values)),
             y_mm=y_mm,
             patterns=patterns,
             unit=unit,
@@ -422,7 +422,7 @@ class Recording(ShowsItself):
         if turn_deg is not None:
             if "orientation_rad" in columns:
                 raise ParameterError("columns", tuple(columns), "one of orientation_deg and orientation_rad")
-            turn_rad = np.radians(column("orientation_deg", turn_deg))
+            turn_rad = np.radians(numbers_per_reading("orientation_deg", turn_deg))
         covariates, notes = covariates_of(columns)
         recording = cls.from_arrays(
             x_mm=columns["x_mm"],
@@ -510,7 +510,7 @@ def require_described(plan: Plan) -> None:
     """Raise ParameterError where a pattern that occurs in the plan is not described."""
     for name, _ in plan.rows_by_pattern():
         if name not in plan.patterns:
-            raise ParameterError("pattern", name, undescribed(name, list(plan.patterns)))
+            raise ParameterError("pattern", name, how_to_describe(name, list(plan.patterns)))
 
 
 def range_text(low: float | None, high: float | None) -> str:

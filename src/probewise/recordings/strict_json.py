@@ -54,7 +54,7 @@ def strict_json(text: str | bytes) -> Any:
         value = json.loads(
             text,
             object_pairs_hook=_unique_names,
-            parse_constant=_no_constant,
+            parse_constant=_refuse_constant,
             parse_int=_whole_number,
             parse_float=_number,
         )
@@ -75,7 +75,7 @@ def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return out
 
 
-def _no_constant(name: str) -> float:
+def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no JSON number")
 
 

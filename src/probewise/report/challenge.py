@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from probewise.challenge import Estimate, Row, by_effect, confusion, reliability
-from probewise.challenge.scoring import answers, fits, leading, leading_name_right
+from probewise.challenge.scoring import effects_to_name, leading, leading_name_right, names_match
 from probewise.challenge.systems import family_of
 from probewise.challenge.systems.table import gains_of
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
@@ -135,7 +135,7 @@ def _case(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
     if "failed" in result:
         return (*begun, f"failed: {result['failed']}", "", "no", "")
     names, probability = leading(result, clean=True)
-    right = leading_name_right(result) if result["hidden"] else fits(names, answers(result, merged=True))
+    right = leading_name_right(result) if result["hidden"] else names_match(names, effects_to_name(result, merged=True))
     gains = gains_of(result, "right")
     said = " and ".join(names) or "clean"
     return (

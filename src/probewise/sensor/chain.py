@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_like, require_number
 from probewise.errors import ParameterError
-from probewise.recordings.columns import undescribed
+from probewise.recordings.columns import how_to_describe
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
@@ -453,7 +453,7 @@ def region_named(regions: Mapping[str, Region], name: str) -> Region:
     try:
         return regions[name]
     except KeyError:
-        raise ParameterError("pattern", name, undescribed(name, list(regions))) from None
+        raise ParameterError("pattern", name, how_to_describe(name, list(regions))) from None
 
 
 def _by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:

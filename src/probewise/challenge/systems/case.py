@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from probewise.challenge.case import Task, said
-from probewise.challenge.covering import truths_and_intervals
+from probewise.challenge.case import Task, scored_statements
+from probewise.challenge.coverage import truths_and_intervals
 from probewise.challenge.systems.held_out import log_densities_of_runs
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.system.diagnose import diagnose_system
@@ -104,7 +104,7 @@ def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
     found = {effect.name: effect for effect in diagnosis.effects}
     named = [e for e in case.effects if e.name in diagnosis.combination and e.name in found]
     return {
-        **said(diagnosis),
+        **scored_statements(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "parameters": {e.name: truths_and_intervals(e.parameters, found[e.name]) for e in named},
         "formula": _has_formula(diagnosis),

@@ -9,10 +9,25 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import mean, resampled, share
+from probewise.challenge.estimates import bootstrapped, mean, share
 from probewise.challenge.reliability import calibration_error
-from probewise.challenge.scoring import answers, fits, is_outside, leading, leading_name_right, names_of
-from probewise.challenge.table import Row, alarms, covering, merged_size, names_physics, singles_of, surely_wrong
+from probewise.challenge.scoring import (
+    effects_to_name,
+    is_out_of_vocabulary,
+    leading,
+    leading_name_right,
+    names_match,
+    names_of,
+)
+from probewise.challenge.table import (
+    Row,
+    confidently_wrong,
+    merged_size,
+    names_physics,
+    rejection_rate,
+    share_covered,
+    singles_of,
+)
 
 __all__ = ["family_of", "gains_of", "score_systems"]
 
@@ -49,9 +64,9 @@ def _clean(done: list[Result]) -> list[Row]:
     white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
     models = sorted({r["noise_model"] for r in other})
     return [
-        Row("false alarms, clean, alpha .05", alarms(white, 0.05), 0.03, 0.06),
-        Row("false alarms, other noise, alpha .05", alarms(other, 0.05), most=0.06),
-        *(Row(f"  {m}", alarms([r for r in other if r["noise_model"] == m], 0.05)) for m in models),
+        Row("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.03, 0.06),
+        Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
+        *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05)) for m in models),
         Row("physics named, clean", share([names_physics(r) for r in white]), most=0.005),
         Row("physics named, other noise", share([names_physics(r) for r in other]), most=0.005),
         Row("noise told as it is, other noise", share([leading(r, clean=True)[0] == tuple(r["truth"]) for r in other])),
@@ -84,7 +99,7 @@ def _probabilities(done: list[Result]) -> list[Row]:
     own = singles_of(done, 12.0)
 
     def holds(r: Result) -> bool:
-        return any(fits(names_of(label), answers(r, merged=True)) for label in r["credible_set"])
+        return any(names_match(names_of(label), effects_to_name(r, merged=True)) for label in r["credible_set"])
 
     return [
         Row("95 % credible set holds the truth or its alias, lambda 12", share([holds(r) for r in own]), 0.95),
@@ -94,19 +109,21 @@ def _probabilities(done: list[Result]) -> list[Row]:
             mean([merged_size(r) for r in own]),
             most=1.4,
         ),
-        Row("wrong name stated above .9", share([_surely_wrong(r) for r in done]), most=0.01),
+        Row("wrong name stated above .9", share([_confidently_wrong(r) for r in done]), most=0.01),
         Row("expected calibration error", calibration_error(done)),
     ]
 
 
-def _surely_wrong(result: Result) -> bool:
+def _confidently_wrong(result: Result) -> bool:
     """Return whether a wrong name, not an alias of the truth, is stated above .9."""
-    return surely_wrong(result) and not fits(leading(result, clean=True)[0], answers(result, merged=True))
+    return confidently_wrong(result) and not names_match(
+        leading(result, clean=True)[0], effects_to_name(result, merged=True)
+    )
 
 
 def _intervals(done: list[Result]) -> list[Row]:
     stated = [interval for r in done for own in r["parameters"].values() for interval in own.values()]
-    return [Row("95 % intervals of effect parameters cover", covering(stated), 0.92, 0.98)]
+    return [Row("95 % intervals of effect parameters cover", share_covered(stated), 0.92, 0.98)]
 
 
 def gains_of(result: Result, best: str) -> tuple[float, float] | None:
@@ -128,7 +145,7 @@ def _held_out(done: list[Result]) -> list[Row]:
     clean = [g[0] for g in (gains_of(r, "true") for r in done if r["kind"] == "clean") if g is not None]
     every = [g[0] for g in (gains_of(r, "true") for r in done) if g is not None]
     return [
-        Row("held-out runs: median share of the right model's gain", resampled(_shares(named), _median), 0.95),
+        Row("held-out runs: median share of the right model's gain", bootstrapped(_shares(named), _median), 0.95),
         Row("held-out worse than the null by over 3 nats", share([bool(g < -3.0) for g in every])),
         Row("  of clean ones", share([bool(g < -3.0) for g in clean])),
     ]
@@ -147,13 +164,16 @@ def _unlisted_laws(done: list[Result]) -> list[Row]:
         Row("not on the list, lambda 20: unknown, or as good as the true law", share(told), 0.9),
         Row("  by a formula or a name", share(good), 0.6),
         Row("  a formula found", share([bool(r["formula"]) for r in outside])),
-        Row("false unknown", share([r["verdict"] == "unknown" for r in inside if not is_outside(r)])),
+        Row("false unknown", share([r["verdict"] == "unknown" for r in inside if not is_out_of_vocabulary(r)])),
     ]
 
 
 def _as_good(result: Result) -> bool:
     """Return whether a name or formula gains most of what the true law does; aliases count too."""
-    if fits(leading(result, clean=True)[0], answers(result, merged=True)) and result["verdict"] != "unknown":
+    if (
+        names_match(leading(result, clean=True)[0], effects_to_name(result, merged=True))
+        and result["verdict"] != "unknown"
+    ):
         return True
     gains = gains_of(result, "right")
     return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]

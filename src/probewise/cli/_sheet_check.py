@@ -30,7 +30,7 @@ _AROUND_MM = np.stack(
 )
 
 
-class SheetWatch:
+class SheetCheck:
     """Checks readings taken over uniform white or black.
 
     Parameters
@@ -46,13 +46,13 @@ class SheetWatch:
         ends = plan.instrumentation.ends
         self._range = ends[1] - ends[0] if len(ends) == 2 else math.nan
         self._read: dict[bool, list[float]] = {True: [], False: []}
-        self._told: set[tuple[str, bool]] = set()
+        self._reported: set[tuple[str, bool]] = set()
         places = np.stack([plan.x_mm, plan.y_mm], axis=-1)
         self._shades = np.full(len(plan), math.nan)
         for name, rows in plan.rows_by_pattern():
             self._shades[rows] = shades(plan.patterns[name], places[rows])
 
-    def heard(self, row: int, value: float) -> str | None:
+    def check_reading(self, row: int, value: float) -> str | None:
         """Check a reading of the plan; return the complaint, once per sheet and shade, or None."""
         shade = self._shades[row]
         if math.isnan(shade) or math.isnan(value):
@@ -62,13 +62,13 @@ class SheetWatch:
         if wrong is None:
             self._read[is_white].append(value)
             return None
-        if (name, is_white) in self._told:
+        if (name, is_white) in self._reported:
             return None
-        self._told.add((name, is_white))
+        self._reported.add((name, is_white))
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
         return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour(is_white)}, and {wrong}"
 
-    def looked(self, name: str, values: dict[bool, float]) -> str | None:
+    def check_levels(self, name: str, values: dict[bool, float]) -> str | None:
         """Check readings over the white and the black of a sheet, and keep them if they are right."""
         wrong = None
         if len(values) == 2:
@@ -84,7 +84,7 @@ class SheetWatch:
             self._read[is_white].append(value)
         return None
 
-    def check_places(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
+    def places_to_check(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
         """Choose places for checking a sheet: over uniform white and uniform black, by shade.
 
         Parameters

@@ -11,18 +11,18 @@ import numpy as np
 from probewise.arm import Pose
 from probewise.arm.carry_out import Request, bounds_of
 from probewise.cli._arm import questioner
-from probewise.cli._bench import moved
+from probewise.cli._bench import moved_pattern
 from probewise.cli._common import caution
 from probewise.emulator.scenes import scene_text
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
     from probewise.arm import LegoArm, OwnInstrument, SimulatedArm
-    from probewise.cli._sheet_watch import SheetWatch
+    from probewise.cli._sheet_check import SheetCheck
     from probewise.recordings import Plan
 
 
-class Hands:
+class PersonAtBench:
     """Pass the requests of `carry_out` to a person; check white and black of a sheet before it is scanned.
 
     Parameters
@@ -44,22 +44,28 @@ class Hands:
         arm: LegoArm | OwnInstrument | SimulatedArm,
         plan: Plan,
         origin_mm: tuple[float, float],
-        watch: SheetWatch,
+        sheet_check: SheetCheck,
         *,
-        looks: bool,
-        typed: bool,
+        check_sheets: bool,
+        emulated: bool,
     ) -> None:
-        self._arm, self._plan, self._origin, self._watch, self._typed = arm, plan, origin_mm, watch, typed
-        self._looks = looks
+        self._arm, self._plan, self._origin, self._sheet_check, self._emulated = (
+            arm,
+            plan,
+            origin_mm,
+            sheet_check,
+            emulated,
+        )
+        self._check_sheets = check_sheets
         self._answer = questioner(arm)
 
     def __call__(self, request: Request) -> None:
         """Prompt, and check the sheet until it is right or the person overrides the check."""
-        text = f"{request[0].upper()}{request[1:]}{self._to_type(request)}"
+        text = f"{request[0].upper()}{request[1:]}{self._typed_request(request)}"
         self._answer(f"{text}, then press Enter: ")
-        if request.pattern is None or not self._looks:
+        if request.pattern is None or not self._check_sheets:
             return
-        while (wrong := self._look(request.pattern)) is not None:
+        while (wrong := self._contradiction(request.pattern)) is not None:
             if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
                 caution(f"{wrong}; is the right sheet there, the right way round?")
                 break
@@ -67,28 +73,30 @@ class Hands:
             if said.lower() == "go":
                 break
 
-    def _to_type(self, request: Request) -> str:
+    def _typed_request(self, request: Request) -> str:
         """Return what to type in the emulator's terminal."""
-        if not self._typed:
+        if not self._emulated:
             return ""
         if request.turned_rad is not None:
             return f" (in the emulator's terminal: turn {np.degrees(request.turned_rad):g})"
         if request.pattern is None:
             return ""
         try:
-            scene = scene_text(moved(self._plan.patterns[request.pattern], self._origin))
+            scene = scene_text(moved_pattern(self._plan.patterns[request.pattern], self._origin))
         except ParameterError:
             return " (the emulator's terminal knows no such pattern; --arm emulator lays it by itself)"
         return f" (in the emulator's terminal: {scene})"
 
-    def _look(self, name: str) -> str | None:
+    def _contradiction(self, name: str) -> str | None:
         bounds, origin = bounds_of(self._arm), np.array(self._origin)
         values = {}
-        for is_white, place in self._watch.check_places(name, lambda places: bounds.holds(places + origin)).items():
+        for is_white, place in self._sheet_check.places_to_check(
+            name, lambda places: bounds.holds(places + origin)
+        ).items():
             x_mm, y_mm = (np.array(place) + origin).tolist()
             standing = float(self._arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
             values[is_white] = self._arm.measure(Pose(x_mm, y_mm, standing)).value
-        return self._watch.looked(name, values)
+        return self._sheet_check.check_levels(name, values)
 
 
 def is_pty(port: str) -> bool:

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from probewise.challenge.coverage import place_overlap, sensor_truths_and_intervals, truths_and_intervals
 
+from probewise.challenge.coverage import place_overlap, sensor_truths_and_intervals, truths_and_intervals
 from probewise.diagnosis import EffectFound, ModelSamples, ParameterFound, Place
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture

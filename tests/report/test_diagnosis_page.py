@@ -16,7 +16,7 @@ from probewise.report.covariate_view import is_line
 from probewise.report.diagnosis_figures import changed_most
 from probewise.report.plots import gain_by_scan, one_scan
 from probewise.report.residual_means import mean_residuals
-from probewise.report.words import readable
+from probewise.report.words import typeset
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 
@@ -99,7 +99,7 @@ def test_scans_that_an_effect_is_bound_to_are_named(saturated):
 
 
 def test_numbers_are_written_as_people_write_them():
-    assert readable("(p = 2.2e-07) -0.3 mm in edge-90") == "(p\u00a0=\u00a02.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
+    assert typeset("(p = 2.2e-07) -0.3 mm in edge-90") == "(p\u00a0=\u00a02.2\u00a0×\u00a010⁻⁷) −0.3 mm in edge-90"
 
 
 def test_labels_carry_units():
@@ -219,8 +219,8 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
         covariate_view, "covariate_values", lambda d: {place.witness: np.arange(3.0) for place in d.where}
     )
     monkeypatch.setattr(covariate_view, "_views", lambda d, place, at: [place])
-    chance = SimpleNamespace(means=lambda d, view, after: SimpleNamespace(stands_out=sizes[view.covariate]))
-    ordered = covariate_view.seen_first(found, chance)
+    chance = SimpleNamespace(means=lambda d, view, after: SimpleNamespace(largest_in_sds=sizes[view.covariate]))
+    ordered = covariate_view.places_in_order(found, chance)
     assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
 
 

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.report.words import interval, unit_of, with_error, within, without_unit
+from probewise.report.words import interval, unit_of, value_and_interval, with_error, without_unit
 
 
 @pytest.mark.parametrize(
@@ -37,8 +37,8 @@ def test_no_error_above_zero_is_written_as_zero(value, error):
 def test_an_interval_is_written_to_the_third_figure_of_its_width():
     assert interval(0.030724, 0.035694) == "0.03072 to 0.03569"
     assert interval(-0.020431, 5.4e-06) == "−0.0204 to 0.0000"
-    assert within(0.032489, 0.030724, 0.035694) == ("0.03249", "0.03072 to 0.03569")
-    assert within(3.0, 3.0, 3.0) == ("3", "3")
+    assert value_and_interval(0.032489, 0.030724, 0.035694) == ("0.03249", "0.03072 to 0.03569")
+    assert value_and_interval(3.0, 3.0, 3.0) == ("3", "3")
 
 
 def test_a_parameters_unit_is_told_once():

@@ -7,7 +7,7 @@ import shlex
 from functools import partial
 
 from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, say
-from probewise.cli._executor import add_executor, campaign_running
+from probewise.cli._executor import add_executor, campaign_kept_message, campaign_running
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import reporting_what_is_kept
 

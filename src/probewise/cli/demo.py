@@ -125,7 +125,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
             seconds=seconds,
         )
         write_text_atomically(stage / "report.html", page)
-        answers = report.answers(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
+        answers = report.main_findings(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
         write_text_atomically(stage / "answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
     return (
         *report.comparison_lines(searches),

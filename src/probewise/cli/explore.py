@@ -193,10 +193,10 @@ def run(arguments: argparse.Namespace) -> int:
             site.arm,
             lambda pose: tell(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
             lambda reading: tell(f"thinking about {reading.value:g}"),
-        ) as telling,
+        ) as reporting,
         closing(
             explore(
-                telling,
+                reporting,
                 inputs.experiment,
                 rng=inputs.streams.run,
                 max_readings=arguments.max_readings,

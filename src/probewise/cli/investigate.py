@@ -160,7 +160,7 @@ def run(arguments: argparse.Namespace) -> int:
         drawn = of_a_diagnosis.figures(diagnosis)
         write_results(diagnosis, drawn, stage.folder, rng=np.random.default_rng(files_seed))
         write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
-        write_bytes_atomically(stage / "by_round.png", report.believed_picture(found))
+        write_bytes_atomically(stage / "by_round.png", report.probabilities_png(found))
         concealed = None if world is None else tuple(effect.name for effect in world.concealed)
         page = report.write_page(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
         write_text_atomically(stage / "report.html", page)

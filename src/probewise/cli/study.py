@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, say
-from probewise.cli._executor import add_executor, campaign_running
+from probewise.cli._executor import add_executor, campaign_kept_message, campaign_running
 from probewise.cli._output import check_out_directory, staged
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError

@@ -10,8 +10,8 @@ from probewise.effects import spoken_name
 from probewise.report.audit_table import audit_table
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import AxesGrid, audit_matrix, png
-from probewise.report.terms import explained, terms_of
-from probewise.report.words import count, number, readable
+from probewise.report.terms import explain_new_terms, with_explanations
+from probewise.report.words import count, number, typeset
 
 _CURED_BY = "The fewest extra readings that would help"
 
@@ -77,8 +77,8 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
     return page(
         f"Audit of {source}",
         answer=answer(audit),
-        key_figure=fragment(shown, *terms_of(f"{answer(audit)} {shown}", known)),
-        sections=explained(sections, known),
+        key_figure=fragment(shown, *explain_new_terms(f"{answer(audit)} {shown}", known)),
+        sections=with_explanations(sections, known),
     )
 
 
@@ -108,7 +108,7 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
             (
                 (
                     str(k),
-                    readable(cure.description),
+                    typeset(cure.description),
                     str(len(cure.plan)),
                     ", ".join(map(spoken_name, cure.cured)) or "–",
                 )

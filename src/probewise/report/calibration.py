@@ -19,7 +19,16 @@ from probewise.report.plots import (
     spatial_sensitivity,
     ssf_by_order,
 )
-from probewise.report.words import count, number, readable, signed, unit_name, with_error, within, without_unit
+from probewise.report.words import (
+    count,
+    number,
+    signed,
+    typeset,
+    unit_name,
+    value_and_interval,
+    with_error,
+    without_unit,
+)
 
 
 def answer(sensor: FittedSensor) -> str:
@@ -32,7 +41,7 @@ def answer(sensor: FittedSensor) -> str:
         lead = chosen.log_z - others[0].log_z
         error = math.hypot(chosen.log_z_error, others[0].log_z_error)
         said += f", ahead of {others[0].n_gaussians} by {with_error(lead, error)} in ln Z"
-    center_x, center_y, widths = field_shape(sensor)
+    center_x, center_y, widths = ssf_centre_and_sds(sensor)
     return (
         f"{said}: centred at ({signed(center_x, 1)}, {signed(center_y, 1)}) mm on the sensor, "
         f"{number(widths[0], 1)} by {number(widths[1], 1)} mm (sd), "
@@ -40,7 +49,7 @@ def answer(sensor: FittedSensor) -> str:
     )
 
 
-def field_shape(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
+def ssf_centre_and_sds(sensor: FittedSensor) -> tuple[float, float, tuple[float, float]]:
     """Return the centre of the mean SSF and its sds along the long and the short axis (mm)."""
     u, v = sensor.field.mean_mm
     short, long = np.sqrt(np.maximum(np.linalg.eigvalsh(sensor.field.cov_mm2), 0))
@@ -114,7 +123,7 @@ def sections(
             (
                 table(
                     ("parameter", "unit", "prior", "why"),
-                    ((p.parameter, _unit(p.unit), readable(p.distribution), readable(p.reason)) for p in sensor.priors),
+                    ((p.parameter, _unit(p.unit), typeset(p.distribution), typeset(p.reason)) for p in sensor.priors),
                 ),
             ),
         ),
@@ -157,7 +166,7 @@ def parameter_table(sensor: FittedSensor) -> Markup:
     median, ends = sensor.median(), sensor.interval()
     return table(
         ("parameter", "unit", "median", "95 % interval"),
-        ((n, _unit(sensor.unit(n)), *within(median[n], *ends[n])) for n in sensor.names),
+        ((n, _unit(sensor.unit(n)), *value_and_interval(median[n], *ends[n])) for n in sensor.names),
         caption="Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of "
         "[[A, C], [C, B]].",
     )
@@ -167,7 +176,7 @@ def ssf_table(sensor: FittedSensor) -> Markup:
     """Build the table of the SSF's centre, widths and angle: medians and 95 % intervals."""
     return table(
         ("SSF", "unit", "median", "95 % interval"),
-        ((without_unit(q.name), _unit(q.unit), *within(q.median, *q.interval95)) for q in sensor.ssf()),
+        ((without_unit(q.name), _unit(q.unit), *value_and_interval(q.median, *q.interval95)) for q in sensor.ssf()),
         caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "
         "and of the angle of the long axis from the x' axis, anticlockwise.",
     )

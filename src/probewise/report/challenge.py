@@ -14,8 +14,8 @@ from probewise.challenge.systems import family_of
 from probewise.challenge.systems.table import gains_of
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
-from probewise.report.terms import explained, terms_of
-from probewise.report.words import count, readable
+from probewise.report.terms import explain_new_terms, with_explanations
+from probewise.report.words import count, typeset
 
 Results = Sequence[Mapping[str, Any]]
 
@@ -40,7 +40,7 @@ def table_of_rows(rows: Sequence[Row]) -> Markup:
             (
                 _keep_indentation(row.name),
                 _value(row.found) if row.found.n else "–",
-                readable(_interval(row.found)),
+                typeset(_interval(row.found)),
                 str(row.found.n),
                 _target(row),
                 "undecided" if row.decision == "open" else _DECISIONS[row.decision],
@@ -98,8 +98,8 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
     return page(
         "How good a diagnosis is",
         answer=answer(rows, len(results)),
-        key_figure=fragment(honest, *terms_of(honest, known)),
-        sections=explained(sections, known),
+        key_figure=fragment(honest, *explain_new_terms(honest, known)),
+        sections=with_explanations(sections, known),
     )
 
 

@@ -64,22 +64,22 @@ class ResidualNoise:
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
         return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, diagnosis.recording.plan))
 
-    def means(self, diagnosis: Diagnosis, witness: CovariateView, *, after: bool) -> Means:
+    def means(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> Means:
         """Average the residuals of a diagnosis along a covariate."""
         return mean_residuals(
-            witness.at,
+            view.at,
             diagnosis.repair.before.residuals,
             diagnosis.repair.after.residuals if after and diagnosis.repair.changes_predictions else None,
             sd=self.sd,
             rho=self.rho,
             scan=diagnosis.recording.plan.scan,
-            names=witness.names,
-            window=None if witness.names else witness.window,
+            names=view.names,
+            window=None if view.names else view.window,
             absorbed=self.absorbed,
         )
 
 
-def telling(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
+def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
     """Choose the first figure's covariate: the first whose means leave the band of chance, else the nearest to it.
 
     Candidates in order: a named wave, folded at its period; the places; for an unknown effect, its most likely
@@ -88,18 +88,18 @@ def telling(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
     values = covariate_values(diagnosis)
     alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
     places = sorted(alarming, key=lambda place: -_probability_of_dependence(diagnosis, place))
-    found = _at_period(diagnosis)
+    found = _views_at_period(diagnosis)
     for place in places:
         found += _views(diagnosis, place, values[place.witness])
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
-        found.append(_by_change(diagnosis))
+        found.append(_view_by_change(diagnosis))
     if not found:
         return CovariateView(np.array(diagnosis.repair.before.readings), label_of(diagnosis, "level"))
-    sizes = [chance.means(diagnosis, witness, after=False).stands_out for witness in found]
+    sizes = [chance.means(diagnosis, view, after=False).largest_in_sds for view in found]
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
 
 
-def seen_first(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
+def places_in_order(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
     """Order the places for the report, each with whether a mean leaves the band of chance.
 
     First the covariate of the unknown effect, which the headline names; then visible places; then the others.
@@ -107,7 +107,7 @@ def seen_first(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place,
     values, seen = covariate_values(diagnosis), {}
     for place in diagnosis.where:
         views = _views(diagnosis, place, values[place.witness])
-        seen[place.witness] = any(chance.means(diagnosis, w, after=False).stands_out >= _SEEN for w in views)
+        seen[place.witness] = any(chance.means(diagnosis, w, after=False).largest_in_sds >= _SEEN for w in views)
     ordered = sorted(diagnosis.where, key=lambda p: (-_probability_of_dependence(diagnosis, p), not seen[p.witness]))
     shown: list[Place] = []
     for place in ordered:  # with one scan, a place in all scans and one in that scan are the same
@@ -125,13 +125,13 @@ def _is_same(values: Mapping[str, FloatArray], place: Place, other: Place) -> bo
 
 def _views(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
     """List views of a place by its covariate, (n_points,); a scan also along its path, which comes first."""
-    by_covariate = of_place(diagnosis, place, at)
+    by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
-    return [along_scan(diagnosis, place.scan, place), by_covariate]
+    return [view_along_scan(diagnosis, place.scan, place), by_covariate]
 
 
-def of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
+def view_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
     """Build the view of a place along its covariate, (n_points,)."""
     unit = diagnosis.recording.plan.instrumentation.unit
     label = label_of(diagnosis, place.covariate, place.scan)
@@ -141,7 +141,7 @@ def of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateVie
     return CovariateView(at, label, names, _window(place, at, names), place)
 
 
-def along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
+def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
     """Build the view of one scan along its path: residuals that change sign average to zero over a scan."""
     plan = diagnosis.recording.plan
     rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
@@ -179,7 +179,7 @@ def _probability_of_dependence(diagnosis: Diagnosis, place: Place) -> float:
     return sum(p for family, p in shares.items() if family.partition(",")[0] == place.covariate + within)
 
 
-def _at_period(diagnosis: Diagnosis) -> list[CovariateView]:
+def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
     """Fold time, or X, at the period of a named wave."""
     plan, out = diagnosis.recording.plan, []
     for effect in diagnosis.effects:
@@ -212,7 +212,7 @@ def _waves_of_table(
     return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
 
 
-def _by_change(diagnosis: Diagnosis) -> CovariateView:
+def _view_by_change(diagnosis: Diagnosis) -> CovariateView:
     unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
     return CovariateView(
         diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})"

@@ -15,7 +15,7 @@ from probewise.report import calibration as calibration_report
 from probewise.report import diagnosis as diagnosis_report
 from probewise.report import doubt as doubt_report
 from probewise.report import exploration as exploration_report
-from probewise.report.held_out import most_gained
+from probewise.report.held_out import part_with_largest_gain
 from probewise.report.html import (
     Markup,
     Section,
@@ -43,7 +43,7 @@ from probewise.report.plots import (
 )
 from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import side_by_side
-from probewise.report.words import count, number, readable
+from probewise.report.words import count, number, typeset
 
 FIRST = 3  # as in the paper's figure
 HEADER = (
@@ -73,7 +73,7 @@ def answer(searches: Sequence[RobotSearch]) -> str:
     )
 
 
-def equal_start(searches: Sequence[RobotSearch]) -> str:
+def equal_readings_text(searches: Sequence[RobotSearch]) -> str:
     """Compare both robots after the number of readings that the SSF robot needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
@@ -84,7 +84,7 @@ def equal_start(searches: Sequence[RobotSearch]) -> str:
     )
 
 
-def answers(
+def main_findings(
     started_alike: Sequence[RobotSearch],
     diagnosis: Diagnosis,
     doubt: Sequence[RobotSearch],
@@ -96,12 +96,12 @@ def answers(
     return {
         "seed": seed,
         "search": answer(started_alike),
-        "equal_readings": equal_start(started_alike),
+        "equal_readings": equal_readings_text(started_alike),
         "verdict": diagnosis.verdict,
         "combination": "+".join(diagnosis.combination),
         "concealed": concealed,
         "diagnosis": diagnosis_report.answer(diagnosis),
-        "reason": readable(diagnosis.reason),
+        "reason": typeset(diagnosis.reason),
         "doubt": doubt_report.answer(doubt),
     }
 
@@ -191,7 +191,7 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
         "explanations.png": png(hypothesis_probabilities(labels, [h.probability for h in likely])),
         "scans.png": png(residuals_by_scan(recording, before, after)),
     }
-    best = most_gained(diagnosis)
+    best = part_with_largest_gain(diagnosis)
     if best is not None:
         name, gain, rows = best
         title = f"{name}: {gain:+.2f} nats per reading when it was held out"
@@ -280,7 +280,7 @@ def write_page(
         ),
     ]
     caption = (
-        f"{equal_start(started_alike)} Left the naive model, right the SSF model. Blue: 50 circles drawn from the "
+        f"{equal_readings_text(started_alike)} Left the naive model, right the SSF model. Blue: 50 circles drawn from the "
         "posterior. Copper: entropy of the readings that these circles predict; brighter places promise more "
         "information. Squares: readings by their brightness. Green: the next place. Dashed white: the hidden "
         "circle."

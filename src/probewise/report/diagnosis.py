@@ -24,13 +24,19 @@ from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.effects.vocabulary import give_or_take
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import family_words, words_and_unit
-from probewise.report.covariate_view import ResidualNoise, seen_first
-from probewise.report.diagnosis_figures import figures, shown_first
-from probewise.report.effect_words import EFFECTS_IN_WORDS, effect_in_words, hypothesis_in_words, is_in_words, listed
+from probewise.report.covariate_view import ResidualNoise, places_in_order
+from probewise.report.diagnosis_figures import figures, first_figure_content
+from probewise.report.effect_words import (
+    EFFECTS_IN_WORDS,
+    effect_in_words,
+    hypothesis_in_words,
+    is_in_words,
+    join_names,
+)
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, element, figure, fragment, page, paragraph, table
-from probewise.report.terms import explained, terms_of
-from probewise.report.words import count, number, probability, readable, unit_name
+from probewise.report.terms import explain_new_terms, with_explanations
+from probewise.report.words import count, number, probability, typeset, unit_name
 
 __all__ = ["answer", "figures", "sections", "write_page"]
 
@@ -95,13 +101,13 @@ def write_page(
     return page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=answer(diagnosis),
-        key_figure=fragment(first, *terms_of(f"{diagnosis.verdict} {first}", known)),
-        sections=explained([*sections(diagnosis, drawn), *design, run], known),
+        key_figure=fragment(first, *explain_new_terms(f"{diagnosis.verdict} {first}", known)),
+        sections=with_explanations([*sections(diagnosis, drawn), *design, run], known),
     )
 
 
 def _first_caption(diagnosis: Diagnosis) -> str:
-    shown = shown_first(diagnosis)
+    shown = first_figure_content(diagnosis)
     bars = "Below: the possible explanations with their probabilities."
     if shown == "readings":
         return "The readings in the order of time. Below: prior probabilities; these readings do not change them."
@@ -161,7 +167,7 @@ def _formula(formula: Formula) -> str:
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
     held_out = f"{formula.heldout_log_density_per_reading:+.3f} nats per held-out reading"
     gained = f"log evidence {formula.log_evidence:+.1f} nats, {held_out}"
-    return readable(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
+    return typeset(f"Added to {of}: {formula.expression}, {numbers} ({gained}).")
 
 
 def _reason_in_words(diagnosis: Diagnosis) -> str:
@@ -180,12 +186,12 @@ def _prediction_in_words(nats: float, sd: float) -> str:
 
 def _signed_nats(nats: float, sd: float) -> str:
     written = give_or_take(nats, sd)
-    return f"{readable(written if written.startswith('-') else f'+{written}')} nats"
+    return f"{typeset(written if written.startswith('-') else f'+{written}')} nats"
 
 
 def _shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str:
     held = (
-        f"{listed(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
+        f"{join_names(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
         for names, share in shares.items()
     )
     return f"Posterior samples in {model} contain: {', '.join(held)}."
@@ -206,7 +212,7 @@ def _chance_in_words(diagnosis: Diagnosis) -> str:
         said = f"For the mean, yes: {often}. But chance would not put so many outlying readings together."
     else:
         said = f"{'Yes' if p_value > _CHANCE else 'Hardly'}: {often}."
-    return readable(said)
+    return typeset(said)
 
 
 def _next_in_words(diagnosis: Diagnosis) -> str:
@@ -234,7 +240,7 @@ def _in_words(label: str) -> str:
     """Write a rival hypothesis of a plan in words; a label that holds no effect names is a phrase already."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
-    said = listed(map(effect_in_words, names)) if all(is_in_words(name) for name in names) else named
+    said = join_names(map(effect_in_words, names)) if all(is_in_words(name) for name in names) else named
     return f"{said}, too weak to be detected so far" if weak else said
 
 
@@ -307,7 +313,7 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
                     hypothesis_in_words(w.effects),
                     str(w.n_gaussians or "–"),
                     number(w.laplace, 2),
-                    readable(give_or_take(w.nested, w.error)),
+                    typeset(give_or_take(w.nested, w.error)),
                     ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
                 )
                 for w in diagnosis.report.weighings
@@ -323,7 +329,7 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
         return (paragraph("No residual is larger than noise explains."),)
     shown = [
         figure(drawn[place.witness], _place_words(diagnosis, place, seen=seen))
-        for place, seen in seen_first(diagnosis, ResidualNoise.of(diagnosis))
+        for place, seen in places_in_order(diagnosis, ResidualNoise.of(diagnosis))
     ]
     opening = paragraph(
         "Residuals of the calibrated model against each covariate in which they are significant: the headline's "
@@ -375,7 +381,7 @@ def _gain_of_repair(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
                     if diagnosis.repair.changes_predictions
                     else (("rms of the residuals", f"{gain.rms_before:.3g} {unit}"),)
                 ),
-                ("test for further missing effects", readable(p_in_words(gain.p_value_after))),
+                ("test for further missing effects", typeset(p_in_words(gain.p_value_after))),
             )
         ),
     )
@@ -391,12 +397,12 @@ def _nothing_held_out(diagnosis: Diagnosis) -> str:
 def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     noise = diagnosis.report.noise
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
-    model = listed(map(effect_in_words, names)) if names else "white: independent, with one sd"
+    model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
     rows = (
         (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value(p)) for p in noise.parameters
     )
     return (
-        paragraph(readable(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")),
+        paragraph(typeset(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")),
         *((table(("parameter", "unit", "value", "95 % interval"), rows),) if noise.parameters else ()),
         figure(
             drawn["noise.svg"],
@@ -440,7 +446,7 @@ def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Write a parameter with its sd (and unit, if asked), and its interval."""
     low, high = found.interval95
     own = _unit(found) if unit else ""
-    return readable(f"{give_or_take(found.mean, found.sd)} {own}".rstrip()), readable(f"{low:.4g} to {high:.4g}")
+    return typeset(f"{give_or_take(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
 
 
 def _unit(found: ParameterFound) -> str:
@@ -467,7 +473,7 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
             (
                 " and ".join(map(effect_in_words, a.effects)),
                 number(a.cosine, 3),
-                readable(a.settle_by),
+                typeset(a.settle_by),
                 _readings(a.readings),
             )
             for a in aliases
@@ -503,7 +509,7 @@ def _design(audit: PlanAudit) -> tuple[Markup, ...]:
 
 
 def _sentence(text: str) -> str:
-    return readable(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
+    return typeset(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
 
 
 def _place_words(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
@@ -522,4 +528,4 @@ def _place_words(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> st
         what += f", {run} {place.scan}"
     chance = "" if place.p_value < ALARM else ", possibly chance"
     hidden = "" if seen else " No mean leaves the band: residuals that change sign, or only scatter, average to zero."
-    return readable(f"Significant residuals: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")
+    return typeset(f"Significant residuals: {what} ({p_in_words(place.p_value)}{chance}).{hidden}")

@@ -11,7 +11,14 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.recordings import Plan
 from probewise.report.covariate import covariate_values, label_of
-from probewise.report.covariate_view import CovariateView, ResidualNoise, along_scan, is_line, of_place, telling
+from probewise.report.covariate_view import (
+    CovariateView,
+    ResidualNoise,
+    choose_first_view,
+    is_line,
+    view_along_scan,
+    view_of_place,
+)
 from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
     correlation_of_neighbours,
@@ -57,18 +64,18 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
             )
         )
     for place in diagnosis.where:
-        drawn[place.witness] = _witness(diagnosis, chance, place, values[place.witness])
+        drawn[place.witness] = _draw_place(diagnosis, chance, place, values[place.witness])
     return drawn
 
 
-def shown_first(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> CovariateView | str:
+def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> CovariateView | str:
     """Choose the content of the first figure: residuals along a covariate, or the noise effect that is named."""
     if diagnosis.judged.too_little:
         return "readings"
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
         return max(diagnosis.combination, key=lambda name: sizes.get(name, 0.0))
-    return telling(diagnosis, ResidualNoise.of(diagnosis) if chance is None else chance)
+    return choose_first_view(diagnosis, ResidualNoise.of(diagnosis) if chance is None else chance)
 
 
 def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
@@ -77,7 +84,7 @@ def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     names = [hypothesis_in_words(h.effects) for h in listed]
     n_bars = min(len(listed), _MOST_BARS) + (len(diagnosis.hypotheses) > min(len(listed), _MOST_BARS))
     above, below = stack_of_axes([2.7, 0.6 + 0.36 * max(n_bars, 3)])
-    shown = shown_first(diagnosis, chance)
+    shown = first_figure_content(diagnosis, chance)
     if shown == "readings":
         readings_in_order(diagnosis.recording, ax=above)
     elif isinstance(shown, str):
@@ -95,32 +102,32 @@ def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     return svg(above)
 
 
-def _witness(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
+def _draw_place(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
     """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
 
     A scan is drawn along its path first, then among the other scans: residuals that change sign average to zero.
     """
-    by_covariate = of_place(diagnosis, place, at)
+    by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         axes = stack_of_axes([2.6])
     else:
         axes = stack_of_axes([2.4, 2.6])
-        _draw_means_along(diagnosis, chance, along_scan(diagnosis, place.scan), after=False, each=True, ax=axes[0])
+        _draw_means_along(diagnosis, chance, view_along_scan(diagnosis, place.scan), after=False, each=True, ax=axes[0])
     _draw_means_along(diagnosis, chance, by_covariate, after=False, each=True, ax=axes[-1])
     return svg(axes)
 
 
 def _draw_means_along(
-    diagnosis: Diagnosis, chance: ResidualNoise, witness: CovariateView, *, after: bool, each: bool, ax: Axes
+    diagnosis: Diagnosis, chance: ResidualNoise, view: CovariateView, *, after: bool, each: bool, ax: Axes
 ) -> Axes:
-    names = witness.shown_names
-    at = witness.at if names is None else _side_by_side(witness.at)
+    names = view.shown_names
+    at = view.at if names is None else _side_by_side(view.at)
     return mean_residuals_along(
-        chance.means(diagnosis, witness, after=after),
-        label=witness.label,
+        chance.means(diagnosis, view, after=after),
+        label=view.label,
         unit=unit_name(diagnosis.recording.plan.instrumentation.unit),
         each=(at, diagnosis.repair.before.residuals) if each else None,
-        window=witness.window,
+        window=view.window,
         names=names,
         ax=ax,
     )
@@ -139,7 +146,7 @@ def _before_and_after(diagnosis: Diagnosis) -> bytes:
     """Draw the line scan that the repair changes most (or the longest): readings, both models, residuals of each."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
     rows = changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
-    shown = along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
+    shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     models = [(BEFORE, diagnosis.repair.before.readings[rows]), (AFTER, diagnosis.repair.after.readings[rows])]
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)

@@ -41,10 +41,10 @@ def hypothesis_in_words(effects: Sequence[str]) -> str:
     """Name a hypothesis: a set of effects, () for clean, ("unknown",) for an effect out of vocabulary."""
     if not effects:
         return "nothing is missing"
-    return "something without a name" if tuple(effects) == ("unknown",) else listed(map(effect_in_words, effects))
+    return "something without a name" if tuple(effects) == ("unknown",) else join_names(map(effect_in_words, effects))
 
 
-def listed(names: Sequence[str] | map[str]) -> str:
+def join_names(names: Sequence[str] | map[str]) -> str:
     """Join names: A, B and C."""
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import predicted_and_recorded, residual_clouds, svg
-from probewise.report.words import number, readable, unit_name
+from probewise.report.words import number, typeset, unit_name
 from probewise.systems import RunTable
 
 _MOST_COLUMNS = 6
@@ -52,7 +52,7 @@ def write_page(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     error = f" ± {number(evidence.error, 2)}" if evidence.error else ""
     how = f"; {evidence.reason}" if evidence.reason else ""
     rows = [
-        (name, readable(f"{median[k]:.5g}"), readable(f"{interval[name][0]:.5g} to {interval[name][1]:.5g}"))
+        (name, typeset(f"{median[k]:.5g}"), typeset(f"{interval[name][0]:.5g} to {interval[name][1]:.5g}"))
         for k, name in enumerate(own.names)
     ]
     run = (

@@ -9,7 +9,7 @@ import numpy as np
 from probewise.diagnosis import ALARM, Diagnosis
 from probewise.effects import UNNAMED
 from probewise.report.covariate import words_and_unit
-from probewise.report.effect_words import effect_in_words, hypothesis_in_words, listed
+from probewise.report.effect_words import effect_in_words, hypothesis_in_words, join_names
 from probewise.report.words import count
 
 MOST_WORDS = 20
@@ -58,7 +58,7 @@ def _left_out(diagnosis: Diagnosis, opening: str) -> list[str]:
     if len(names) == 1:
         return [f"{opening} {names[0]}.", f"{opening} one effect."]
     return [
-        f"{opening} {listed(names)}.",
+        f"{opening} {join_names(names)}.",
         f"{opening} {len(names)} effects, the largest of them {names[0]}.",
         f"{opening} {len(names)} effects.",
     ]
@@ -70,7 +70,7 @@ def _unknown(diagnosis: Diagnosis) -> list[str]:
     covariate, _ = words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
     known = [effect_in_words(e.name) for e in diagnosis.effects if e.probability >= _SURE]
     short = "Something is missing that no known effect explains"
-    plain = f"Beside {listed(known)}, something is missing that no known effect explains" if known else short
+    plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short
     if top in UNNAMED:
         said = [f"{plain}; it looks most like {effect_in_words(top)}."]
     elif top.endswith(", far out"):

@@ -9,7 +9,7 @@ from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 
 
-def most_gained(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
+def part_with_largest_gain(diagnosis: Diagnosis) -> tuple[str, float, IntArray] | None:
     """Return the held-out part with the largest gain: name, gain in nats per reading, row numbers, (n_rows,).
 
     None where nothing was repaired, or nothing could be held out.

@@ -12,22 +12,22 @@ from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import beliefs_by_round, png
-from probewise.report.terms import explained, terms_of
-from probewise.report.words import count, probability, readable
+from probewise.report.terms import explain_new_terms, with_explanations
+from probewise.report.words import count, probability, typeset
 
 _MOST_TOLD = 4
 _LEAST_TOLD = 0.005
 
 
-def believed_picture(found: Investigation) -> bytes:
+def probabilities_png(found: Investigation) -> bytes:
     """Draw the probability of each explanation after each round, as a PNG."""
-    return png(beliefs_by_round({_title(each): _beliefs(each) for each in found.rounds}))
+    return png(beliefs_by_round({_title(each): _probabilities(each) for each in found.rounds}))
 
 
-def believed(found: Investigation) -> Markup:
+def probabilities_figure(found: Investigation) -> Markup:
     """Show the probability of each explanation after each round."""
     return figure(
-        believed_picture(found), "Probability of each explanation after each round, given all readings so far."
+        probabilities_png(found), "Probability of each explanation after each round, given all readings so far."
     )
 
 
@@ -63,7 +63,7 @@ def write_page(
         Effect that a simulated world concealed, stated at the end; None for a real arm.
     """
     last = found.last
-    bars = believed(found)
+    bars = probabilities_figure(found)
     run = definition_list(
         (
             ("arm", source),
@@ -82,8 +82,8 @@ def write_page(
     return page(
         f"Investigation: {last.diagnosis.verdict.replace('_', ' ')} after {count(len(found.rounds), 'round')}",
         answer=answer(found),
-        key_figure=fragment(bars, *terms_of(bars, known)),
-        sections=explained([story, details, Section("This run", (run,))], known),
+        key_figure=fragment(bars, *explain_new_terms(bars, known)),
+        sections=with_explanations([story, details, Section("This run", (run,))], known),
     )
 
 
@@ -92,7 +92,7 @@ def _title(each: Round) -> str:
     return f"round {each.number}: {n}" if each.number == 1 else f"round {each.number}: {len(each.recording)} more"
 
 
-def _beliefs(each: Round) -> dict[str, float]:
+def _probabilities(each: Round) -> dict[str, float]:
     out: dict[str, float] = {}
     for hypothesis in each.diagnosis.hypotheses:
         name = hypothesis_in_words(hypothesis.effects)
@@ -104,7 +104,7 @@ def _round_words(each: Round) -> Section:
     """Describe one round: the readings and their reason, the diagnosis, the next plan."""
     diagnosis = each.diagnosis
     why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.asked}"
-    likely = [(name, p) for name, p in _beliefs(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
+    likely = [(name, p) for name, p in _probabilities(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
     asked = diagnosis.next_measurement
     between = (
         "" if asked is None or len(asked.between) < 2 else f", which tell {asked.between[0]} from {asked.between[1]}"
@@ -116,9 +116,9 @@ def _round_words(each: Round) -> Section:
     else:
         then = f"Next readings: {asked.description}{between} (about {asked.minutes:.0f} minutes)."
     said: tuple[Markup, ...] = (
-        paragraph(readable(f"{count(len(each.recording), 'reading').capitalize()} were taken, {why}.")),
-        paragraph(readable(f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}.")),
+        paragraph(typeset(f"{count(len(each.recording), 'reading').capitalize()} were taken, {why}.")),
+        paragraph(typeset(f"Test of all readings so far against the model's mean: {p_in_words(diagnosis.p_value)}.")),
         table(("explanation", "probability"), ((name, probability(p)) for name, p in likely)),
-        paragraph(readable(then)),
+        paragraph(typeset(then)),
     )
     return Section(_title(each)[:1].upper() + _title(each)[1:], said)

@@ -199,4 +199,4 @@ def _(value: SystemPrediction) -> str:
 @render_html.register
 def _(value: Investigation) -> str:
     said = _text(value.summary())
-    return _card(paragraph(investigation_report.answer(value)), investigation_report.believed(value), said)
+    return _card(paragraph(investigation_report.answer(value)), investigation_report.probabilities_figure(value), said)

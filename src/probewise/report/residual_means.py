@@ -33,7 +33,7 @@ class Means:
     size: IntArray
 
     @property
-    def stands_out(self) -> float:
+    def largest_in_sds(self) -> float:
         """Largest mean of the calibrated model's residuals, in sds."""
         return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
 
@@ -136,12 +136,12 @@ def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float
     own = np.zeros(len(scan))
     own[rows] = sd[rows]
     variance = float(own @ own)
-    for lag in range(1, min(_longest_memory(rho), len(scan) - 1) + 1):
+    for lag in range(1, min(_longest_lag(rho), len(scan) - 1) + 1):
         variance += 2 * rho**lag * float(np.sum(own[lag:] * own[:-lag] * (scan[lag:] == scan[:-lag])))
     return max(variance, 0.0) / max(rows.size, 1) ** 2
 
 
-def _longest_memory(rho: float) -> int:
+def _longest_lag(rho: float) -> int:
     """Return the lag at which an AR(1) correlation falls below a hundredth."""
     return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0
 

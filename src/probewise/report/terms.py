@@ -37,7 +37,7 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
 """For each term: a pattern that finds its uses in a text, and its explanation."""
 
 
-def terms_of(content: str, known: set[str]) -> tuple[Markup, ...]:
+def explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
     """Explain the terms that some HTML uses and that are not yet in `known`, and add them to it."""
     text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
     new: list[str] = []
@@ -50,6 +50,6 @@ def terms_of(content: str, known: set[str]) -> tuple[Markup, ...]:
     return (paragraph(*parts, class_="terms"),) if parts else ()
 
 
-def explained(sections: Sequence[Section], known: set[str]) -> list[Section]:
+def with_explanations(sections: Sequence[Section], known: set[str]) -> list[Section]:
     """Add to each section the explanations of the terms that it uses first."""
-    return [replace(s, body=(*s.body, *terms_of(" ".join((s.heading, *s.body)), known))) for s in sections]
+    return [replace(s, body=(*s.body, *explain_new_terms(" ".join((s.heading, *s.body)), known))) for s in sections]

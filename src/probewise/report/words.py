@@ -24,7 +24,7 @@ def with_error(value: float, error: float, unit: str = "") -> str:
         written = f"{signed(value, max(digits, 0))} ± {number(error, max(digits, 0))}"
     else:
         written = f"{value:.3g} ± {error:.1g}"
-    return readable(f"{written} {unit}".rstrip()).replace("-", "−")
+    return typeset(f"{written} {unit}".rstrip()).replace("-", "−")
 
 
 def interval(low: float, high: float) -> str:
@@ -36,7 +36,7 @@ def interval(low: float, high: float) -> str:
     return f"{signed(low, digits)} to {signed(high, digits)}"
 
 
-def within(value: float, low: float, high: float) -> tuple[str, str]:
+def value_and_interval(value: float, low: float, high: float) -> tuple[str, str]:
     """Write a value and its interval to the same decimals: the third significant digit of the interval's width."""
     ends = interval(low, high)
     decimals = len(ends.partition(" ")[0].partition(".")[2])
@@ -60,7 +60,7 @@ def signed(value: float, digits: int) -> str:
     return number(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
 
 
-def readable(text: str) -> str:
+def typeset(text: str) -> str:
     """Typeset the numbers of a text: 2 × 10⁻⁷ for 2e-07, a true minus sign, "p = 0.2" on one line."""
 
     def power(found: re.Match[str]) -> str:

@@ -21,7 +21,7 @@ from probewise.report.plots.canvas import (
     AxesGrid,
     axes_or_new,
     grid_of_axes,
-    tidy,
+    label_axes,
 )
 
 _ROD_MM = 26.0  # distance between the two rods of each parallelogram, as drawn
@@ -105,17 +105,21 @@ def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | 
     wrist = knee + lower_mm * np.array([np.cos(lower), np.sin(lower)])
     _draw_side(ax, geometry, shoulder, lower, named=False)
     across = 40.0 * np.array([-np.sin(shoulder), np.cos(shoulder)])
-    _measure(ax, joint, knee, across, f"upper_mm {upper_mm:g}")
-    _measure(ax, knee, wrist, 40.0 * np.array([-np.sin(lower), np.cos(lower)]), f"lower_mm {lower_mm:g}")
+    _draw_dimension(ax, joint, knee, across, f"upper_mm {upper_mm:g}")
+    _draw_dimension(ax, knee, wrist, 40.0 * np.array([-np.sin(lower), np.cos(lower)]), f"lower_mm {lower_mm:g}")
     low = np.array([0.0, -45.0])
-    _measure(ax, np.array([0.0, 0.0]), np.array([forward, 0.0]), low, f"shoulder_forward_mm {forward:g}", side="left")
+    _draw_dimension(
+        ax, np.array([0.0, 0.0]), np.array([forward, 0.0]), low, f"shoulder_forward_mm {forward:g}", side="left"
+    )
     up = np.array([-70.0, 0.0])
-    _measure(ax, np.array([0.0, 0.0]), np.array([0.0, height]), up, f"shoulder_height_mm\n{height:g}", side="left")
+    _draw_dimension(
+        ax, np.array([0.0, 0.0]), np.array([0.0, height]), up, f"shoulder_height_mm\n{height:g}", side="left"
+    )
     eye = wrist + np.array([out_mm, -drop_mm])
-    _measure(ax, np.array([wrist[0], 0.0]), np.array([eye[0], 0.0]), low, f"forward_mm {out_mm:g}", side="right")
-    _measure(ax, eye, np.array([eye[0], wrist[1]]), np.array([35.0, 0.0]), f"drop_mm {drop_mm:g}", side="right")
+    _draw_dimension(ax, np.array([wrist[0], 0.0]), np.array([eye[0], 0.0]), low, f"forward_mm {out_mm:g}", side="right")
+    _draw_dimension(ax, eye, np.array([eye[0], wrist[1]]), np.array([35.0, 0.0]), f"drop_mm {drop_mm:g}", side="right")
     said = f"read_height_mm {geometry.read_height_mm:g}"
-    _measure(ax, np.array([eye[0], 0.0]), eye, np.array([75.0, 0.0]), said, side="right")
+    _draw_dimension(ax, np.array([eye[0], 0.0]), eye, np.array([75.0, 0.0]), said, side="right")
     x, y = joint.tolist()
     named = (
         ("base", geometry.base, (0.0, height + 110.0), (-12, 16), "right"),
@@ -129,7 +133,9 @@ def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | 
     return ax
 
 
-def _measure(ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, *, side: str = "above") -> None:
+def _draw_dimension(
+    ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, *, side: str = "above"
+) -> None:
     """Draw a dimension line with its arrow and text, offset from the part."""
     a, b = begin + away, end + away
     for here, there in ((begin, a), (end, b)):
@@ -203,7 +209,7 @@ def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, n
     ax.plot([wrist[0], eye[0]], [wrist[1], wrist[1]], color=BLACK, linewidth=2.2, zorder=4)
     ax.add_patch(Rectangle((eye[0] - 8, eye[1]), 16, geometry.sensor_mm[1] + 6, fc="#9a9a9a", ec=BLACK, zorder=4))
     if not named:
-        tidy(ax, x="distance from the arm's axis (mm)", y="height (mm)")
+        label_axes(ax, x="distance from the arm's axis (mm)", y="height (mm)")
         ax.set_aspect("equal")
         return
     ax.annotate("base turns about this axis", (0, knee[1] + 40), xytext=(10, 12), **_LABEL)
@@ -214,7 +220,7 @@ def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, n
     far = float(eye[0])
     ax.set(xlim=(-120, far + 130), ylim=(-140, float(knee[1]) + 110), aspect="equal")
     ax.set_yticks([tick for tick in ax.get_yticks() if 0 <= tick <= knee[1] + 60])
-    tidy(ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side")
+    label_axes(ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side")
 
 
 def _draw_above(ax: Axes, geometry: Geometry, place_mm: tuple[float, float], outline_mm: FloatArray | None) -> None:
@@ -228,4 +234,4 @@ def _draw_above(ax: Axes, geometry: Geometry, place_mm: tuple[float, float], out
     ax.plot(at_x, at_y, marker="s", markersize=7, color="#9a9a9a", markeredgecolor=VERMILLION, markeredgewidth=1.4)
     ax.annotate("base", (x, y), xytext=(12, 0), textcoords="offset points", va="center", fontsize=SMALL_PT)
     ax.set(xlim=(-20, width + 20), ylim=(-20, max(height, y) + 50), aspect="equal")
-    tidy(ax, x="x (mm)", y="y (mm)", title="from above, with the field")
+    label_axes(ax, x="x (mm)", y="y (mm)", title="from above, with the field")

@@ -11,8 +11,8 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, SMALL_PT, axes_or_new, tidy
-from probewise.report.plots.scene import bar_beside, out_of_reach
+from probewise.report.plots.canvas import BLACK, SMALL_PT, axes_or_new, label_axes
+from probewise.report.plots.scene import bar_beside, paint_out_of_reach
 from probewise.report.words import number
 
 _LINES_DEG = 15.0  # step between contours of equal orientation
@@ -56,7 +56,7 @@ def reach_map(
         for label in ax.clabel(lines, fmt=_angle, fontsize=SMALL_PT):
             label.set_path_effects([withStroke(linewidth=2.0, foreground=BLACK)])
     left, right, low, high = image.get_extent()
-    out_of_reach(ax)
+    paint_out_of_reach(ax)
     bar_beside(ax, image, "orientation of the sensor (degrees)")
     bar = ax.child_axes[-1].yaxis
     bar.set_major_locator(MultipleLocator(_LINES_DEG) if levels.size else MaxNLocator())
@@ -69,7 +69,7 @@ def reach_map(
     ax.set_aspect("equal")
     share = 100 * float(np.isfinite(degrees).mean())
     title = f"{share:.0f} % of the field (framed) within reach; grey is out of reach"
-    return tidy(ax, x="x (mm)", y="y (mm)", title=title)
+    return label_axes(ax, x="x (mm)", y="y (mm)", title=title)
 
 
 def _unwrapped_degrees(degrees: FloatArray) -> FloatArray:

@@ -18,8 +18,8 @@ from probewise.report.plots.canvas import (
     SMALL_PT,
     AxesGrid,
     axes_or_grid,
-    key_below,
-    tidy,
+    label_axes,
+    legend_below,
 )
 
 COLOUR = {"fine": BLUE, "aliased": ORANGE, "invisible": GREY}
@@ -71,14 +71,14 @@ def audit_matrix(
     for kind, colour in COLOUR.items():
         if kind in detectability:
             bars.barh([np.nan], [0], color=colour, label=kind)
-    tidy(bars, x="detectable share (no unit)", y="")
+    label_axes(bars, x="detectable share (no unit)", y="")
     numbered = len(order) > _MOST_NAMES
     if numbered:
         bars.set_yticks(at, [f"{name}  {k + 1}" for k, name in enumerate(labels)])
         labels = [str(k + 1) if k % 5 == 4 else "" for k in range(len(labels))]
     _matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
     if own:
-        key_below(axes)
+        legend_below(axes)
     else:
         bars.legend(frameon=False, fontsize=SMALL_PT)
     return axes
@@ -96,4 +96,4 @@ def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) 
     ax.tick_params(left=False)
     bar = ax.figure.colorbar(image, ax=ax, label="cosine (no unit); circles from the line on", shrink=0.7)
     bar.ax.axhline(alias, color="black", linewidth=1.2)
-    tidy(ax, x="effect it may be mistaken for", y="", title="row: the effect present; grey: not compared")
+    label_axes(ax, x="effect it may be mistaken for", y="", title="row: the effect present; grey: not compared")

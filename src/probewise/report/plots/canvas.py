@@ -25,11 +25,11 @@ from numpy.typing import NDArray
 from probewise._kinds import require_kind
 from probewise.errors import ShapeError
 from probewise.report.palette import BLACK, BLUE, CYCLE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION, YELLOW
-from probewise.report.words import readable
+from probewise.report.words import typeset
 
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
 __all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "axes_or_new", "grid_of_axes"]
-__all__ += ["key_below", "legend_above", "new_figure", "plain_numbers", "png", "stack_of_axes", "svg", "tidy"]
+__all__ += ["label_axes", "legend_above", "legend_below", "new_figure", "plain_numbers", "png", "stack_of_axes", "svg"]
 
 _LETTERS_PER_IN = 16.2  # letters per inch of a legend, about
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
@@ -182,10 +182,10 @@ def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:
             axis.set_major_formatter(in_full)
         else:
             digits = 3 - math.floor(math.log10(max(high - low, 1e-300)))
-            axis.set_major_formatter(FuncFormatter(lambda v, _, digits=digits: readable(f"{round(v, digits) + 0.0:g}")))
+            axis.set_major_formatter(FuncFormatter(lambda v, _, digits=digits: typeset(f"{round(v, digits) + 0.0:g}")))
 
 
-def key_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
+def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none", ink: str = BLACK) -> None:
     """Draw one legend for all axes below them, where it covers nothing.
 
     Parameters
@@ -214,7 +214,7 @@ def key_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "none"
         )
 
 
-def tidy(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
+def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
     """Label axes, and drop the upper and right spines."""
     ax.set_xlabel(x)
     ax.set_ylabel(y)

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import IntArray
 from probewise.challenge import Bin
-from probewise.report.plots.canvas import BLACK, BLUE, GREY, SMALL_PT, axes_or_new, legend_above, tidy
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, SMALL_PT, axes_or_new, label_axes, legend_above
 
 
 def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
@@ -35,7 +35,7 @@ def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
         )
     ax.set(xlim=(0, 1.04), ylim=(-0.02, 1.04), aspect="equal")
     legend_above(ax)
-    return tidy(ax, x="probability stated", y="share that was right")
+    return label_axes(ax, x="probability stated", y="share that was right")
 
 
 def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArray, *, ax: Axes | None = None) -> Axes:
@@ -59,4 +59,4 @@ def confusion_matrix(truths: Sequence[str], said: Sequence[str], counts: IntArra
             ax.text(column, row, str(n), ha="center", va="center", fontsize=SMALL_PT, color=colour)
     ax.set_xticks(np.arange(len(said)), said, rotation=60, ha="right", rotation_mode="anchor", fontsize=SMALL_PT)
     ax.set_yticks(np.arange(len(truths)), truths, fontsize=SMALL_PT)
-    return tidy(ax, x="most probable", y="concealed")
+    return label_axes(ax, x="most probable", y="concealed")

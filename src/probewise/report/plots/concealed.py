@@ -14,8 +14,8 @@ from probewise.report.plots.canvas import (
     VERMILLION,
     AxesGrid,
     axes_or_grid,
-    key_below,
-    tidy,
+    label_axes,
+    legend_below,
 )
 from probewise.study import ConcealedRow
 from probewise.study.table import Estimate
@@ -70,8 +70,8 @@ def doubt_beside_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None = 
             ax.axvline(0.95, color=GREY, linewidth=0.9, linestyle="--")
         ax.grid(axis="x", color=GREY, alpha=0.25)
         ax.set_yticks(np.arange(len(names)), names)
-        tidy(ax, x=x, y="", title=title)
+        label_axes(ax, x=x, y="", title=title)
     axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
     if own:
-        key_below(axes)
+        legend_below(axes)
     return axes

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from probewise.report.plots.canvas import axes_or_new, legend_above, tidy
+from probewise.report.plots.canvas import axes_or_new, label_axes, legend_above
 
 _MOST = 5  # effects with a colour of their own; the others share one
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
@@ -47,4 +47,4 @@ def belief_in_the_sensor(left_out: Sequence[Mapping[str, float]], *, ax: Axes | 
     ax.set(ylim=(0, 1), xlim=(0.4, len(left_out) + 0.6))
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(ax)
-    return tidy(ax, x="reading", y="probability")
+    return label_axes(ax, x="reading", y="probability")

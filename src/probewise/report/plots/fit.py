@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, BLUE, legend_above, stack_of_axes, tidy
+from probewise.report.plots.canvas import BLACK, BLUE, label_axes, legend_above, stack_of_axes
 
 
 def predicted_and_recorded(
@@ -38,6 +38,6 @@ def predicted_and_recorded(
     )
     ends = [min(predicted[there].min(), readings[there].min()), max(predicted[there].max(), readings[there].max())]
     ax.plot(ends, ends, color=BLACK, lw=0.9, label="as predicted")
-    tidy(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
+    label_axes(ax, x=f"predicted {label} ({unit})", y=f"recorded {label} ({unit})")
     legend_above(ax)
     return ax

@@ -29,10 +29,10 @@ from probewise.report.plots.canvas import (
     AxesGrid,
     axes_or_grid,
     axes_or_new,
+    label_axes,
     new_figure,
-    tidy,
 )
-from probewise.report.words import unit_of, with_error, within, without_unit
+from probewise.report.words import unit_of, value_and_interval, with_error, without_unit
 
 Posterior: TypeAlias = NestedResult | Weighted
 
@@ -85,7 +85,7 @@ def trace_plot(
     top.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
     top.plot(depth, mass, color=BLUE, linewidth=1.2)
     top.set_ylim(bottom=0)
-    tidy(top, x="", y="posterior\nper nat", title=_evidence(result))
+    label_axes(top, x="", y="posterior\nper nat", title=_evidence(result))
     key.axis("off")
     scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
     place = key.inset_axes((0.05, 0.42, 0.9, 0.16))
@@ -107,14 +107,14 @@ def trace_plot(
             rasterized=True,
         )
         last = row == n
-        tidy(trace, x=_DEPTH if last else "", y=_label(result.names[i]))
-        span = _span(result, i)
-        centres, density = _marginal(values, result.weight, span, result.n_eff)
+        label_axes(trace, x=_DEPTH if last else "", y=_label(result.names[i]))
+        span = _axis_limits(result, i)
+        centres, density = _smoothed_density(values, result.weight, span, result.n_eff)
         side.fill_betweenx(centres, density, color=BLUE, alpha=0.25, lw=0)
         side.plot(density, centres, color=BLUE, linewidth=1.2)
         side.set_xlim(left=0)
         side.set_ylim(span)
-        tidy(side, x="posterior" if last else "", y="")
+        label_axes(side, x="posterior" if last else "", y="")
         side.set_xticks([])
         side.yaxis.tick_right()
         side.tick_params(labelsize=SMALL_PT)
@@ -154,9 +154,9 @@ def corner_plot(
     columns = _columns(result, parameters)
     n = len(columns)
     side = (min(1.9, (PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
-    cells = _cells(n, side) if axes is None else axes_or_grid(axes, n, n, size_in=(PAGE_IN, PAGE_IN))
+    cells = _corner_axes(n, side) if axes is None else axes_or_grid(axes, n, n, size_in=(PAGE_IN, PAGE_IN))
     drawn = np.full((n, n), None, dtype=np.object_)
-    spans = [_span(result, i) for i in columns]
+    spans = [_axis_limits(result, i) for i in columns]
     for (row, column), ax in np.ndenumerate(cells):
         if ax is None:
             continue
@@ -201,7 +201,7 @@ def corner_plot(
     return drawn
 
 
-def _cells(n: int, side_in: float) -> AxesGrid:
+def _corner_axes(n: int, side_in: float) -> AxesGrid:
     """Lay out square axes on and below the diagonal and, for the legend, at the upper right: (n, n), None elsewhere."""
     width, height = _LEFT_IN + n * side_in + _RIGHT_IN, _BOTTOM_IN + n * side_in + _TOP_IN
     sheet = new_figure((width, height))
@@ -233,7 +233,7 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     n = result.insertion_rank.size
     if n == 0:
         ax.text(0.5, 0.5, "no point was inserted", transform=ax.transAxes, ha="center", va="center")
-        return tidy(ax, x="rank among the live points (0: worst, 1: best)", y="new points")
+        return label_axes(ax, x="rank among the live points (0: worst, 1: best)", y="new points")
     edges = np.linspace(0.0, 1.0, int(np.clip(n / 60, 4, 25)) + 1)
     counts = _spread_ranks(result.insertion_rank, result.insertion_n_ranked, edges)
     n_bars = len(counts)
@@ -255,7 +255,7 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
     ax.set_ylim(0, 1.3 * max(high, counts.max()))
     ax.legend(frameon=False, fontsize=SMALL_PT, loc="upper right", ncols=2)  # leaves room for the text above every bar
     title = f"{n} new points, p = {result.insertion_p_value:.2g}"
-    return tidy(ax, x="rank among the live points (0: worst, 1: best)", y="new points", title=title)
+    return label_axes(ax, x="rank among the live points (0: worst, 1: best)", y="new points", title=title)
 
 
 def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
@@ -281,14 +281,14 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     floor = max(float(result.log_likelihood.min()), peak - below)
     likelihood.plot(depth, result.log_likelihood, color=BLUE, linewidth=1.4)
     likelihood.set_ylim(floor - 0.03 * (peak - floor), peak + 0.05 * (peak - floor))
-    tidy(likelihood, x="", y="ln likelihood", title=_evidence(result))
+    label_axes(likelihood, x="", y="ln likelihood", title=_evidence(result))
     posterior.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
     posterior.plot(depth, mass, color=BLUE, linewidth=1.4)
     posterior.set_ylim(bottom=0)
-    tidy(posterior, x="", y="posterior per nat")
+    label_axes(posterior, x="", y="posterior per nat")
     alive.plot(depth, result.n_at_death, color=BLUE, linewidth=0.8)
     alive.set_ylim(0, 1.1 * float(result.n_at_death.max()))
-    tidy(alive, x="", y="live points")
+    label_axes(alive, x="", y="live points")
     error = result.log_z_error
     evidence.axhspan(result.log_z - error, result.log_z + error, color=GREY, alpha=0.35, lw=0, label="ln Z ± its error")
     so_far = np.logaddexp.accumulate(result.log_weight) + result.log_z
@@ -296,7 +296,7 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     evidence.set_ylim(result.log_z - max(6.0, 4 * error), result.log_z + max(1.0, 2 * error))
     evidence.legend(frameon=False, fontsize=SMALL_PT, loc="lower right")
     evidence.set_xlim(0, depth[-1])
-    tidy(evidence, x=_DEPTH, y="ln Z")
+    label_axes(evidence, x=_DEPTH, y="ln Z")
     evidence.figure.align_ylabels(list(axes[:, 0]))
     return axes
 
@@ -339,7 +339,7 @@ def _thinned_rows(n: int) -> IntArray:
     return np.unique(np.linspace(0, n - 1, min(n, _MOST_POINTS)).astype(np.int64))
 
 
-def _span(result: Posterior, column: int) -> tuple[float, float]:
+def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
     """Return limits that hold 99 % of the posterior with a margin, within the range of the dead points."""
     values = result.theta[:, column]
     order = np.argsort(values)
@@ -353,7 +353,7 @@ def _span(result: Posterior, column: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _marginal(
+def _smoothed_density(
     values: FloatArray, weight: FloatArray, span: tuple[float, float], n_eff: float
 ) -> tuple[FloatArray, FloatArray]:
     """Smooth the density at the middles of 80 bins, reflected at the ends, where the prior may be cut off.
@@ -370,7 +370,7 @@ def _marginal(
 
 
 def _draw_one(ax: Axes, result: Posterior, column: int, span: tuple[float, float], *, titled: bool) -> None:
-    centres, density = _marginal(result.theta[:, column], result.weight, span, result.n_eff)
+    centres, density = _smoothed_density(result.theta[:, column], result.weight, span, result.n_eff)
     cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
     ax.plot(centres, density, color=BLUE, linewidth=1.2)
     for (low, high), colour in zip(cuts, _SHADES, strict=True):
@@ -381,7 +381,7 @@ def _draw_one(ax: Axes, result: Posterior, column: int, span: tuple[float, float
     if titled:
         median = float(result.quantiles([0.5])[0, column])
         low, high = (float(end) for end in cuts[0])
-        ax.set_title("\n".join(within(median, low, high)), fontsize=SMALL_PT)
+        ax.set_title("\n".join(value_and_interval(median, low, high)), fontsize=SMALL_PT)
 
 
 def _draw_pair(

@@ -11,10 +11,10 @@ from probewise.report.plots.canvas import (
     BLUE,
     GREY,
     VERMILLION,
+    label_axes,
     legend_above,
     plain_numbers,
     stack_of_axes,
-    tidy,
 )
 
 _MOST_LAGS = 12
@@ -52,7 +52,7 @@ def correlation_of_neighbours(
     if rho is not None:
         ax.plot(lags, rho**lags, "--", color=BLUE, linewidth=1.5, label=f"noise model found: {rho:.2f} per step")
     ax.set_xticks(lags)
-    tidy(ax, x="how many readings apart (within a scan or run)", y="correlation (no unit)")
+    label_axes(ax, x="how many readings apart (within a scan or run)", y="correlation (no unit)")
     plain_numbers(ax, x=False)
     legend_above(ax)
     return ax
@@ -94,7 +94,7 @@ def spread_by_level(
         by_model = np.array([np.sqrt(np.mean(model_sd[p] ** 2)) for p in parts])
         ax.plot(at, by_model, "--", color=BLUE, linewidth=1.6, label="noise model found")
     ax.set_ylim(bottom=0.0)
-    tidy(ax, x=f"predicted reading ({unit})", y=f"rms residual ({unit})")
+    label_axes(ax, x=f"predicted reading ({unit})", y=f"rms residual ({unit})")
     plain_numbers(ax)
     legend_above(ax)
     return ax
@@ -123,7 +123,7 @@ def tails(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
     ax.plot(at, normal, "--", color=BLACK, linewidth=1.4, label="normal distribution")
     ax.set_yscale("log")
     ax.set_ylim(0.5, 2 * max(float(counts.max(initial=1)), 1.0))
-    tidy(ax, x="residual (sds of the noise)", y="readings per half sd")
+    label_axes(ax, x="residual (sds of the noise)", y="readings per half sd")
     plain_numbers(ax, y=False)
     legend_above(ax)
     return ax
@@ -137,7 +137,7 @@ def lost_readings(
     ax.plot(predicted[~lost], readings[~lost], "o", color=GREY, markersize=3, label="reading")
     ax.plot(predicted[lost], readings[lost], "X", color=VERMILLION, markersize=7, label="lost reading")
     ax.axline((float(np.nanmean(predicted)),) * 2, slope=1, color=BLACK, linewidth=0.7)
-    tidy(ax, x=f"predicted reading ({unit})", y=f"reading ({unit})")
+    label_axes(ax, x=f"predicted reading ({unit})", y=f"reading ({unit})")
     plain_numbers(ax)
     legend_above(ax)
     return ax
@@ -150,7 +150,7 @@ def lattice_of_readings(readings: FloatArray, step: float, *, unit: str, ax: Axe
     counts, edges = np.histogram(np.mod(finite / step + 0.5, 1.0) - 0.5, 41, (-0.5, 0.5))
     ax.bar((edges[:-1] + edges[1:]) / 2, counts, 0.9 / 41, color=VERMILLION, label="readings")
     ax.axhline(len(finite) / 41, color=GREY, linestyle="--", label="without rounding")
-    tidy(ax, x=f"distance from a multiple of {step:.4g} {unit} (steps)", y="readings")
+    label_axes(ax, x=f"distance from a multiple of {step:.4g} {unit} (steps)", y="readings")
     plain_numbers(ax)
     legend_above(ax)
     return ax

@@ -11,7 +11,7 @@ from probewise.recordings import HalfPlane, Quadrant, Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, CYCLE, GREY, AxesGrid, axes_or_new, grid_of_axes
-from probewise.report.plots.readings import MARKERS, tracks
+from probewise.report.plots.readings import MARKERS, split_into_tracks
 from probewise.report.words import number, signed, unit_name
 
 _DARK, _BRIGHT = "#1b1b1b", "#ffffff"
@@ -35,7 +35,7 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
     """
     require_recording(recording)
     plan = recording.plan
-    lines = [(k, track) for k, track in enumerate(tracks(plan)[0]) if track.from_edge]
+    lines = [(k, track) for k, track in enumerate(split_into_tracks(plan)[0]) if track.from_edge]
     if not lines:
         raise ParameterError("recording", recording.source or "as given", "one with a scan over a half_plane")
     turns = {track.label: (k, float(plan.orientation_rad[track.rows[0]]), track) for k, track in lines}

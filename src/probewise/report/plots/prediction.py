@@ -18,11 +18,11 @@ from probewise.report.plots.canvas import (
     AxesGrid,
     axes_or_grid,
     axes_or_new,
-    key_below,
+    label_axes,
     legend_above,
-    tidy,
+    legend_below,
 )
-from probewise.report.plots.readings import Track, along_label, tracks
+from probewise.report.plots.readings import Track, along_label, split_into_tracks
 from probewise.report.residual_means import running_mean
 from probewise.report.words import unit_name
 
@@ -48,7 +48,7 @@ def predicted_against_recorded(
     Axes, three columns (two where there are two or four panels, one for one panel).
     """
     require_recording(recording)
-    found, alone = tracks(recording.plan)
+    found, alone = split_into_tracks(recording.plan)
     shown = [found[i] for i in _evenly_spaced(len(found), MAX_PANELS - bool(alone.size))]
     n_panels = max(len(shown) + bool(alone.size), 1)
     n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
@@ -59,11 +59,11 @@ def predicted_against_recorded(
     unit = recording.plan.instrumentation.unit
     for ax, track in zip(axes.flat, shown, strict=False):
         _draw_track(ax, recording, track, mean, sd)
-        tidy(ax, x="", y="", title=track.label)
+        label_axes(ax, x="", y="", title=track.label)
     if alone.size:
         ax = axes.flat[len(shown)]
         _draw_alone(ax, recording, alone, mean, sd)
-        tidy(ax, x="", y="", title="single readings")
+        label_axes(ax, x="", y="", title="single readings")
     for ax in list(axes.flat)[n_panels:]:
         ax.set_visible(False)
     for ax in axes[:, 0]:
@@ -71,7 +71,7 @@ def predicted_against_recorded(
     for k in range(max(n_panels - n_columns, 0), len(shown)):
         axes.flat[k].set_xlabel(along_label(shown).replace(", white side positive", ""))
     if own:
-        key_below(axes)
+        legend_below(axes)
     else:
         axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
     return axes
@@ -120,7 +120,7 @@ def calibration_check(recording: Recording, mean: FloatArray, sd: FloatArray, *,
     ax.plot(ok + 1, (recording.readings[ok] - mean[ok]) / sd[ok], ".", color=BLUE, markersize=3)
     for level in (-1.96, 0.0, 1.96):
         ax.axhline(level, color=GREY, linewidth=0.8, linestyle="-" if level == 0 else "--")
-    return tidy(ax, x="reading number", y="(recorded − predicted) / sd")
+    return label_axes(ax, x="reading number", y="(recorded − predicted) / sd")
 
 
 def residuals_against(
@@ -156,4 +156,4 @@ def residuals_against(
         ax.plot(center, average, color=colour, linewidth=2.0, label=name)
     ax.axhline(0, color=BLACK, linewidth=0.7)
     legend_above(ax)
-    return tidy(ax, x=label, y=f"recorded − predicted ({unit_name(unit)})")
+    return label_axes(ax, x=label, y=f"recorded − predicted ({unit_name(unit)})")

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, CYCLE, SMALL_PT, axes_or_new, legend_above, tidy
+from probewise.report.plots.canvas import BLACK, CYCLE, SMALL_PT, axes_or_new, label_axes, legend_above
 from probewise.report.words import count
 
 
@@ -30,10 +30,10 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
         number = np.arange(1, len(sd) + 1)
         ax.plot(number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {count(len(sd), 'reading')}")
     legend_above(ax)
-    return towards_target(ax, target_mm)
+    return label_progress_axes(ax, target_mm)
 
 
-def towards_target(ax: Axes, target_mm: float) -> Axes:
+def label_progress_axes(ax: Axes, target_mm: float) -> Axes:
     """Set up axes for posterior sds against the number of readings, with a line at the target precision."""
     ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
     ax.annotate(
@@ -50,7 +50,7 @@ def towards_target(ax: Axes, target_mm: float) -> Axes:
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter(NullFormatter())
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    return tidy(ax, x="number of readings", y="widest posterior sd (mm)")
+    return label_axes(ax, x="number of readings", y="widest posterior sd (mm)")
 
 
 def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None) -> Axes:
@@ -76,4 +76,4 @@ def information_gained(bits: Mapping[str, FloatArray], *, ax: Axes | None = None
         )
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     legend_above(ax)
-    return tidy(ax, x="number of readings", y="information about the shape (bits)")
+    return label_axes(ax, x="number of readings", y="information about the shape (bits)")

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.recordings import Plan, Recording
 from probewise.recordings.patterns import HalfPlane
 from probewise.recordings.plan import require_recording
-from probewise.report.plots.canvas import CYCLE, axes_or_new, legend_above, tidy
+from probewise.report.plots.canvas import CYCLE, axes_or_new, label_axes, legend_above
 from probewise.report.words import unit_name
 
 MARKERS = ("o", "s", "D", "^", "v", "P", "X")
@@ -33,7 +33,7 @@ class Track:
     from_edge: bool
 
 
-def tracks(plan: Plan) -> tuple[list[Track], IntArray]:
+def split_into_tracks(plan: Plan) -> tuple[list[Track], IntArray]:
     """Split a plan into tracks and single rows.
 
     Returns
@@ -99,7 +99,7 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
     """
     require_recording(recording)
     ax = axes_or_new(ax)
-    found, _ = tracks(recording.plan)
+    found, _ = split_into_tracks(recording.plan)
     for k, track in enumerate(found):
         ok = recording.usable[track.rows]
         ax.plot(
@@ -115,4 +115,4 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
         )
     if 0 < len(found) <= MAX_NAMED:
         legend_above(ax, title="orientation of the sensor")
-    return tidy(ax, x=along_label(found), y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
+    return label_axes(ax, x=along_label(found), y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")

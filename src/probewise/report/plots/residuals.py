@@ -21,10 +21,10 @@ from probewise.report.plots.canvas import (
     SMALL_PT,
     VERMILLION,
     AxesGrid,
+    label_axes,
     legend_above,
     plain_numbers,
     stack_of_axes,
-    tidy,
 )
 from probewise.report.residual_means import Means, running_mean
 from probewise.report.words import number, signed, unit_name
@@ -88,7 +88,7 @@ def mean_residuals_along(
         middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
         ax.axvspan(middle - half, middle + half, color=SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
     averaged = each is None and int(means.size.max(initial=1)) > 1
-    tidy(ax, x=label, y=f"{'mean residual' if averaged else 'residual'} ({unit})")
+    label_axes(ax, x=label, y=f"{'mean residual' if averaged else 'residual'} ({unit})")
     plain_numbers(ax, x=not names)
     legend_above(ax)
     return ax
@@ -132,8 +132,8 @@ def one_scan(
         if joined:
             below.plot(*running_mean(along, readings - predicted), color=colour, linewidth=1.6, linestyle=line)
     below.sharex(above)
-    tidy(above, x="", y=f"reading ({unit})")
-    tidy(below, x=label, y=f"residual ({unit})")
+    label_axes(above, x="", y=f"reading ({unit})")
+    label_axes(below, x=label, y=f"residual ({unit})")
     for ax in axes:
         plain_numbers(ax)
         legend_above(ax)
@@ -146,7 +146,7 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     usable = np.flatnonzero(recording.usable)
     ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)
-    tidy(ax, x="reading number", y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
+    label_axes(ax, x="reading number", y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
     plain_numbers(ax)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return ax
@@ -182,7 +182,7 @@ def residual_clouds(
                 linestyle=line,
                 label=f"running mean, {name}",
             )
-        tidy(ax, x=label, y=f"residual ({unit})")
+        label_axes(ax, x=label, y=f"residual ({unit})")
         plain_numbers(ax)
         legend_above(ax)
     return axes
@@ -217,7 +217,7 @@ def gain_by_scan(
     ax.axvline(0, color=BLACK, linewidth=0.7)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
     ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
-    tidy(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}")
+    label_axes(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}")
     plain_numbers(ax, y=False)
     legend_above(ax)
     return ax

@@ -11,8 +11,8 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
-from probewise.report.plots.canvas import BLACK, BLUE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, tidy
-from probewise.report.plots.readings import Track, tracks
+from probewise.report.plots.canvas import BLACK, BLUE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, label_axes
+from probewise.report.plots.readings import Track, split_into_tracks
 from probewise.report.words import unit_name
 
 _MOST_GROUPS, _LEAST_ROWS = 18, 5  # number of groups of neighbours in a running mean
@@ -43,7 +43,7 @@ def residuals_by_scan(
     Axes, (n_rows, columns); those without a scan are hidden.
     """
     require_recording(recording)
-    found, _ = tracks(recording.plan)
+    found, _ = split_into_tracks(recording.plan)
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in found]
     shown = [found[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
     n_rows = max(-(-len(shown) // columns), 1)
@@ -54,7 +54,7 @@ def residuals_by_scan(
             ax.plot(along, residual, ".", color=colour, markersize=2.2, alpha=0.4)
             ax.plot(*_means(along, residual), color=colour, linewidth=1.8)
         ax.axhline(0.0, color=BLACK, linewidth=0.7)
-        tidy(ax, x="", y="", title=_title(recording, track))
+        label_axes(ax, x="", y="", title=_title(recording, track))
     for ax in list(axes.flat)[len(shown) :]:
         ax.set_visible(False)
     sheet = axes.flat[0].figure
@@ -93,7 +93,7 @@ def before_and_after(
     require_recording(recording)
     axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
     above, below = axes[:, 0]
-    found, _ = tracks(recording.plan.take(rows))
+    found, _ = split_into_tracks(recording.plan.take(rows))
     if not found:
         raise ParameterError("rows", rows.tolist(), "readings at three places or more along one line")
     for k, track in enumerate(found):
@@ -114,9 +114,9 @@ def before_and_after(
     below.set_xlim(low, high)
     unit = unit_name(recording.plan.instrumentation.unit)
     above.legend(frameon=False, fontsize=SMALL_PT)
-    tidy(above, x="", y=f"reading ({unit})", title=name)
+    label_axes(above, x="", y=f"reading ({unit})", title=name)
     from_edge = all(track.from_edge for track in found)
-    tidy(below, x=_ALONG if from_edge else _ALONG_OTHERS, y=f"recorded − predicted\n({unit})")
+    label_axes(below, x=_ALONG if from_edge else _ALONG_OTHERS, y=f"recorded − predicted\n({unit})")
     return axes
 
 

@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray
-from probewise.report.plots.canvas import BLACK, COPPER, OUT_OF_REACH, SMALL_PT, AxesGrid, axes_or_new, key_below
+from probewise.report.plots.canvas import BLACK, COPPER, OUT_OF_REACH, SMALL_PT, AxesGrid, axes_or_new, legend_below
 
 LEGO_UNIT_MM = 8.0  # spacing of the holes of a LEGO Technic part
 NEXT_GREEN = "#00e08a"  # the palette's green, lighter, so that the next place shows on copper
@@ -74,7 +74,7 @@ def playing_field(
     ax = axes_or_new(ax, size_in=(8.2, 5.2))
     dx, dy = (x_mm[1] - x_mm[0]) / 2, (y_mm[1] - y_mm[0]) / 2
     if np.isnan(utility).any():
-        out_of_reach(ax)
+        paint_out_of_reach(ax)
     top = utility_max if utility_max is not None else max(float(np.nanmax(utility)), 1e-9)
     image = ax.imshow(
         np.ma.masked_invalid(utility),
@@ -125,10 +125,10 @@ def playing_field(
 
 def explain_field(axes: Axes | AxesGrid) -> None:
     """Draw one legend for all playing fields of a figure, below them."""
-    key_below(axes, n_columns=3, ground=GROUND, ink="white")
+    legend_below(axes, n_columns=3, ground=GROUND, ink="white")
 
 
-def out_of_reach(ax: Axes) -> None:
+def paint_out_of_reach(ax: Axes) -> None:
     """Paint the background grey: whatever the map does not cover is out of the arm's reach."""
     ax.set_facecolor(OUT_OF_REACH)
     ax.add_patch(Rectangle((0.0, 0.0), 0.0, 0.0, facecolor=OUT_OF_REACH, label="out of the arm's reach"))

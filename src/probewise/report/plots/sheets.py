@@ -74,7 +74,7 @@ def _groups_of_five(items: Sequence[Any]) -> list[Sequence[Any]]:
     return [items[k : k + 5] for k in range(0, len(items), 5)]
 
 
-def _paper(page_mm: tuple[float, float]) -> Axes:
+def _open_page(page_mm: tuple[float, float]) -> Axes:
     """Open a page with coordinates in mm from its lower left corner."""
     figure = Figure(figsize=(page_mm[0] / _MM_PER_IN, page_mm[1] / _MM_PER_IN), facecolor="none")
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
@@ -85,7 +85,7 @@ def _paper(page_mm: tuple[float, float]) -> Axes:
 
 def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
     page = PAPERS_MM[paper]
-    ax = _paper(page)
+    ax = _open_page(page)
     top = page[1] - 18.0
     ax.text(LEFT_MM, top, title, fontsize=_LARGE, va="baseline")
     told = (
@@ -106,7 +106,7 @@ def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Fi
         last = first + len(tiles) - 1
         said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; page {first}"]
         if len(tiles) > 1:
-            said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; pages {first} to {last}", _grid(tiles)]
+            said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; pages {first} to {last}", _grid_in_words(tiles)]
         said += [*sheet.lines, f"origin: {sheet.frame}"]
         if sheet.orientations_rad:
             turns = ", ".join(f"{np.degrees(turn):.4g}" for turn in sheet.orientations_rad)
@@ -120,7 +120,7 @@ def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Fi
     return ax.figure  # type: ignore[return-value]
 
 
-def _grid(tiles: Sequence[Tile]) -> str:
+def _grid_in_words(tiles: Sequence[Tile]) -> str:
     return f"{tiles[-1].column + 1} side by side, {tiles[-1].row + 1} one above the other, from the lower left"
 
 
@@ -149,7 +149,7 @@ def _thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float
 
 
 def _page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: str) -> Figure:
-    ax = _paper(tile.page_mm)
+    ax = _open_page(tile.page_mm)
     low, high = np.array(tile.low_mm), np.array(tile.high_mm)
     size, beyond = high - low, np.array(tile.beyond_mm)
     clip = ax.add_patch(Rectangle((LEFT_MM, BOTTOM_MM), *(size + beyond), fc="none", ec="none"))
@@ -214,7 +214,7 @@ def _ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
 
 def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any, *, named: bool = True) -> None:
     """Paint the part of the sheet between two corners; `place` maps points, (n, 2), from sheet to page."""
-    for corners, albedo in _areas(sheet.pattern, low_mm, high_mm):
+    for corners, albedo in _painted_outlines(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))
         patch = ax.add_patch(Outline(place(corners), closed=True, fc=ink, ec="none", lw=0, zorder=1))
         patch.set_clip_path(clip)
@@ -244,7 +244,7 @@ def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: 
             told.set_clip_path(clip)
 
 
-def _areas(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:
+def _painted_outlines(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:
     """Return outlines (n, 2) with the albedo inside, in the order of painting."""
     (x0, y0), (x1, y1) = low_mm, high_mm
     whole = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])

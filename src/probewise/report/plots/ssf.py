@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
-from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_grid, axes_or_new, tidy
+from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_grid, axes_or_new, label_axes
 from probewise.report.plots.scene import bar_beside
 from probewise.report.words import with_error
 from probewise.sensor import SSFField
@@ -49,15 +49,15 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
     bar_beside(ax, image, "sensitivity (share of its peak)")
     ax.contour(x, y, values, levels=[0.1 * peak, 0.5 * peak], colors="white", linewidths=[0.8, 1.4])
     ax.plot([0], [0], marker="+", color="white", markersize=10, markeredgewidth=1.5)
-    reach = _reach(values, x, y, field.pixel_mm)
+    reach = _visible_half_width(values, x, y, field.pixel_mm)
     ax.set_xlim(-reach, reach)
     ax.set_ylim(-reach, reach)
     ax.set_aspect("equal")
     ax.spines[["top", "right"]].set_visible(True)
-    return tidy(ax, x="x' (mm)", y="y' (mm)", title=title)
+    return label_axes(ax, x="x' (mm)", y="y' (mm)", title=title)
 
 
-def _reach(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
+def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
     """Return the half width of a square about the origin that holds the visible SSF, rounded up to half a decade."""
     matters = values > 0.01 * values.max()
     far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), pixel_mm)
@@ -110,4 +110,4 @@ def log_evidences(
     ax.errorbar(np.arange(len(orders)), below, yerr=log_z_error, linestyle="none", color=BLACK, capsize=4)
     ax.axhline(0, color=BLACK, linewidth=0.8)
     ax.set_xticks(np.arange(len(orders)), [str(n) for n in orders])
-    return tidy(ax, x="number of Gaussians", y="ln Z below the best")
+    return label_axes(ax, x="number of Gaussians", y="ln Z below the best")

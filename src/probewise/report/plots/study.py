@@ -16,10 +16,10 @@ from probewise.report.plots.canvas import (
     VERMILLION,
     AxesGrid,
     axes_or_grid,
-    key_below,
-    tidy,
+    label_axes,
+    legend_below,
 )
-from probewise.report.plots.progress import towards_target
+from probewise.report.plots.progress import label_progress_axes
 from probewise.report.words import count
 from probewise.study import Summary
 
@@ -56,11 +56,13 @@ def widths_of_runs(
         for other, more in tables.items():
             if other != name:
                 label = "median of another panel"
-                ax.plot(_numbers(more), np.median(more, axis=0), color=GREY, linewidth=0.9, label=label)
+                ax.plot(_reading_numbers(more), np.median(more, axis=0), color=GREY, linewidth=0.9, label=label)
         low, high = np.quantile(table, _BAND, axis=0)
-        ax.fill_between(_numbers(table), low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs")
-        ax.plot(_numbers(table), np.median(table, axis=0), color=BLUE, linewidth=1.8, label="median")
-        towards_target(ax, target_mm)
+        ax.fill_between(
+            _reading_numbers(table), low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs"
+        )
+        ax.plot(_reading_numbers(table), np.median(table, axis=0), color=BLUE, linewidth=1.8, label="median")
+        label_progress_axes(ax, target_mm)
         ax.set_title(f"{name} ({count(len(table), 'run')})", fontsize="medium", loc="left")
         ax.label_outer()
     for ax in list(axes.flat)[len(runs) :]:
@@ -68,7 +70,7 @@ def widths_of_runs(
         axes.flat[len(runs) - n_columns].xaxis.set_tick_params(labelbottom=True)
         axes.flat[len(runs) - n_columns].set_xlabel("number of readings")
     if own:
-        key_below(axes)
+        legend_below(axes)
     else:
         axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
     return axes
@@ -80,7 +82,7 @@ def _extended(widths: Sequence[FloatArray]) -> FloatArray:
     return np.array([np.pad(w, (0, longest - len(w)), mode="edge") for w in widths])
 
 
-def _numbers(table: FloatArray) -> FloatArray:
+def _reading_numbers(table: FloatArray) -> FloatArray:
     return np.arange(1.0, table.shape[1] + 1)
 
 
@@ -118,11 +120,11 @@ def readings_needed(rows: Mapping[str, Summary], *, axes: AxesGrid | None = None
         ax.set_xlim(left=0)
         ax.grid(axis="x", color=GREY, alpha=0.25)
         ax.set_yticks(y, names)
-        tidy(ax, x="number of readings", y="", title=title)
+        label_axes(ax, x="number of readings", y="", title=title)
     # Half a row of margin at either end, also for a single row.
     axes[0, 0].set_ylim(len(names) - 0.5, -0.5)
     if own:
-        key_below(axes)
+        legend_below(axes)
     else:
         axes.flat[0].legend(frameon=False, fontsize=SMALL_PT)
     return axes

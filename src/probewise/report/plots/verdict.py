@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from probewise.report.plots.canvas import BLUE, CYCLE, GREY, SMALL_PT, axes_or_new, legend_above, tidy
+from probewise.report.plots.canvas import BLUE, CYCLE, GREY, SMALL_PT, axes_or_new, label_axes, legend_above
 
 _SHOWN = 6  # hypotheses with a colour of their own
 _VISIBLE = 0.02  # probability from which a hypothesis has one
@@ -46,7 +46,7 @@ def hypothesis_probabilities(
     ax.set_xticks(np.linspace(0.0, 1.0, 6))
     # Room for at least three bars, so that a single bar is not too thick.
     ax.set_ylim(min(at[-1], -2.0) - 0.5, 0.5)
-    return tidy(ax, x="probability", y="")
+    return label_axes(ax, x="probability", y="")
 
 
 def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
@@ -79,4 +79,4 @@ def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | N
     ax.set_yticks(at, list(beliefs))
     ax.set_xlim(0.0, 1.0)
     legend_above(ax)
-    return tidy(ax, x="probability", y="")
+    return label_axes(ax, x="probability", y="")

@@ -82,7 +82,7 @@ def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
 
 
 def radians_meant(name: str, values: float | NDArray[np.float64]) -> None:
-    """Warn of angles beyond a full turn either way, which somebody may have given in degrees."""
+    """Warn of angles (radians) beyond a full turn either way, which somebody may have given in degrees."""
     widest = abs(values) if isinstance(values, float) else float(np.abs(values).max(initial=0.0))
     if _FULL_TURN_RAD < widest < math.inf:
         said = f"{name} reaches {widest:.6g} rad, beyond a full turn (6.283 rad): convert degrees with numpy.radians"

@@ -81,8 +81,8 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         yield progress
 
 
-def of_nested(progress: Progress) -> Callable[[int | str, RoundSummary | Rung], None]:
-    """Adapt a progress function to nested sampling and climbs; each is named or has a number of Gaussians."""
+def nested_progress(progress: Progress) -> Callable[[int | str, RoundSummary | Rung], None]:
+    """Adapt a progress function to reports of nested sampling and climbs, each by its name or number of Gaussians."""
 
     def tell(what: int | str, state: RoundSummary | Rung) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
@@ -95,7 +95,7 @@ def of_nested(progress: Progress) -> Callable[[int | str, RoundSummary | Rung], 
     return tell
 
 
-class _Said(NamedTuple):
+class _Report(NamedTuple):
     """The last report; its fields are the arguments of `Progress`."""
 
     stage: str
@@ -110,7 +110,7 @@ class _Bars:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._shows_at = time.monotonic() + _PATIENCE_S
-        self._now: _Said | None = None
+        self._now: _Report | None = None
         self._began = 0.0
         self._bar: tqdm[Never] | None = None
 
@@ -119,7 +119,7 @@ class _Bars:
             if self._now is None or (stage, total) != (self._now.stage, self._now.total):
                 self._end(ended=True)
                 self._began = time.time()
-            self._now = _Said(stage, done, total, note)
+            self._now = _Report(stage, done, total, note)
             self._draw()
 
     def beat(self) -> None:
@@ -154,15 +154,15 @@ class _Bars:
 
 
 class _TextProgress:
-    """A line of text after two seconds, after five more, and then at growing intervals."""
+    """Lines of text on standard error: after two seconds, after five more, then at growing intervals."""
 
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()
         self._said = False
-        self._now = _Said("getting ready", 0, 0, "")
+        self._now = _Report("getting ready", 0, 0, "")
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        self._now = _Said(stage, done, total, note)
+        self._now = _Report(stage, done, total, note)
         self.beat()
 
     def beat(self) -> None:

@@ -12,7 +12,7 @@ T = TypeVar("T")
 
 
 def renamed_arguments(**new_by_old: str) -> Callable[[Callable[P, T]], Callable[P, T]]:
-    """Decorate a function that also accepts arguments by their old names."""
+    """Return a decorator: the function also accepts keyword arguments by their old names, with a warning."""
 
     def decorate(function: Callable[P, T]) -> Callable[P, T]:
         @functools.wraps(function)

@@ -124,7 +124,7 @@ def _parsed_line(path: str | os.PathLike[str], number: int, line: bytes) -> dict
 
 
 class _ResultLog:
-    """Append lines, each synced to disk before the next; an incomplete last line is cut off first."""
+    """A campaign's file, open for results: lines are synced to disk one by one; an incomplete last line is cut off."""
 
     def __init__(self, path: Path, settings: Mapping[str, Any], *, fresh: bool) -> None:
         if fresh:

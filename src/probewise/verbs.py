@@ -116,7 +116,7 @@ def calibrate(
     1
     """
     from probewise import calibration
-    from probewise._progress import of_nested, progress_or_bar
+    from probewise._progress import nested_progress, progress_or_bar
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
 
@@ -136,7 +136,7 @@ def calibrate(
             stop=NESTED_STOP[nested_stop or "change"] if paper else None,
             refined=not paper,
             rng=rng,
-            progress=of_nested(told),
+            progress=nested_progress(told),
         )
 
 
@@ -397,7 +397,7 @@ def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progres
     sensor
         The calibrated sensor; by default a typical one.
     progress
-        Whether to show a progress bar, in a terminal or a notebook; or a function of your own that is told.
+        Whether to show a progress bar in a terminal or notebook; or your own function (`probewise.progress`).
 
     Returns
     -------

@@ -12,7 +12,7 @@ from probewise.errors import ParameterError
 from probewise.nested import NestedResult, merge, run
 from probewise.priors import Empty, Product, Uniform
 from probewise.report import plots
-from probewise.report.plots.nested import _label, _marginal, _spread_ranks
+from probewise.report.plots.nested import _label, _smoothed_density, _spread_ranks
 
 
 class Bell:
@@ -147,7 +147,7 @@ def test_names_become_labels_with_units():
 
 def test_a_flat_posterior_stays_flat_up_to_the_priors_edge():
     values = (np.arange(8000) + 0.5) / 8000
-    _, density = _marginal(values, np.full(8000, 1 / 8000), (0.0, 1.0), 8000.0)
+    _, density = _smoothed_density(values, np.full(8000, 1 / 8000), (0.0, 1.0), 8000.0)
     assert density == pytest.approx(np.full(80, 1 / 80))
 
 

@@ -1,4 +1,4 @@
-"""Cosines of a concealed effect with the effects of the vocabulary, and the residual of a pair when one is named."""
+"""Cosines of a concealed effect with the effects of the vocabulary, and a pair's residuals after one is fitted."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def cosines(
     *,
     vocabulary: Mapping[str, type[NamedEffect[Any]]] = VOCABULARY,
 ) -> dict[str, float]:
-    """Compare what a refit of the null leaves of an effect with every named effect on the mean, at its best fit.
+    """Return the cosine of an effect's residuals, after a refit of the null, with every named effect on the mean.
 
     Parameters
     ----------
@@ -42,9 +42,9 @@ def cosines(
 
     Returns
     -------
-    Cosine rho by name: the square root of the share of the residual sum of squares that the effect of that name
-    explains together with the null. The effects that explain most are refitted in full, the others linearised. If a
-    halo or blur is similar, "ssf_order" is included: one more Gaussian and no missing physics.
+    Cosine rho by name: the square root of the share of the residual sum of squares that the named effect, at its best
+    fit and together with the null, explains. The effects that explain most are refitted in full, the others
+    linearised. If a halo or blur explains much, "ssf_order" is included: one more Gaussian, no missing physics.
     """
     found = refit.refit(clean, changed)
     usable = np.flatnonzero(clean.usable)
@@ -70,7 +70,7 @@ def cosines(
 def residual_with_one_named(
     refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]
 ) -> dict[str, float]:
-    """Return the residual norm of two effects when one of them is in the model, in reading units.
+    """Return the norm of two effects' residuals after a fit of the null and one of them, in reading units.
 
     Parameters
     ----------
@@ -130,6 +130,6 @@ def _with_effect(
 
 
 def _cosine(found: Fit, by: Fit) -> float:
-    """Return the square root of the share of a fit's residual sum of squares that another fit explains."""
+    """Return the square root of the share of one fit's residual sum of squares that another fit explains."""
     left = float(by.residuals @ by.residuals) / float(found.residuals @ found.residuals)
     return float(np.sqrt(np.clip(1 - left, 0.0, 1.0)))

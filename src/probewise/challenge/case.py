@@ -30,22 +30,22 @@ _LEAST_COSINE = 0.5
 
 @dataclass(frozen=True)
 class Task:
-    """Case `number` of the challenge of a sealed seed."""
+    """One case of a challenge: the challenge's sealed seed and the case's number, from 0."""
 
     seed: int
     number: int
 
     @property
     def key(self) -> str:
-        """Its name in the campaign's file."""
+        """The case's key in the campaign's file."""
         return f"{self.seed} / {self.number}"
 
 
 @dataclass(frozen=True)
 class Investigated:
-    """Run a case in rounds: recording, diagnosis, the readings that it advises, until settled.
+    """A function that runs a case in up to `rounds` rounds: record, diagnose, then take the advised readings.
 
-    A dataclass instead of a closure, so that it can be pickled for another process.
+    It is a dataclass instead of a closure, so that it can be pickled for another process.
     """
 
     rounds: int
@@ -56,7 +56,7 @@ class Investigated:
 
 
 def run_case(task: Task) -> dict[str, Any]:
-    """Draw a case, diagnose it from its recording alone, and return the diagnosis and the truth.
+    """Draw a case and diagnose it from its recording alone; return the diagnosis and the truth.
 
     Returns
     -------
@@ -102,7 +102,7 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
 
 
 def _concealed_effects(hidden: Sequence[Hidden], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
-    """Describe the effects; for a pair also "size_beside", the size of each when the other is in the model."""
+    """Describe the effects; for a pair also "size_beside", the size of each effect when the other is in the model."""
     each = [_effect_result(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
         both = sizer.recording(*(one.effect for one in hidden))
@@ -113,7 +113,7 @@ def _concealed_effects(hidden: Sequence[Hidden], sizer: EffectSizer, refit: Null
 
 
 def _effect_result(hidden: Hidden, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
-    """Describe one effect; "cosines": its aliases in this plan with their cosines."""
+    """Describe one effect; "cosines" holds similar effects in this plan, by name, with their cosines."""
     # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
     on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
     like = {} if on_noise else cosines(refit, sizer.clean, sizer.recording(hidden.effect))
@@ -168,7 +168,7 @@ def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, A
 
 
 def scored_statements(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Return the statements of a diagnosis that are scored."""
+    """Return the parts of a diagnosis that are scored, as a JSON object."""
     return {
         "verdict": diagnosis.verdict,
         "p_value": diagnosis.p_value,

@@ -77,7 +77,7 @@ def _moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
 
 
 def place_overlap(region: Region, places: Sequence[Place]) -> float:
-    """Return intersection over union of an effect's region and the strongest place in that covariate; 0 if none."""
+    """Return intersection over union of an effect's region and the strongest place in its covariate; 0 if none."""
     place = next((p for p in places if p.covariate == region.covariate), None)
     if place is None:
         return 0.0

@@ -16,7 +16,7 @@ from probewise.world.challenge import NO_PHYSICS, Case, held_out
 
 
 def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator) -> dict[str, dict[str, float]]:
-    """Sum the log predictive densities of each held-out scan, in nats.
+    """Return the log predictive density of each held-out scan under four models, in nats.
 
     "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", if all concealed effects are in the
     vocabulary and detectable in this plan, is the model with exactly these effects, fitted to the same readings: the

@@ -21,7 +21,7 @@ _BEHIND = 3.0  # nats: once an SSF order is this far behind the best, higher ord
 
 
 class NullRefit:
-    """Fit the null to clean readings once, then refit it to readings with effects.
+    """The null model, fitted to clean readings once and refitted to readings with effects.
 
     The order of the SSF is the one with the largest evidence on the clean readings, as in a diagnosis. Its residuals on
     those readings (the true SSF may be no mixture of Gaussians) are subtracted before a refit.
@@ -31,7 +31,7 @@ class NullRefit:
         self._clean: Recording | None = None
 
     def __call__(self, clean: Recording, changed: Recording) -> float:
-        """Return the norm of the residuals that a full refit leaves of an effect, in reading units."""
+        """Return the norm of an effect's residuals after a full refit of the null, in reading units."""
         return float(np.linalg.norm(self.refit(clean, changed).residuals))
 
     def refit(self, clean: Recording, changed: Recording) -> Fit:

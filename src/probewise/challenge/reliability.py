@@ -37,7 +37,7 @@ def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
 
 
 def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
-    """Return the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
+    """Estimate the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
     found = bootstrapped(
         np.array([leading_probability(result) for result in results], dtype=np.float64).reshape(-1, 2), _error
     )

@@ -26,7 +26,7 @@ _BOOTSTRAPS = 2000
 
 
 def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
-    """Score the results of `Investigated`: each target after the last round and, below it, after the first."""
+    """Score the results of `Investigated`: one row per target after the last round and, below it, after the first."""
     last = [r for r in results if "failed" not in r]
     first = [r | r["rounds"][0] for r in last]
     return (

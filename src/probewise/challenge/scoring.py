@@ -21,7 +21,10 @@ Result = Mapping[str, Any]
 
 
 def right_names(hidden: Mapping[str, Any]) -> frozenset[str]:
-    """Return all right names of one concealed effect: its own and its aliases."""
+    """Return all right names of one concealed effect: its own and its aliases.
+
+    An effect outside the vocabulary has only its aliases; "unknown" is right if it has none.
+    """
     cosines: Mapping[str, float] = hidden["cosines"]
     if hidden["in_vocabulary"]:
         squared = hidden["size_lambda"] ** 2 / 2
@@ -47,7 +50,7 @@ def effects_to_name(result: Result, *, merged: bool, noise: bool = True) -> list
 
 
 def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
-    """Return whether names match the wanted effects one to one; effects that are no physics may be unnamed."""
+    """Return whether names match the wanted effects one to one; effects that are no physics may go unnamed."""
     needed = [right for right in wanted if not right & NO_PHYSICS]
     optional = [right for right in wanted if right & NO_PHYSICS]
     n_more = len(names) - len(needed)
@@ -107,7 +110,7 @@ def leading_name_right(result: Result) -> bool:
 
 
 def leading_probability(result: Result) -> tuple[float, bool]:
-    """Return the probability of the most probable hypothesis, clean included, and whether it is exactly the truth."""
+    """Return the probability of the leading hypothesis, which may be clean, and whether it is exactly the truth."""
     names, probability = leading(result, clean=True)
     return probability, names_match(names, effects_to_name(result, merged=False))
 

@@ -90,7 +90,7 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
 
 
 def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
-    """Estimate for each single effect of a size how often it was detected at alpha .01, and named first."""
+    """Estimate, for each effect concealed alone at a size, how often it was detected at alpha .01 and named first."""
     singles = singles_of([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
@@ -213,7 +213,7 @@ def _interval_rows(done: list[Result]) -> list[Row]:
 
 
 def share_covered(intervals: list[list[float]]) -> Estimate:
-    """Estimate how often intervals [truth, low, high] cover the truth."""
+    """Estimate the share of intervals, [truth, low, high] each, that cover the truth."""
     return share([low <= truth <= high for truth, low, high in intervals])
 
 
@@ -265,7 +265,7 @@ def _pair_rows(done: list[Result]) -> list[Row]:
 
 
 def _each_shows(result: Result) -> bool:
-    """Return whether each of two effects has about the size given the other that their cosine implies."""
+    """Return whether each of two effects keeps at least `_BESIDE` of its size when the other is in the model."""
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
@@ -329,7 +329,7 @@ def _on_mean(results: Sequence[Result]) -> list[Result]:
 
 
 def rejection_rate(results: Sequence[Result], alpha: float) -> Estimate:
-    """Estimate how often the test of the mean rejects at a significance level."""
+    """Estimate how often the test of the mean rejects at significance level `alpha`."""
     return share([r["p_value"] <= alpha for r in results])
 
 

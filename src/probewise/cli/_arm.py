@@ -50,14 +50,14 @@ def geometry_of(arguments: argparse.Namespace) -> Geometry:
 
 @dataclass(frozen=True)
 class ArmName:
-    """The choice of an arm: its kind, and its port or file; for an emulated arm, the file of its true geometry."""
+    """An arm as chosen by --arm: its kind, and `where`: its port or file, or an emulated arm's true geometry file."""
 
     kind: Literal["simulated", "emulator", "nxt", "file"]
     where: str = ""
 
     @property
     def is_lego(self) -> bool:
-        """Whether it is the LEGO arm, whose reach follows from its geometry."""
+        """Whether it is a LEGO arm, real or emulated, whose reach follows from its geometry."""
         return self.kind in ("nxt", "emulator")
 
     @property
@@ -90,7 +90,7 @@ def parse_arm(text: str) -> ArmName:
 
 
 def open_own_instrument(path: str, *, start_s: float = 0.0) -> OwnInstrument:
-    """Load a user's file; its `connect()` returns the instrument when it is entered."""
+    """Load a user's file; its `connect()` is called when the instrument is entered."""
     from probewise.arm import OwnInstrument
 
     return OwnInstrument.from_file(path, start_s=start_s)
@@ -142,7 +142,7 @@ def emulated_arm(
 
 
 def warn_of_clearance(geometry: Geometry) -> None:
-    """Warn if the reading height is smaller than the possible error of the geometry."""
+    """Warn if the sensor may touch the table: if its height may be wrong by more than the reading height."""
     doubt_mm = geometry.height_doubt_mm
     if doubt_mm < geometry.read_height_mm:
         return
@@ -159,7 +159,7 @@ def warn_of_clearance(geometry: Geometry) -> None:
 
 
 def warn_of_place_sd(geometry: Geometry, stop_sd_mm: float) -> None:
-    """Warn if the arm's place is known less well than the lengths of a shape are to be."""
+    """Warn if the sd of the arm's place is no smaller than the sd at which a run stops."""
     accuracy = geometry.accuracy
     if accuracy is None or accuracy.place_sd_mm < stop_sd_mm:
         return
@@ -170,7 +170,7 @@ def warn_of_place_sd(geometry: Geometry, stop_sd_mm: float) -> None:
 
 
 def confirm_lowering(arm: LegoArm) -> LegoArm:
-    """Return the arm with its first lowering confirmed step by step."""
+    """Let a person confirm each step of the arm's first lowering; return the same arm."""
     ask = prompter(arm)
 
     def confirm(height_mm: float) -> None:
@@ -192,7 +192,7 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
 
 
 def open_nxt(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
-    """Connect to a brick with the arm attached."""
+    """Connect to the brick at a port; return its arm."""
     from probewise.arm import LegoArm
     from probewise.arm.nxt import BrickMachine
 
@@ -200,14 +200,14 @@ def open_nxt(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
 
 
 def open_brick(port: str) -> Brick:
-    """Connect to a brick."""
+    """Connect to the brick at a port."""
     from probewise.arm.nxt import Brick
 
     return Brick.open(port)
 
 
 class ReportingInstrument:
-    """An instrument that reports each move before it starts, and each reading, since a real arm takes seconds."""
+    """An instrument that calls `moving` before each move and `read` after each reading, since a real arm is slow."""
 
     def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
         self._instrument, self._moving, self._read = instrument, moving, read
@@ -235,10 +235,9 @@ class ReportingInstrument:
 def require_declared(
     arm: Instrument, orientations_deg: Sequence[float] | None, heights_mm: Sequence[float] | None
 ) -> None:
-    """Raise ParameterError for poses that a user's instrument (already entered) does not declare as possible.
+    """Check that a user's instrument, already entered, can take the orientations and heights that were given.
 
-    Raises ParameterError if orientations or heights are given for an instrument that does not declare `turns` or
-    `lifts`.
+    Raises ParameterError if orientations are given and it does not declare `turns`, or heights and not `lifts`.
     """
     from probewise.arm import OwnInstrument
 

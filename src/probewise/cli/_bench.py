@@ -1,4 +1,4 @@
-"""A simulated bench for the tasks of `arm`, on which patterns are laid automatically."""
+"""A simulated bench for the tasks of `arm`: a table on which the program itself lays the patterns."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Bench:
         self._stand: Callable[[], Stand] | None = None
 
     def simulated(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
-        """Return the simulated arm over it, which turns its sensor itself."""
+        """Return the simulated arm over the table; its sensor takes any orientation."""
         number = itertools.count(self._n_taken)
 
         def light(pose: Pose, time_s: float, height_mm: float) -> float:
@@ -66,7 +66,7 @@ class Bench:
         return make(last=Reading(math.nan, rest, start_s))
 
     def emulated(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
-        """Return the LEGO arm over it, on an emulated brick."""
+        """Return the LEGO arm over the table, on an emulated brick."""
         surface, seed = self._table.surface, self._seed + self._n_taken
         arm, bench = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
         self._table, self._stand = bench.table, bench.arm.stand
@@ -97,7 +97,7 @@ class Bench:
         return " ".join(words)
 
     def lay(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
-        """Carry out a request of `carry_out`: lay a pattern with its origin there, or turn the sensor."""
+        """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if isinstance(request, Request) and request.pattern is not None:
             self._table.surface = moved_pattern(patterns[request.pattern], origin_mm)
         if isinstance(request, Request) and request.turned_rad is not None:
@@ -120,7 +120,7 @@ def open_arm(
     Parameters
     ----------
     chosen
-        Which.
+        The arm, from `parse_arm`.
     geometry, geometry_file
         Geometry of the LEGO arm, and its file if given; with a file, the simulated arm has its reach.
     sensor, scene, seed

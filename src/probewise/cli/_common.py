@@ -31,7 +31,7 @@ class Verb:
 
 
 class CommandError(ProbewiseError, ValueError):
-    """Raised for an incomplete command line; the message says how to complete it."""
+    """An incomplete command line; the message says how to complete it."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -157,7 +157,7 @@ def caution(text: str) -> None:
 
 
 def kept_message(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
-    """Return a message on how much of a run a file holds, and the command that resumes it."""
+    """Return a message: how much of a run a file holds, and the command that resumes the run."""
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
     count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"

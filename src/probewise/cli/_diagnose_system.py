@@ -74,7 +74,7 @@ def write_results(diagnosis: Diagnosis, folder: Path) -> None:
 
 
 def _files_to_keep(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
-    """List files to keep: all input files, and the next.csv of an earlier run if readings were filled in."""
+    """List files that results must not replace: inputs, and an earlier next.csv with readings filled in."""
     from probewise.errors import FileError
     from probewise.recordings.table import read_table
 

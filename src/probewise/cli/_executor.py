@@ -54,7 +54,7 @@ def campaign_running(
 
 
 def campaign_kept_message(path: Path, noun: str, arguments: argparse.Namespace) -> str:
-    """Return a message on how many finished tasks a campaign's file holds, and how to resume."""
+    """Return a message: how many finished tasks a campaign's file holds, and the command that resumes it."""
     from probewise.campaign import read_campaign
 
     return (

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class Pictures:
-    """Draws each step as it arrives, and keeps steps and pictures for the report."""
+    """The pictures of a run: draws each step as it arrives, and keeps steps and pictures for the report."""
 
     out: Path
     inputs: Inputs
@@ -38,7 +38,7 @@ class Pictures:
     frames: list[bytes] = field(default_factory=list)
 
     def add(self, step: Step, shadow: Step | None) -> None:
-        """Draw a step, with the other sensor model's posterior if there is one, and write its picture."""
+        """Draw a step, beside the other sensor model's (`shadow`) if there is one, and write the picture."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)

@@ -41,10 +41,9 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
 
 
 def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> Hidden:
-    """Parse "[SHAPE:]V,V,...", the parameters of the true shape; without a text, draw them from the prior.
+    """Parse "[SHAPE:]V,V,...", the parameters of the true shape; if `text` is None, draw them from the prior.
 
-    Raises ParameterError if the text names an unknown shape, lacks a number, or has one that the shape's prior
-    excludes.
+    Raises ParameterError for an unknown shape, a wrong number of values, or values that the shape's prior excludes.
     """
     if text is None:
         return Hidden.drawn({name: SHAPES[name](field) for name in names}, rng=rng)

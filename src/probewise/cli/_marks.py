@@ -23,7 +23,7 @@ _HELP = (
 
 
 class MarkQuestion(str):
-    """A question to the person who watches the sensor, as a sentence.
+    """A question about a mark to the person who watches the sensor: the sentence, with the mark's place.
 
     Attributes
     ----------

@@ -26,7 +26,7 @@ _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 
 
 class Stage:
-    """An empty directory to write results into, and the files that were renamed to make way for them.
+    """An empty directory to write results into, and the input files that were renamed to make way for them.
 
     Attributes
     ----------
@@ -45,12 +45,12 @@ class Stage:
 
     @property
     def notes(self) -> list[str]:
-        """The renamed files, in words."""
+        """One text for each renamed file."""
         return [f"what was {path} is now {now}" for path, now in self.kept.items()]
 
 
 def check_out_directory(path: Path) -> Path:
-    """Raise, before any work, if no directory can be made there."""
+    """Return the path; raise FileError, before any work, if no directory can be made there."""
     if path.exists() and not path.is_dir():
         raise ParameterError("--out", str(path), "a directory, existing or new; this is a file")
     parent = next(p for p in (path, *path.absolute().parents) if p.exists())
@@ -64,7 +64,7 @@ def check_out_directory(path: Path) -> Path:
 
 
 def check_out_file(path: Path, *inputs: Path) -> Path:
-    """Raise, before any work, if no file can be written there or it would overwrite an input."""
+    """Return the path; raise FileError, before any work, if it cannot be written or would overwrite an input."""
     if path.is_dir():
         raise ParameterError("--out", str(path), "a file name; this is a directory")
     for taken in inputs:
@@ -180,7 +180,7 @@ def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
 
 
 def _names_kept(out: Path, names: Sequence[str]) -> dict[str, str]:
-    """Find for each file the first free NAME_kept, NAME_kept_2 ...; files of one stem get the same ending."""
+    """Return for each file its first free name NAME_kept, NAME_kept_2, ...; files of one stem get the same ending."""
     aside: dict[str, str] = {}
     for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):
         group = [Path(name) for name in names if Path(name).with_suffix("") == stem]

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class PersonAtBench:
-    """Pass the requests of `carry_out` to a person; check white and black of a sheet before it is scanned.
+    """A person who carries out the requests of `carry_out`; each sheet's white and black are checked before its scan.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ class PersonAtBench:
                 break
 
     def _typed_request(self, request: Request) -> str:
-        """Return what to type in the emulator's terminal."""
+        """Return the hint that says what to type in the emulator's terminal; "" without an emulator."""
         if not self._emulated:
             return ""
         if request.turned_rad is not None:

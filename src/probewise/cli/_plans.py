@@ -24,7 +24,7 @@ def plan_of(text: str) -> Plan:
 def for_own_instrument(
     plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
 ) -> Plan:
-    """Return the plan with the instrumentation of a user's own instrument, from its JSON or the options."""
+    """Return the plan for a user's own instrument: instrumentation from its JSON, which the options override."""
     said: dict[str, object] = {} if unit is None else {"unit": unit}
     if unit is not None:  # the declared values have another unit
         said |= {"min": None, "max": None, "step": None, "sensor": ""}
@@ -36,7 +36,7 @@ def for_own_instrument(
 
 
 def for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
-    """Return the plan with the instrumentation of the LEGO arm: percent, at its reading height."""
+    """Return the plan for the LEGO arm: readings in percent, at the arm's reading height."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
         unit="LEGO",
@@ -50,7 +50,7 @@ def for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
 
 
 def keep_commanded(plan: Plan) -> Plan:
-    """Keep only the covariates that can be commanded; others are measurements of an earlier recording."""
+    """Return the plan with the covariates that can be commanded; others were measured in an earlier recording."""
     can = {*plan.instrumentation.controls, "led", "height_mm"}
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
 

@@ -1,4 +1,4 @@
-"""Check during recording whether the sheets match the plan: white reads bright, black dark."""
+"""Check during recording that each sheet matches its pattern: white reads bright, black reads dark."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _AROUND_MM = np.stack(
 
 
 class SheetCheck:
-    """Checks readings taken over uniform white or black.
+    """A check of each sheet against its pattern, by the readings over its uniform white and black.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class SheetCheck:
             self._shades[rows] = shades(plan.patterns[name], places[rows])
 
     def check_reading(self, row: int, value: float) -> str | None:
-        """Check a reading of the plan; return the complaint, once per sheet and shade, or None."""
+        """Check the reading of a plan's row; return a complaint, at most once per sheet and shade, or None."""
         shade = self._shades[row]
         if math.isnan(shade) or math.isnan(value):
             return None
@@ -69,7 +69,10 @@ class SheetCheck:
         return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour(is_white)}, and {wrong}"
 
     def check_levels(self, name: str, values: dict[bool, float]) -> str | None:
-        """Check readings over the white and the black of a sheet, and keep them if they are right."""
+        """Check a sheet by its readings over white (True) and black (False); return a complaint or None.
+
+        Readings that are right are kept as levels for later checks.
+        """
         wrong = None
         if len(values) == 2:
             contrast = values[True] - values[False]
@@ -85,7 +88,7 @@ class SheetCheck:
         return None
 
     def places_to_check(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
-        """Choose places for checking a sheet: over uniform white and uniform black, by shade.
+        """Choose the places at which to check a sheet: one over uniform white (True), one over uniform black (False).
 
         Parameters
         ----------

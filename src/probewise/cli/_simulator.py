@@ -25,10 +25,7 @@ def add_simulator(parser: argparse.ArgumentParser, *, replaces: str = " instead 
 
 
 def refuse_sensor_options(arguments: argparse.Namespace, *names: str) -> None:
-    """Refuse options that apply only to light sensors.
-
-    Raises ParameterError if one of them is given.
-    """
+    """Raise ParameterError if one of these options, which apply only to light sensors, is given."""
     for name in names:
         value = getattr(arguments, name)
         if value is not None and value is not False:

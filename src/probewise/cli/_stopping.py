@@ -20,7 +20,7 @@ from probewise.errors import FileError, LinkError
 
 
 class Stopped(KeyboardInterrupt):
-    """Raised after a signal, its `number`; the text says what is kept."""
+    """The interruption of a command by signal `number`; the text says what is kept on disk."""
 
     def __init__(self, number: int = signal.SIGINT, kept: str = "") -> None:
         self.number = number
@@ -33,7 +33,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class _Request:
-    """The last request to stop: signal number and time."""
+    """The last request to stop: its signal number, None if there is none, and its time."""
 
     number: int | None = None
     at_s: float = 0.0
@@ -76,12 +76,12 @@ def raise_if_stopped() -> None:
 
 @contextlib.contextmanager
 def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> Iterator[None]:
-    """Add what is kept on disk to the final message of a run that a signal or a lost connection ends.
+    """Add to the final message of a run that a signal or a lost connection ends what is kept on disk.
 
     Parameters
     ----------
     kept
-        Function that returns that message.
+        Function that returns the text to add.
     results
         Whether the run is over and writes its results, so that file errors get the message too.
     """

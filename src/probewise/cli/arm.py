@@ -376,7 +376,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
 
 
 def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    """Let the light say how high the sensor hangs, relative to the first place."""
+    """Measure by the light how high the sensor hangs at each place, relative to the first."""
     import numpy as np
 
     from probewise.arm import LegoArm, require_reach
@@ -549,7 +549,7 @@ def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
 
 
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
-    """Read the readings of an earlier session, which must match the plan's first rows."""
+    """Return the readings of an earlier session, which must match the plan's first rows; none in a dry run."""
     import numpy as np
 
     from probewise.arm import readings_of
@@ -620,7 +620,7 @@ def _instrument(
 def _warn_and_confirm_lowering(
     arguments: argparse.Namespace, instrument: LegoArm | OwnInstrument | SimulatedArm, geometry: Geometry
 ) -> None:
-    """Warn of a geometry with which the sensor may hit the table; lower in steps if a person can watch."""
+    """Warn if the sensor may hit the table; let a person who can watch confirm each step of the first lowering."""
     import sys
 
     from probewise.arm import LegoArm

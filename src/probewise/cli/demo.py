@@ -154,7 +154,7 @@ def as_searches(
 
 
 def circle_on_field() -> Circle:
-    """Return the prior of the circle: entirely on the field, radius 50 to 150 mm."""
+    """Return the hypothesised shape: a circle entirely on the field, radius 50 to 150 mm."""
     from probewise.scene import Circle
 
     return Circle(radius_mm=(50.0, 150.0), inside=True)
@@ -222,7 +222,7 @@ def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: 
 
 
 def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> Exploration:
-    """Search for the circle by the paper's rule, from a first reading on it that all models share."""
+    """Search for the circle by the paper's rule; the first reading, on the circle, is the same for all models."""
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run_from, surface_of
@@ -240,7 +240,7 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
 
 
 def place_on_circle(truth: tuple[float, ...], seed: int) -> Pose:
-    """Draw a place on the circle, uniformly: the first reading of robots that are to start alike."""
+    """Draw a place within the circle, uniformly: the common first reading of robots to be compared."""
     import numpy as np
 
     from probewise.arm import Pose
@@ -252,7 +252,7 @@ def place_on_circle(truth: tuple[float, ...], seed: int) -> Pose:
 
 
 def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, ...], seed: int) -> Exploration:
-    """Search for the circle with a sensor that saturates, which its model leaves out, from a first reading on it."""
+    """Search for the circle, from a first reading on it, with a sensor that saturates; its model leaves that out."""
     from dataclasses import replace
 
     import numpy as np

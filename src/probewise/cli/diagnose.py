@@ -131,7 +131,7 @@ def generators(seed: int) -> Sequence[np.random.Generator]:
 
 
 def _files_to_keep(arguments: argparse.Namespace, out: Path) -> list[Path]:
-    """List files to keep: all input files, and the next plan of an earlier run if readings were filled in."""
+    """List files that results must not replace: inputs, and an earlier next plan with readings filled in."""
     from probewise.diagnosis import NEXT_PLAN
 
     read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]

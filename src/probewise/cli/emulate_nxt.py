@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Listener:
-    """Executes typed commands: another scene, `turn DEGREES`, `where`; reports if the sensor is in the table."""
+    """Commands typed at the emulator: another scene, `turn DEGREES`, `where`; also reports a sensor in the table."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None

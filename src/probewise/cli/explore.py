@@ -229,7 +229,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Path) -> Iterator[str]:
-    """Say what was found, what its errors leave out, and what the readings say of the sensor."""
+    """Yield the closing lines: the shape found, errors that its sds leave out, and probable faults of the sensor."""
     from probewise import experiment as posing
     from probewise.report import exploration as report
 
@@ -247,7 +247,7 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Pat
 
 
 def _relative_path(folder: Path, path: Path) -> str:
-    """Return a file's path relative to a folder, so that both can be moved together."""
+    """Return a file's path relative to a folder, which stays right if both are moved together."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # on another drive

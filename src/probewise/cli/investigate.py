@@ -185,7 +185,7 @@ def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
 
 @contextlib.contextmanager
 def _recorder(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int) -> Iterator[Take]:
-    """Open an arm to carry out plans, with a person or an emulated bench handling the sheets."""
+    """Yield a function that carries out plans with an opened arm; a person or a simulated bench lays the sheets."""
     from probewise.arm import Request, carry_out
     from probewise.cli._bench import open_arm
 

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Predict every row, and score the prediction if there are readings."""
+    """Predict every row, and score the predictions where there are readings."""
     refuse_journal(arguments.plan)
     if arguments.simulator is not None:
         return _by_simulator(arguments)

@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run what is left of the study and write its table."""
+    """Run the study's remaining tasks and write its table."""
     from probewise._progress import progress_shown
     from probewise.recordings import write_text_atomically
     from probewise.report import study as report
@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
-    """Run what is left of the study of concealed effects and write its table."""
+    """Run the remaining tasks of the study of concealed effects and write its table."""
     from probewise.recordings import write_text_atomically
     from probewise.report import concealed as report
     from probewise.study import concealed_rows, concealed_table, run_concealed

@@ -18,9 +18,9 @@ _SUFFIX = ".part"
 def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None:
     """Replace the file at `path` by `content` atomically.
 
-    The bytes go to a temporary file in the same folder (a rename across file systems is not
-    atomic), are synced to disk, and the file is renamed. Temporary files of this name left by
-    killed processes are removed.
+    The bytes are written to a temporary file and synced to disk; then the temporary file is renamed. It lies in the
+    same folder, since a rename across file systems is not atomic. Temporary files that killed processes left behind
+    are removed.
 
     Raises
     ------

@@ -62,9 +62,9 @@ def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = Non
 
 
 def parse_texts(values: ArrayLike) -> ArrayLike:
-    """Parse texts in a column as in a file: numbers, and "", "nan", "n/a" and the like for missing ones.
+    """Parse a column of texts as a file's: numbers, and "", "nan", "n/a" and the like, which become NaN.
 
-    A column without texts, or with a text that is neither, is returned unchanged.
+    A column without texts, or with a text that is none of these, is returned unchanged.
     """
     cells = values if isinstance(values, str) else np.asarray(values)
     if isinstance(cells, str) or cells.ndim != 1 or cells.dtype.kind not in "OUT":
@@ -96,9 +96,9 @@ def dates_to_seconds(values: ArrayLike) -> ArrayLike:
 
 
 def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
-    """Check the other logged columns: one number per reading in each.
+    """Check a user's covariates: columns of one number per reading, by name.
 
-    Raises ParameterError if they have no names, or the name of one of a recording's own columns.
+    Raises ParameterError if they have no names, or if a name is that of a recording's own column, such as "x_mm".
     """
     if columns is None:
         return {}
@@ -112,7 +112,7 @@ def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> di
 
 
 def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
-    """Convert a selection of rows (numbers, one truth value per row, or a slice) to row numbers, (n_rows,).
+    """Convert a selection of rows (row numbers, one truth value per row, or a slice) to row numbers, (n_rows,).
 
     Raises ParameterError if the selection is none of these, or a row does not exist.
     """
@@ -201,7 +201,7 @@ def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, P
 
 
 def how_to_describe(name: str, known: Sequence[str]) -> str:
-    """Say, for an error message, what to do about a pattern that is named but not described."""
+    """Return, for an error message, what is allowed where a pattern is named but not described."""
     listed = ", ".join(map(repr, known)) or "none"
     return f"one that is described ({listed}); {name!r} is named but not described: pass patterns={{{name!r}: ...}}"
 

@@ -13,10 +13,10 @@ from probewise.recordings.table import csv_text, number_text
 
 
 def fingerprint(recording: Recording) -> str:
-    """Hash a recording's content: SHA-256, hexadecimal, of its files in a normal form.
+    """Return the SHA-256, in hexadecimal, of a recording's content, written in a fixed order.
 
-    Rows, readings, scans, covariates, patterns and the instrument count; the free-text description,
-    file names, column order and line ends do not.
+    The content is its rows, readings, scans, covariates, patterns and instrument; not the free-text description, file
+    names, column order or line ends.
     """
     plan = recording.plan
     columns = plan_columns(plan) | {"reading": [number_text(value) for value in recording.readings]}

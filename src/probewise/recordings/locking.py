@@ -77,7 +77,7 @@ def _locked_file(lock: Path, path: Path) -> int | None:
 
 
 def try_lock(handle: int) -> bool:
-    """Lock an open file until it is closed; return False if another process holds the lock."""
+    """Lock an open file until it is closed; return False, without a lock, if another process holds one."""
     try:
         _lock(handle)
     except OSError as error:
@@ -88,7 +88,7 @@ def try_lock(handle: int) -> bool:
 
 
 def remove_unless_locked(path: Path) -> None:
-    """Remove a file unless the process that locked it is alive."""
+    """Remove a file unless a living process holds its lock."""
     with contextlib.suppress(OSError):
         if sys.platform == "win32":
             path.unlink()  # refused while another process has it open

@@ -122,7 +122,7 @@ class Stripes(_Checked):
 
 @dataclass(frozen=True)
 class Ramp(_Checked):
-    """A linear gradient, albedo per_mm (x . n), unbounded: an encoder on a scale is a sensor on a ramp."""
+    """A linear gradient without bounds: albedo per_mm (x . n). It also describes an encoder, which reads its place."""
 
     normal_rad: float
     per_mm: float
@@ -130,7 +130,7 @@ class Ramp(_Checked):
 
 @dataclass(frozen=True, eq=False)
 class Image(_Checked):
-    """An image: albedo of pixels 0 to 1, first row on top, 0 outside; `origin_mm` is the lower left corner."""
+    """An image: one albedo (0 to 1) per pixel, first row on top, 0 outside; `origin_mm` is its lower left corner."""
 
     albedo: FloatArray
     pixel_mm: float

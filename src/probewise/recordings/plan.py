@@ -34,7 +34,7 @@ from probewise.recordings.patterns import Pattern
 
 @dataclass(frozen=True)
 class Instrumentation:
-    """The instrument: unit, range and step of a reading, the sensor, and what can be commanded."""
+    """The instrument: unit, range and step of a reading, the sensor, and the columns that can be commanded."""
 
     unit: str = "LEGO"
     min: float | None = None
@@ -461,7 +461,7 @@ class Recording(ShowsItself):
         return ok
 
     def notes_on_unusable_readings(self) -> tuple[str, ...]:
-        """Say how many readings are unusable: missing, or outside the declared range."""
+        """Return in words how many readings are unusable, one text for each reason: missing, or out of range."""
         inst = self.plan.instrumentation
         n_missing = int(np.isnan(self.readings).sum())
         n_outside = len(self) - n_missing - int(self.usable.sum())
@@ -514,7 +514,7 @@ def require_described(plan: Plan) -> None:
 
 
 def range_text(low: float | None, high: float | None) -> str:
-    """Describe a declared range."""
+    """Write a declared range in words; None where an end is not declared."""
     if low is None and high is None:
         return "any range"
     if low is None:

@@ -99,7 +99,7 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
 
 
 def jittered(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
-    """Make a plan's times and battery voltages realistic: jittered intervals, and measurement noise on the voltage.
+    """Return the plan with jittered intervals of time and, where it has a battery voltage, measurement noise on it.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def jittered(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Pla
     rng
         Source of randomness.
     share
-        Every interval changes by up to this share of it, 0 to 1.
+        Largest change of an interval as a share of it, 0 to 1.
 
     Raises
     ------

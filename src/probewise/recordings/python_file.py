@@ -61,5 +61,5 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
 
 
 def error_text(error: BaseException) -> str:
-    """Write an error on one short line."""
+    """Return an error's message on one line, cut where it is long."""
     return shortened(" ".join(str(error).split()), _LONGEST)

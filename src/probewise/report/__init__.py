@@ -1,4 +1,4 @@
-"""One self-contained HTML page per run, and its figures."""
+"""Reports: one self-contained HTML page per run, and its figures."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ _CURED_BY = "The fewest extra readings that would help"
 
 
 def answer(audit: PlanAudit) -> str:
-    """Summarise in twenty words at most how many effects are fine, aliased and invisible, and what would help."""
+    """Summarise in at most twenty words: how many effects are fine, aliased or invisible, and what would help."""
     n_fine, n_aliased = len(audit.seen_as("fine")), len(audit.seen_as("aliased"))
     n_invisible = len(audit.seen_as("invisible"))
     said = (

@@ -34,8 +34,8 @@ _SIZES = {
 def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:
     """Build the table of all effects: detectability, aliases, and the size at which each is detectable.
 
-    `of` names the model whose own parameters absorb part of an effect. A column gives the number of rows that an effect
-    needs, where that was computed.
+    `of` names the model whose own parameters absorb part of an effect. Where it was computed, a column gives the number
+    of rows that the plan needs to detect an effect.
     """
     counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")
@@ -66,7 +66,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
 
 
 def _smallest(parameter: str, unit: str, amount: float | None) -> str:
-    """Write a size, with the name of its parameter where the unit does not already say it."""
+    """Write an effect's size, with its parameter's name where the unit alone is not clear."""
     name = _SIZES.get(parameter, "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " "))
     value = "at no size" if amount is None else f"{amount:.2g} {_unit(unit)}"
     return f"{name} {value}".strip()

@@ -1,4 +1,4 @@
-"""The covariates of a diagnosis: labels, units, and values row by row."""
+"""Covariates of a diagnosis: their labels, units and values, one per reading."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WORDS = {
 
 
 def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
-    """Name a covariate with its unit; `unit` is that of the readings."""
+    """Return a covariate's name in words with its unit; `unit` is the readings' unit."""
     said, own = covariate_words(name), covariate_unit(name, unit)
     if scan is not None and name != "scan":
         said += f", scan {scan}"
@@ -45,7 +45,7 @@ def family_words(family: str) -> str:
 
 
 def covariate_unit(name: str, unit: str) -> str:
-    """Return the unit of a covariate, "" if none is known; `unit` is that of the readings."""
+    """Return the unit of a covariate, "" if none is known; `unit` is the readings' unit."""
     known = {**UNITS, "level": unit_name(unit), "slope": f"{unit_name(unit)} per mm"}
     return known.get(name, SUFFIXES.get(name.rpartition("_")[2], ""))
 
@@ -68,10 +68,10 @@ def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
 
 
 def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
-    """Return the covariate of each located residual, (n_points,), by the name of its figure.
+    """Return the covariate of each place in `diagnosis.where`, (n_points,), by the name of the place's figure.
 
-    Rows that a place does not cover are NaN. The values are those used when the residual was located: recomputing them
-    (slopes, for instance) from another estimate of the sensor could move a reading across the end of an interval.
+    Rows that a place does not cover are NaN. The values are those by which the diagnosis found the place. Computed
+    from another estimate of the sensor, a slope, for instance, could lie on the other side of an interval's end.
     """
     usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:

@@ -1,4 +1,4 @@
-"""Covariates to draw residuals against: one for each place, and the one that shows the verdict best."""
+"""Covariates against which residuals are drawn: those of each place, and that of the first figure."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ _LEAST_PERIODS = 3.0  # least number of periods in a recording for folding it
 
 @dataclass(frozen=True, eq=False)
 class CovariateView:
-    """A covariate to draw residuals against: values (n_points,), NaN where there is none, and a label with unit.
+    """A covariate against which residuals are drawn: its values (n_points,), NaN where it has none, and axis label.
 
-    `names` name the values of a categorical covariate; `window` is the significant interval, in the covariate's unit
-    or, with names, in positions; `place` is the place that it shows, if any.
+    `names` name the values of a categorical covariate. `window` is the significant interval, in the covariate's unit;
+    of a categorical covariate, in positions on the axis. `place` is the place of the diagnosis shown, if any.
     """
 
     at: FloatArray
@@ -45,7 +45,11 @@ class CovariateView:
 
 @dataclass(frozen=True, eq=False)
 class ResidualNoise:
-    """What chance means of residuals depend on: noise sds (n_points,), AR(1) correlation, posterior predictions."""
+    """Noise of residuals, for the band of chance about their means.
+
+    `sd`, (n_points,), is the noise sd of each reading, `rho` the AR(1) correlation. `absorbed`, (n_samples, n_points),
+    holds posterior predictions, whose variance the fit takes from the noise.
+    """
 
     sd: FloatArray
     rho: float
@@ -80,7 +84,9 @@ class ResidualNoise:
 
 
 def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
-    """Choose the first figure's covariate: the first whose means leave the band of chance, else the nearest to it.
+    """Choose the first figure's covariate: the first whose means clearly leave the band of chance, else the largest.
+
+    The largest is the one with the largest mean in sds.
 
     Candidates in order: a named wave, folded at its period; the places; for an unknown effect, its most likely
     covariate; last, the change that the repair makes.
@@ -124,7 +130,7 @@ def _is_same(values: Mapping[str, FloatArray], place: Place, other: Place) -> bo
 
 
 def _views(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
-    """List views of a place by its covariate, (n_points,); a scan also along its path, which comes first."""
+    """List the views of a place: for a scan first along its path; then along the place's covariate, (n_points,)."""
     by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
@@ -142,7 +148,10 @@ def view_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> Covaria
 
 
 def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
-    """Build the view of one scan along its path: residuals that change sign average to zero over a scan."""
+    """Build the view of one scan along its path.
+
+    It shows residuals that change sign within the scan, whose mean over the scan is zero.
+    """
     plan = diagnosis.recording.plan
     rows = np.flatnonzero(plan.scan == plan.scan_names.index(scan))
     if isinstance(plan, RunTable):
@@ -160,7 +169,7 @@ def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None)
 
 
 def is_line(plan: Plan | RunTable, rows: IntArray) -> bool:
-    """Return whether rows of one scan lie along a line, at three or more places; rows of a table, along time."""
+    """Return whether the rows of one scan lie on a line, at three or more places; True for the rows of a table."""
     if isinstance(plan, RunTable):
         return True
     places = np.stack([plan.x_mm[rows], plan.y_mm[rows]])
@@ -205,7 +214,10 @@ def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
 def _waves_of_table(
     diagnosis: Diagnosis, table: RunTable, effect: str, found: Mapping[str, float]
 ) -> list[tuple[FloatArray, float, str, str]]:
-    """Fold time at the period of a wave in time, or a column at that of its periodic error."""
+    """Return what to fold for an effect on a table: values (n_points,), period, name and unit; an empty list if none.
+
+    A wave in time folds the time; a column's periodic error folds that column.
+    """
     if found.get("hz", 0.0) > 0:
         return [(table.time_s, 1 / found["hz"], *words_and_unit(diagnosis, "time"))]
     column = public_name(effect).partition(":")[2]
@@ -220,7 +232,7 @@ def _view_by_change(diagnosis: Diagnosis) -> CovariateView:
 
 
 def _window(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
-    """Return the interval to shade: from start to end, or around the scan, direction or orientation."""
+    """Return the interval to shade: from a place's start to its end, or around its category; None if it has neither."""
     ends = None if place.start is None or place.end is None else (place.start, place.end)
     if not names:
         return ends

@@ -74,7 +74,7 @@ def answer(searches: Sequence[RobotSearch]) -> str:
 
 
 def equal_readings_text(searches: Sequence[RobotSearch]) -> str:
-    """Compare both robots after the number of readings that the SSF robot needed."""
+    """Compare in a sentence both robots' widest posterior sds after as many readings as the SSF robot needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
     widest = naive.run.steps[naive.step_at(n) - 1].widest_mm
@@ -107,7 +107,7 @@ def main_findings(
 
 
 def comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
-    """Fill the comparison: readings, information, errors, one row per sensor model."""
+    """Return the comparison's rows: readings, information and errors, one row per search."""
     return [
         (
             s.model,
@@ -280,8 +280,8 @@ def write_page(
         ),
     ]
     caption = (
-        f"{equal_readings_text(started_alike)} Left the naive model, right the SSF model. Blue: 50 circles drawn from the "
-        "posterior. Copper: entropy of the readings that these circles predict; brighter places promise more "
+        f"{equal_readings_text(started_alike)} Left the naive model, right the SSF model. Blue: 50 circles drawn "
+        "from the posterior. Copper: entropy of the readings that these circles predict; brighter places promise more "
         "information. Squares: readings by their brightness. Green: the next place. Dashed white: the hidden "
         "circle."
     )

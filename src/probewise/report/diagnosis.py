@@ -171,7 +171,7 @@ def _formula(formula: Formula) -> str:
 
 
 def _reason_in_words(diagnosis: Diagnosis) -> str:
-    """Return the reason without the plan, which the page gives elsewhere, and with names in words."""
+    """Return the verdict's reason in words, without its sentence on the next plan, which the page gives elsewhere."""
     said = diagnosis.reason.partition(TO_SEPARATE)[0]
     names = "|".join(EFFECTS_IN_WORDS)
     return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
@@ -237,7 +237,7 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
 
 
 def _in_words(label: str) -> str:
-    """Write a rival hypothesis of a plan in words; a label that holds no effect names is a phrase already."""
+    """Write the label of a hypothesis that a plan separates in words; one without effect names is in words already."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
     said = join_names(map(effect_in_words, names)) if all(is_in_words(name) for name in names) else named
@@ -294,7 +294,7 @@ def _candidate(name: str) -> str:
 
 
 def _unlisted_corrections(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """List corrections in the repaired sensor that are in none of the explanations above."""
+    """List corrections that samples of the repaired model contain, but none of the explanations above."""
     return tuple(
         paragraph(_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.carried
@@ -437,7 +437,7 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
 
 
 def _with_name(name: str) -> str:
-    """Name an effect in words, with its name in diagnosis.json."""
+    """Name an effect in words, followed by its name in diagnosis.json."""
     said = effect_in_words(name)
     return f"{said} ({name})" if said != name else name
 
@@ -482,7 +482,7 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
 
 
 def _readings(n: int) -> str:
-    """Write the number of readings that would separate a pair, up to the largest plan."""
+    """Write the number of readings that would separate a pair: a dash for 0, a bound above the largest plan."""
     return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
 
 

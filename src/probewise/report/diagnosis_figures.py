@@ -45,7 +45,7 @@ _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readin
 
 
 def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw all figures: the first screen, before and after, noise, held-out gain, and one for each located residual."""
+    """Draw all figures: first screen, before and after, residuals, noise, held-out gain, and one for each place."""
     chance, values = ResidualNoise.of(diagnosis), covariate_values(diagnosis)
     drawn = {
         "first.svg": _draw_evidence(diagnosis, chance),
@@ -69,7 +69,11 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
 
 
 def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = None) -> CovariateView | str:
-    """Choose the content of the first figure: residuals along a covariate, or the noise effect that is named."""
+    """Choose the content of the first figure.
+
+    It is a view of residuals along a covariate, the name of the largest noise effect, or "readings" if they are too few
+    for a diagnosis.
+    """
     if diagnosis.judged.too_little:
         return "readings"
     if diagnosis.verdict == "noise":
@@ -105,7 +109,7 @@ def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 def _draw_place(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
     """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
 
-    A scan is drawn along its path first, then among the other scans: residuals that change sign average to zero.
+    A scan is drawn along its path, which shows residuals that change sign, and below that beside the other scans.
     """
     by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:

@@ -29,7 +29,7 @@ def answer(searches: Sequence[RobotSearch]) -> str:
 
 
 def figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
-    """Draw what both robots believe about the circle at the end, and the doubting one about its sensor: PNG by name."""
+    """Draw each robot's final posterior of the circle, and the doubting robot's effect probabilities: PNG by name."""
     ends = np.array([window_mm([s.run], len(s.run.steps)) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)

@@ -38,13 +38,13 @@ def effect_in_words(name: str) -> str:
 
 
 def hypothesis_in_words(effects: Sequence[str]) -> str:
-    """Name a hypothesis: a set of effects, () for clean, ("unknown",) for an effect out of vocabulary."""
+    """Name a hypothesis in words: a set of effects, () for clean, ("unknown",) for an effect out of vocabulary."""
     if not effects:
         return "nothing is missing"
     return "something without a name" if tuple(effects) == ("unknown",) else join_names(map(effect_in_words, effects))
 
 
 def join_names(names: Sequence[str] | map[str]) -> str:
-    """Join names: A, B and C."""
+    """Join names as in "A, B and C"."""
     *others, last = names
     return f"{', '.join(others)} and {last}" if others else last

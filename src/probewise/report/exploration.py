@@ -82,7 +82,7 @@ def frame(
     levels: tuple[float, float],
     truth_mm: FloatArray | None = None,
 ) -> bytes:
-    """Draw the picture of one step, with its legend, as a PNG."""
+    """Draw the robot's view after one step, with its legend, as a PNG; parameters as in `view`."""
     ax = view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
     explain_field(ax)
     return png(ax, dpi=90, tight=False)
@@ -121,7 +121,7 @@ def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust
 
 
 def _fault_probabilities(steps: Sequence[Step], trust: float) -> Section:
-    """Show the probabilities of the sensor's possible faults after each reading."""
+    """Build the section on possible faults of the sensor: their probabilities after each reading."""
     doubted = left_out_of(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
     changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
@@ -144,7 +144,7 @@ def _fault_probabilities(steps: Sequence[Step], trust: float) -> Section:
 
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
-    """Say how far from the truth the estimates are, each beside its posterior sd."""
+    """Write each estimate minus its truth, with the posterior sd."""
     step = run.last
     return ", ".join(
         f"{without_unit(_own_name(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
@@ -190,7 +190,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
 
 
 def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
-    """Build the table of steps: where, what (in the unit of readings), what was then known."""
+    """Build the table of steps: place, reading (in `unit`), then the widest posterior sd and the information so far."""
     reading = f"reading ({unit_name(unit)})" if unit else "reading"
     return table(
         ("number", "at (mm)", reading, "widest sd (mm)", "information so far (bits)"),
@@ -230,7 +230,7 @@ def write_page(
     truth
         Parameters of the true shape by name, where known.
     beside
-        What other sensor models made of the same readings, step by step, by name of the model.
+        Steps of other sensor models from the same readings, by name of the model.
     unit
         Of readings.
     """

@@ -98,7 +98,7 @@ def _undecided(diagnosis: Diagnosis) -> list[str]:
 
 
 def _join_alternatives(rivals: Sequence[tuple[str, ...]]) -> str:
-    """Join hypotheses by the effects in which they differ."""
+    """Join hypotheses as in "A, B or C", without the effects that they share."""
     shared = frozenset.intersection(*map(frozenset, rivals))
     *others, last = (hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals)
     return f"{', '.join(others)} or {last}" if others else last

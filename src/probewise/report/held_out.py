@@ -1,4 +1,4 @@
-"""The held-out part of a recording on which a repair gains most, row by row."""
+"""The held-out part of a recording on which a repair gains most."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
 
 
 def _least_width(png: bytes) -> str:
-    """Return the least width at which a PNG's type is legible: nine tenths of the width it was drawn for."""
+    """Return the CSS width below which a PNG's text is too small to read: nine tenths of the width it was drawn for."""
     with Image.open(io.BytesIO(png)) as picture:
         dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
         return f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
@@ -97,7 +97,7 @@ def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
     slides
         Picture and one line of text each, in order.
     caption
-        What all of them show.
+        Caption of all pictures together.
     """
     *earlier, last = (element("div", figure(image, text), class_="slide") for image, text in slides)
     hidden = (Markup(slide.replace("<div", "<div hidden", 1)) for slide in earlier)

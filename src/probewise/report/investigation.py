@@ -25,14 +25,14 @@ def probabilities_png(found: Investigation) -> bytes:
 
 
 def probabilities_figure(found: Investigation) -> Markup:
-    """Show the probability of each explanation after each round."""
+    """Build the figure of the probability of each explanation after each round."""
     return figure(
         probabilities_png(found), "Probability of each explanation after each round, given all readings so far."
     )
 
 
 def answer(found: Investigation) -> str:
-    """Return the verdict and the number of readings it took."""
+    """Return the verdict in words, and how many readings beyond the first plan it took."""
     extra = found.extra_readings
     taken = f"{count(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
     came = "settled it" if found.last.settled else "did not settle it"

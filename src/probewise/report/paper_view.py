@@ -46,7 +46,7 @@ def paper_view(
     title: str = "",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the entropy map after a reading as the paper does: cells of uniform entropy, or bright edges.
+    """Draw the entropy map after a reading, with the circles, as the paper does.
 
     Parameters
     ----------
@@ -88,14 +88,14 @@ def paper_view(
 
 
 def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:
-    """Return the limits of a window that holds all readings and all circles sampled after the first few readings.
+    """Return the limits of a window that holds all readings and each run's circles sampled after reading `first`.
 
     Parameters
     ----------
     runs
         Over the same field.
     first
-        Number of the first reading that is shown.
+        Number of the first reading shown, from 1.
 
     Returns
     -------

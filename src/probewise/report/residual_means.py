@@ -19,11 +19,11 @@ _NEVER_LESS = 0.05  # of the variance of a mean: the least width of the band, ho
 
 @dataclass(frozen=True, eq=False)
 class Means:
-    """Mean residuals per bin, all arrays (n_steps,).
+    """Mean residuals per bin; all arrays have shape (n_bins,).
 
-    `at` is the covariate's mean, or 0, 1, 2 ... for a categorical covariate; `before` and `after` are the mean
-    residuals of the calibrated and of the repaired model (`after` None: nothing was repaired); `chance` is
-    half the width of the 95 % band; `size` is the number of readings.
+    `at` is the covariate's mean in the bin, or 0, 1, 2 ... for a categorical covariate. `before` and `after` are the
+    mean residuals of the calibrated and of the repaired model (`after` None: nothing was repaired). `chance` is half
+    the width of the 95 % band of chance, `size` the number of readings.
     """
 
     at: FloatArray
@@ -34,7 +34,7 @@ class Means:
 
     @property
     def largest_in_sds(self) -> float:
-        """Largest mean of the calibrated model's residuals, in sds."""
+        """Largest absolute mean of the calibrated model's residuals, in sds of that mean by chance."""
         return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
 
 
@@ -147,7 +147,7 @@ def _longest_lag(rho: float) -> int:
 
 
 def running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average groups of neighbours in x, each about one twentieth of the points."""
+    """Return the means of x and y in groups of neighbours in x: at most 20 groups, of four points or more."""
     ok = np.isfinite(x) & np.isfinite(y)
     x, y = x[ok], y[ok]
     if x.size == 0:

@@ -1,4 +1,4 @@
-"""One robot's search beside the truth that only the simulated world knows."""
+"""One robot's search, with the true shape that only the simulated world knows."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from probewise.experiment import Exploration
 
 @dataclass(frozen=True, eq=False)
 class RobotSearch:
-    """One robot's search: the name of its sensor model, its run, and the true shape."""
+    """One robot's search: its sensor model's name, its run, the true shape, and the readings over black and white.
+
+    `truth` holds the shape's parameters by name, `truth_mm` its outline, (n_vertices, 2).
+    """
 
     model: str
     run: Exploration

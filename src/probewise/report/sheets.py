@@ -1,4 +1,4 @@
-"""Sheets to print and lay under the arm: their content, and how large ones are split into pages."""
+"""Sheets to print and lay under the arm: their content, and the pages into which large ones are split."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Sheet:
     crosses_mm
         Crosses to bring the sensor or a joint to, (n, 2).
     cross_names
-        What stands beside each cross; empty: its number and place.
+        Text beside each cross; empty: its number and place.
     strokes_mm
         Further lines, (n, 2) each.
     words
@@ -62,7 +62,7 @@ class Sheet:
     frame
         Origin of x and y, in words.
     orientations_rad
-        Orientations of the sensor over it.
+        Orientations of the sensor over the sheet.
     """
 
     name: str
@@ -285,7 +285,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
 
 
 def _beam(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
-    """Outline a beam with round ends between the centres of its outer holes, (n, 2), closed."""
+    """Return the closed outline, (n, 2), of a beam with round ends, given the centres of its outer holes."""
     turn = math.atan2(*(end_mm - start_mm)[::-1].tolist())
     half = np.linspace(math.pi / 2, 3 * math.pi / 2, 37)
     ends = [
@@ -296,7 +296,7 @@ def _beam(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
 
 
 def _sheet_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Corners of a sheet that shows these points, (n, 2)."""
+    """Return the lower left and upper right corner of a sheet that shows points, (n, 2), with a margin."""
     low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
     return _two_floats(low), _two_floats(high)

@@ -32,7 +32,7 @@ _INTERVALS = (
 
 
 def answer(study: Study) -> str:
-    """Summarise in one sentence how many readings the first row needs."""
+    """Summarise in one sentence how many readings the study's first row needs."""
     row, found = next(iter(study.table().items()))
     share = "All" if found.reached.value == 1 else f"{number(100 * found.reached.value, 1)} % of the"
     return (
@@ -69,10 +69,9 @@ def table_of_rows(study: Study) -> Markup:
 
 
 def table_of_bounds(study: Study) -> Markup | None:
-    """Build the table of a lower bound on the mean number of readings of any strategy, with the measured mean.
+    """Build the table of a lower bound, for any strategy, on the mean number of readings, beside the measured mean.
 
-    None where the study has no row to which the bound applies: a robot with the correct sensor model, otherwise
-    default.
+    None if the study has no row to which the bound applies: default options and the correct sensor model.
     """
     lines = []
     for row, found in study.table().items():

@@ -38,7 +38,7 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 def explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
-    """Explain the terms that some HTML uses and that are not yet in `known`, and add them to it."""
+    """Explain the terms that a text of HTML uses and that are not in `known`; add them to `known`."""
     text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
     new: list[str] = []
     while text:  # an explanation may use a term itself

@@ -28,7 +28,7 @@ def with_error(value: float, error: float, unit: str = "") -> str:
 
 
 def interval(low: float, high: float) -> str:
-    """Write the ends of an interval to the third significant digit of its width."""
+    """Write the ends of an interval, both to the third significant digit of its width."""
     width = high - low
     if not (math.isfinite(width) and width > 0):
         return "–" if not math.isfinite(low) else f"{low:.6g}"
@@ -37,7 +37,7 @@ def interval(low: float, high: float) -> str:
 
 
 def value_and_interval(value: float, low: float, high: float) -> tuple[str, str]:
-    """Write a value and its interval to the same decimals: the third significant digit of the interval's width."""
+    """Write a value and its interval with the same decimals: to the third significant digit of the interval's width."""
     ends = interval(low, high)
     decimals = len(ends.partition(" ")[0].partition(".")[2])
     return (signed(value, decimals) if high > low else f"{value:.6g}"), ends
@@ -61,7 +61,7 @@ def signed(value: float, digits: int) -> str:
 
 
 def typeset(text: str) -> str:
-    """Typeset the numbers of a text: 2 × 10⁻⁷ for 2e-07, a true minus sign, "p = 0.2" on one line."""
+    """Typeset the numbers in a text: 2 × 10⁻⁷ for 2e-07, true minus signs, no line break within "p = 0.2"."""
 
     def power(found: re.Match[str]) -> str:
         return f"{found[1]}\u00a0×\u00a010{str(int(found[2])).translate(_RAISED)}"
@@ -81,7 +81,7 @@ def unit_name(unit: str) -> str:
 
 
 def probability(p: float) -> str:
-    """Write a probability, as a bound rather than rounded to 0 or 1."""
+    """Write a probability with three decimals; as a bound, "< 0.001" or "> 0.999", near 0 and 1."""
     if p < 0.001:
         return "< 0.001"
     return "> 0.999" if p > 0.999 else f"{p:.3f}"

@@ -136,7 +136,7 @@ def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | 
 def _draw_dimension(
     ax: Axes, begin: FloatArray, end: FloatArray, away: FloatArray, text: str, *, side: str = "above"
 ) -> None:
-    """Draw a dimension line with its arrow and text, offset from the part."""
+    """Draw a dimension line with arrows and text, parallel to a part and away from it."""
     a, b = begin + away, end + away
     for here, there in ((begin, a), (end, b)):
         ax.plot([here[0], there[0]], [here[1], there[1]], color=GREY, linewidth=0.6, zorder=1)
@@ -165,7 +165,7 @@ def _draw_dimension(
 def draw_sensor_face(
     ax: Axes, *, center: tuple[float, float] = (0.0, 0.0), size: float, turned_rad: float = 0.0, zorder: float = 3.0
 ) -> None:
-    """Draw a sensor's package, its photodiode (white), its LED (red) and the ridge between, turned anticlockwise.
+    """Draw the sensor seen from below: package, photodiode (white), LED (red) and the ridge between them.
 
     Parameters
     ----------

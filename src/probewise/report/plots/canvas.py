@@ -168,7 +168,7 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
 
 
 def _legend_width(labels: Sequence[str], n_columns: int) -> int:
-    """Estimate a legend's width in letters; its first columns hold one label more, a line sample counts as five."""
+    """Estimate a legend's width in letters: matplotlib fills its first columns first; a line sample counts as five."""
     return sum(max(map(len, column)) + 6 for column in np.array_split(np.array(labels, dtype=np.object_), n_columns))
 
 
@@ -215,7 +215,7 @@ def legend_below(axes: Axes | AxesGrid, *, n_columns: int = 4, ground: str = "no
 
 
 def label_axes(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:
-    """Label axes, and drop the upper and right spines."""
+    """Label both axes, set the title, and hide the upper and right spines; return the axes."""
     ax.set_xlabel(x)
     ax.set_ylabel(y)
     if title:

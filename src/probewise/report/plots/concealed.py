@@ -1,4 +1,4 @@
-"""The robot with a concealed fault: with doubt in its sensor beside trust, row by row."""
+"""A study of the robot with concealed faults: with doubt in its sensor beside trust, row by row."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def row_name(row: ConcealedRow) -> str:
 
 
 def doubt_beside_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None = None) -> AxesGrid:
-    """Draw what doubt changes: runs that are sure and wrong, intervals that hold, and readings.
+    """Compare doubt with trust: runs that are sure and wrong, intervals that cover the truth, and readings.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A simulator's predictions against what was recorded."""
+"""Recorded readings against a simulator's predictions."""
 
 from __future__ import annotations
 

@@ -202,7 +202,7 @@ def corner_plot(
 
 
 def _corner_axes(n: int, side_in: float) -> AxesGrid:
-    """Lay out square axes on and below the diagonal and, for the legend, at the upper right: (n, n), None elsewhere."""
+    """Open square axes on and below the diagonal, and at the upper right for the legend: (n, n), None elsewhere."""
     width, height = _LEFT_IN + n * side_in + _RIGHT_IN, _BOTTOM_IN + n * side_in + _TOP_IN
     sheet = new_figure((width, height))
     cells = np.full((n, n), None, dtype=np.object_)
@@ -356,9 +356,10 @@ def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
 def _smoothed_density(
     values: FloatArray, weight: FloatArray, span: tuple[float, float], n_eff: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Smooth the density at the middles of 80 bins, reflected at the ends, where the prior may be cut off.
+    """Return the middles of 80 bins and the smoothed density of weighted values there, (80,) each.
 
-    The kernel has three quarters of Silverman's width, since posteriors may have several modes.
+    The kernel has three quarters of Silverman's width, since posteriors may have several modes. It is reflected at the
+    ends, where the prior may cut the density off.
     """
     density, edges = np.histogram(values, bins=80, range=span, weights=weight)
     centres = (edges[:-1] + edges[1:]) / 2

@@ -1,4 +1,4 @@
-"""How a recording was taken: sensor orientations over the boundary, and the quadrants (paper, figures 3 and 4)."""
+"""The patterns of a recording: sensor orientations over the boundary, and the quadrants (paper, figures 3 and 4)."""
 
 from __future__ import annotations
 

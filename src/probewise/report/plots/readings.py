@@ -23,8 +23,8 @@ MAX_NAMED = 8  # tracks in the legend; with more there is none
 class Track:
     """Rows of a plan along one line over one pattern, which a curve may join.
 
-    `along_mm`, shape (n_rows,): signed distance from a half-plane's edge, or else position along the scan from its
-    middle.
+    `along_mm`, (n_rows,), is the signed distance from a half-plane's edge; over another pattern, the position along the
+    scan from its middle.
     """
 
     label: str

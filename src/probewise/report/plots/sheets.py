@@ -213,7 +213,7 @@ def _ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
 
 
 def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any, *, named: bool = True) -> None:
-    """Paint the part of the sheet between two corners; `place` maps points, (n, 2), from sheet to page."""
+    """Paint the part of the sheet between two corners; `place` maps points, (n, 2), from the sheet to the page."""
     for corners, albedo in _painted_outlines(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))
         patch = ax.add_patch(Outline(place(corners), closed=True, fc=ink, ec="none", lw=0, zorder=1))
@@ -245,7 +245,7 @@ def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: 
 
 
 def _painted_outlines(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:
-    """Return outlines (n, 2) with the albedo inside, in the order of painting."""
+    """Return outlines (n, 2), each with the albedo inside, in the order of painting; none if the pattern has none."""
     (x0, y0), (x1, y1) = low_mm, high_mm
     whole = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     match pattern:
@@ -274,7 +274,7 @@ def _painted_outlines(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple
 
 
 def _clipped(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> FloatArray:
-    """Clip a convex outline, (n, 2), to the half-plane beyond a line."""
+    """Clip a convex outline, (n, 2), to the half-plane x cos(normal) + y sin(normal) >= offset."""
     if not len(corners_mm):
         return corners_mm
     away = corners_mm @ [np.cos(normal_rad), np.sin(normal_rad)] - offset_mm

@@ -29,7 +29,7 @@ _BAND = (0.16, 0.84)
 def widths_of_runs(
     runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw the widest posterior sd by reading: median and middle 68 % of the runs, one panel per row.
+    """Draw the widest posterior sd after each reading: median and middle 68 % of the runs, one panel per row.
 
     Thin lines are the medians of the other panels. A run that has ended keeps its last width.
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.advice.aliases import Alias, surviving_cosine
+from probewise.diagnosis.advice.aliases import Alias, projected_cosine
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import (
     LEAST_VISIBLE,
@@ -278,7 +278,7 @@ def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
         unit = columns / np.linalg.norm(columns, axis=0)
         left = unit - slopes @ np.linalg.lstsq(slopes, unit)[0]
         wanted.append(np.linalg.norm(left) / np.linalg.norm(unit))
-    np.testing.assert_allclose(Bank.of(templates, ["a", "b", "c"], n).surviving(problem), wanted, atol=1e-7)
+    np.testing.assert_allclose(Bank.of(templates, ["a", "b", "c"], n).unabsorbed_shares(problem), wanted, atol=1e-7)
 
 
 def test_null_draws_have_nothing_in_the_span_of_the_fit():
@@ -297,8 +297,8 @@ def test_templates_in_one_direction_have_cosine_one_and_absorbed_ones_none():
     problem = Linearised(basis, np.zeros(52), white(50), 1.0, 50)
     first = rng.normal(size=(50, 1))
     second = 3 * first + slopes @ np.array([[1e-5], [2e-5]])
-    assert surviving_cosine(problem, first, second) == pytest.approx(1.0, abs=1e-6)
-    assert surviving_cosine(problem, first, slopes[:, :1]) == 0.0
+    assert projected_cosine(problem, first, second) == pytest.approx(1.0, abs=1e-6)
+    assert projected_cosine(problem, first, slopes[:, :1]) == 0.0
 
 
 def test_windows_never_part_equal_values():

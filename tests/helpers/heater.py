@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise.systems import FittedSystem, Noise, RunTable, Simulator, System
 from probewise.systems.forms import About, forms_of
-from probewise.systems.forms.again import recorded
+from probewise.systems.forms.rebinding import recorded
 
 FILE = """\
 import numpy as np

@@ -101,7 +101,7 @@ def test_what_a_tank_spills_into_the_next_one_is_there():
 
 def test_time_that_falls_within_a_run_is_refused_with_the_row():
     with pytest.raises(ParameterError, match=r"row 4.*allowed: a time that does not fall"):
-        _ = RowsInRuns(_table([0.0, 1.0, 0.5])).rows
+        _ = RowsInRuns(_table([0.0, 1.0, 0.5])).row_at_place
 
 
 @pytest.mark.slow
@@ -115,7 +115,7 @@ def test_the_step_is_halved_until_readings_stand_still():
     )
     table = _table(np.linspace(0, 10, 30))
     system = System.of(simulator, table)
-    still = system.standing_still(table, system.theta(system.starts[:1]), tolerance=1e-5)
+    still = system.with_converged_step(table, system.theta(system.starts[:1]), tolerance=1e-5)
     finer = System(simulator, system.runs, still.max_step / 16)
     theta = system.theta(system.starts[:1])
     far = np.abs(still.chain(table, ()).predict(theta, table) - finer.chain(table, ()).predict(theta, table))

@@ -69,8 +69,11 @@ class Apparatus(Protocol):
         """Return the names of the user's own effects, which are always tried."""
         ...
 
-    def refits_are_over(self, share: float = 1.0) -> bool:
-        """Return whether the budget of costly predictions is spent, so that no further combination is refitted."""
+    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
+        """Return whether this share of the budget of costly predictions is spent.
+
+        With all of it spent, no further combination is refitted.
+        """
         ...
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
@@ -110,10 +113,10 @@ class Apparatus(Protocol):
         """Return the possible next measurements; `level` (n_points,) are the expected readings of the plan."""
         ...
 
-    def one_after_another(self, commands: Sequence[Any], after: Plan) -> Plan:
-        """Concatenate commands, each timed as if directly after a plan, to predict all of them at once."""
+    def each_directly_after(self, commands: Sequence[Any], after: Plan) -> Plan:
+        """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
         ...
 
-    def in_turn(self, commands: Sequence[Any], after: Plan) -> Plan:
-        """Concatenate commands as they would be carried out after a plan."""
+    def in_sequence(self, commands: Sequence[Any], after: Plan) -> Plan:
+        """Concatenate commands into one plan, timed to be carried out in sequence after a plan."""
         ...

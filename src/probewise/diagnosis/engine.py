@@ -1,7 +1,7 @@
 """The pipeline of a diagnosis, from recordings to a `Diagnosis`.
 
-prepared -> searched -> tested -> judged -> repaired -> located -> advised -> said. Each step takes the values of the
-steps before it and returns a new one.
+prepared -> searched -> tested -> judged -> repaired -> located -> advised -> reported. Each step takes the values of
+the steps before it and returns a new one.
 """
 
 from __future__ import annotations

@@ -23,9 +23,9 @@ class PriorOdds:
     the effects of `UNNAMED`; the rest has no formula. Noise: `white`, and the rest divided among noise models by size,
     then equally. `complexity_penalty` (nats) is the prior penalty of an effect per Gaussian of the SSF that it makes
     superfluous, since physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is the same for an unknown
-    effect, which can imitate any shape. `twice` is the probability that one of the effects `twofold`, which may occur
-    twice, does if it occurs: who finds one cycle left out expects another one sooner than any other second effect. With
-    None it does as often as any other effect occurs beside it.
+    effect, which can imitate any shape. `twofold` are the effects that may occur twice;
+    `twice` is the probability that one of them does, given that it occurs. A second cycle beside a first is more
+    plausible than any other second effect. None: a second copy has the prior of any other second effect.
     """
 
     n_named: int = 24

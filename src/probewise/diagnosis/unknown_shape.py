@@ -70,17 +70,17 @@ class SensorAndShape:
 
     @property
     def n_gaussians(self) -> int:
-        """As for the sensor."""
+        """Number of Gaussians of the sensor's SSF."""
         return self.sensor.n_gaussians
 
     @property
     def degrees_of_freedom(self) -> int:
-        """As for the sensor."""
+        """Effective degrees of freedom of the sensor's SSF, counted in Gaussians."""
         return self.sensor.degrees_of_freedom
 
     @property
     def form(self) -> str:
-        """As for the sensor."""
+        """Description of the sensor's SSF."""
         return self.sensor.form
 
     @property
@@ -100,7 +100,7 @@ class SensorAndShape:
 
     @property
     def nuisance(self) -> tuple[str, ...]:
-        """The shape's parameters."""
+        """Names of the shape's parameters, which apply to this recording only."""
         return self.shape.prior.names
 
     @property

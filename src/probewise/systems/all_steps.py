@@ -18,10 +18,19 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.systems.motion import Given, Motion, RowsInRuns, gaps_of, integrate_states, path, starts_of, stepped
+from probewise.systems.motion import (
+    Given,
+    Motion,
+    RowsInRuns,
+    gaps_of,
+    integrate_states,
+    starts_of,
+    states_by_step,
+    stepped,
+)
 from probewise.systems.table import RunTable
 
-__all__ = ["Known", "Problem", "Solved", "Steps", "Trajectories", "integrate_near", "solve", "steps_of"]
+__all__ = ["KnownTrajectory", "Problem", "SolvedSteps", "Steps", "Trajectories", "integrate_near", "solve", "steps_of"]
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
 _NEWTONS = 8  # iterations with a sample's own Jacobian
@@ -55,7 +64,7 @@ class Steps:
 
     @cached_property
     def gap(self) -> IntArray:
-        """Position of the runs from which each step goes on, (n_steps,)."""
+        """Position in the runs of the row before each step, (n_steps,)."""
         return np.repeat(np.arange(len(self.in_gap)), self.in_gap)
 
     @cached_property
@@ -66,17 +75,17 @@ class Steps:
     @property
     def n_runs(self) -> int:
         """Number of runs."""
-        return int(self.places.rows.shape[1])
+        return int(self.places.row_at_place.shape[1])
 
     @cached_property
     def begin(self) -> FloatArray:
-        """Share of that time at which each step begins."""
+        """Share of the gap between two rows at which each step begins."""
         share = (np.arange(len(self.gap)) - self.number[self.gap]) / self.in_gap[self.gap]
         return np.repeat(share, self.n_runs)
 
     @cached_property
     def length(self) -> FloatArray:
-        """Share of that time that each step takes."""
+        """Share of the gap between two rows that each step takes."""
         return np.repeat(1.0 / self.in_gap[self.gap], self.n_runs)
 
     def at_rows(self, states: FloatArray) -> FloatArray:
@@ -92,7 +101,7 @@ def steps_of(table: RunTable, max_step: float) -> Steps:
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class KnownTrajectory:
     """A trajectory: its parameters, states (n_states, n_steps + 1, n_runs), and its Jacobian once it was needed."""
 
     theta: FloatArray
@@ -102,12 +111,14 @@ class Known:
 
 @dataclass(eq=False)
 class Trajectories:
-    """Memory of trajectories, by steps and by effects; `useless` for a law that cannot take all steps at once."""
+    """Cache of trajectories, by steps and by effects; `useless` for a law that cannot evaluate all steps at once."""
 
-    known: dict[tuple[Hashable, Hashable], list[Known]] = field(default_factory=dict)
+    known: dict[tuple[Hashable, Hashable], list[KnownTrajectory]] = field(default_factory=dict)
     useless: bool = False
 
-    def near(self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int) -> tuple[list[Known], IntArray]:
+    def near(
+        self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
+    ) -> tuple[list[KnownTrajectory], IntArray]:
         """Return known trajectories of the same steps, and for each sample, theta (n_samples, n_params), the nearest.
 
         Those of other effects are compared by the first `n_own` parameters, if there is none of the same.
@@ -122,8 +133,8 @@ class Trajectories:
         apart = (theta[:, None, :width] - there) / np.maximum(np.abs(there).max(axis=0), 1e-300)
         return own, np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
 
-    def keep(self, steps: Hashable, effects: Hashable, more: Sequence[Known]) -> None:
-        """Remember more trajectories, and forget the oldest."""
+    def keep(self, steps: Hashable, effects: Hashable, more: Sequence[KnownTrajectory]) -> None:
+        """Add trajectories to the cache, and drop those used least recently."""
         if not more:
             return
         own = self.known.pop((steps, effects), [])  # those used last come last
@@ -139,8 +150,8 @@ class Trajectories:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
-    """States (n_states, n_samples, n_steps + 1, n_runs), which samples converged, and what was learnt by the way.
+class SolvedSteps:
+    """States (n_states, n_samples, n_steps + 1, n_runs), which samples converged, and figures of the iteration.
 
     `bands` are Jacobians of some samples by their number; `moved` (n_samples,) is the change from the trajectory that a
     sample began from, in the largest state; `n_evaluated` is the number of steps evaluated, of all samples and runs.
@@ -152,11 +163,11 @@ class Solved:
     moved: FloatArray
     n_evaluated: int
 
-    def known(self, theta: FloatArray) -> list[Known]:
-        """Return the trajectories that are worth remembering."""
+    def known(self, theta: FloatArray) -> list[KnownTrajectory]:
+        """Return the converged trajectories that are far enough from the known ones to be cached."""
         worth = np.flatnonzero(self.done & (self.moved > _FAR))[:_MOST_NEW]
         return [
-            Known(theta[k].copy(), self.states[:, k].copy(), [self.bands[k]] if k in self.bands else [])
+            KnownTrajectory(theta[k].copy(), self.states[:, k].copy(), [self.bands[k]] if k in self.bands else [])
             for k in worth.tolist()
         ]
 
@@ -198,7 +209,7 @@ def integrate_near(
             memory.useless = True
     if left.size:
         motion, parameters, columns = problem(left)
-        every = path(motion, steps.places, parameters, columns, steps.in_gap)
+        every = states_by_step(motion, steps.places, parameters, columns, steps.in_gap)
         there = np.stack([[*s.values()] for s in every], axis=2)
         if states is None:
             states = there
@@ -207,13 +218,15 @@ def integrate_near(
         cost += n_steps
         finite = np.isfinite(there).all(axis=(0, 2, 3))
         memory.keep(
-            steps, effects, [Known(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()]
+            steps,
+            effects,
+            [KnownTrajectory(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()],
         )
     assert states is not None
     return dict(zip(problem(np.arange(1))[0].law.states, steps.at_rows(states), strict=True)), cost
 
 
-def solve(problem: Problem, steps: Steps, known: Sequence[Known], nearest: IntArray) -> Solved:
+def solve(problem: Problem, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray) -> SolvedSteps:
     """Solve for the states at the end of every step, each sample from the known trajectory nearest to it.
 
     Parameters
@@ -226,7 +239,7 @@ def solve(problem: Problem, steps: Steps, known: Sequence[Known], nearest: IntAr
         Trajectories, and for each sample the number of the one to begin from, (n_samples,).
     """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
-    search = _Search(problem, steps, guess.copy())
+    search = _NewtonState(problem, steps, guess.copy())
     _share_jacobians(search, known, nearest)
     # A chord that led away is no better a start than the trajectory that it began from.
     astray = search.active & ~(search.rate < 1)
@@ -234,10 +247,10 @@ def solve(problem: Problem, steps: Steps, known: Sequence[Known], nearest: IntAr
     search.change[~search.done] = np.inf
     bands = _own_jacobians(search)
     moved = _largest_change(search.states - guess, guess)
-    return Solved(search.states, search.done, bands, moved, search.n_evaluated)
+    return SolvedSteps(search.states, search.done, bands, moved, search.n_evaluated)
 
 
-def _share_jacobians(search: _Search, known: Sequence[Known], nearest: IntArray) -> None:
+def _share_jacobians(search: _NewtonState, known: Sequence[KnownTrajectory], nearest: IntArray) -> None:
     """Take chord iterations, each with the Jacobian of the known trajectory nearest to a sample."""
     for _ in range(_CHORDS):
         active = search.active & ((search.rate < _SLOW) | ~np.isfinite(search.change))
@@ -258,7 +271,7 @@ def _share_jacobians(search: _Search, known: Sequence[Known], nearest: IntArray)
             search.possible &= ~far
 
 
-def _own_jacobians(search: _Search) -> dict[int, FloatArray]:
+def _own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
     """Take Newton iterations of the samples that have not converged; return the last Jacobian of each."""
     last: dict[int, FloatArray] = {}
     for k in range(_NEWTONS):
@@ -275,8 +288,8 @@ def _own_jacobians(search: _Search) -> dict[int, FloatArray]:
 
 
 @dataclass(eq=False)
-class _Search:
-    """The states of all samples on the way to their trajectories, and how far each has come."""
+class _NewtonState:
+    """The state of the Newton iteration: the states of all samples, and the convergence of each."""
 
     problem: Problem
     steps: Steps

@@ -184,7 +184,7 @@ class CountedCalls:
     Parameters
     ----------
     progress
-        Told.
+        The progress function that it calls.
     caller
         The caller whose calls are counted from now on.
     """

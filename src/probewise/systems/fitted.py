@@ -23,7 +23,7 @@ from probewise.errors import FileError, ParameterError, ProbewiseError
 from probewise.recordings import strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
-from probewise.systems.forms.again import Recorded
+from probewise.systems.forms.rebinding import Recorded
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from probewise.errors import ParameterError
 from probewise.systems.table import RunTable
 
-__all__ = ["behind", "join_tables", "unused_name"]
+__all__ = ["append_tables", "join_tables", "unused_name"]
 
 _FILE = "file"
 
@@ -62,8 +62,8 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
     return replace(first, columns=columns, run=run), tuple(notes)
 
 
-def behind(table: RunTable, more: Sequence[RunTable]) -> RunTable:
-    """Append tables with the same columns; names of runs are unchanged."""
+def append_tables(table: RunTable, more: Sequence[RunTable]) -> RunTable:
+    """Append the rows of tables with the same columns to a table; names of runs are unchanged."""
     columns = {name: np.concatenate([t.columns[name] for t in (table, *more)]) for name in table.columns}
     return replace(table, columns=columns, like={key: value for t in (table, *more) for key, value in t.like.items()})
 

@@ -25,8 +25,8 @@ __all__ = [
     "integrate",
     "integrate_states",
     "observed",
-    "path",
     "starts_of",
+    "states_by_step",
     "stepped",
 ]
 
@@ -38,7 +38,7 @@ Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 class Limit:
     """A bound of a state: `level` (n_samples, 1), an upper bound if `upper`, else a lower bound.
 
-    What it stops goes nowhere, but for the shares `spilt` (n_samples, 1), by state, that other states take up.
+    The rate beyond the bound is lost, except for the shares `spilt` (n_samples, 1) that other states, by name, take up.
     """
 
     state: str
@@ -135,7 +135,7 @@ class RowsInRuns:
     table: RunTable
 
     @cached_property
-    def rows(self) -> IntArray:
+    def row_at_place(self) -> IntArray:
         """Row of the table at each position of each run, (n_places, n_runs)."""
         table, by_run = self.table, self.table.rows_by_scan()
         for name, rows in zip(table.scan_names, by_run, strict=True):
@@ -150,7 +150,7 @@ class RowsInRuns:
     @cached_property
     def gaps(self) -> FloatArray:
         """Time from each position to the next, (n_places - 1, n_runs)."""
-        return np.diff(self.table.time_s[self.rows], axis=0)
+        return np.diff(self.table.time_s[self.row_at_place], axis=0)
 
     @cached_property
     def place(self) -> tuple[IntArray, IntArray]:
@@ -219,26 +219,29 @@ def integrate_states(
     at_row = np.concatenate([[0], np.cumsum(in_gap)])
     kept: dict[str, FloatArray] = {}
     k = 0
-    for number, s in enumerate(path(motion, places, parameters, columns, in_gap)):
+    for number, s in enumerate(states_by_step(motion, places, parameters, columns, in_gap)):
         if number != at_row[k]:
             continue
         for state, values in s.items():
             if k == 0:
-                kept[state] = np.empty((len(values), *places.rows.shape))
+                kept[state] = np.empty((len(values), *places.row_at_place.shape))
             kept[state][:, k] = values
         k += 1
     place, run = places.place
     return {state: values[:, place, run] for state, values in kept.items()}
 
 
-def path(
+def states_by_step(
     motion: Motion,
     places: RowsInRuns,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
     in_gap: IntArray,
 ) -> Iterator[dict[str, FloatArray]]:
-    """Yield the states (n_samples, n_runs) at the start and after every step, `in_gap` (n_places - 1,) in each gap."""
+    """Integrate the motion: yield all states by name, (n_samples, n_runs) each, at the start and after every step.
+
+    `in_gap`, (n_places - 1,), is the number of steps between one position and the next.
+    """
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
     start = starts_of(motion.law, places, parameters, n_samples)
     gaps = gaps_of(places, columns)
@@ -254,11 +257,11 @@ def path(
 
 
 def gaps_of(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
-    """Return the time that passes from each position to the next, (1 or n_samples, n_places - 1, n_runs).
+    """Return the time from each position to the next by the time column, (1 or n_samples, n_places - 1, n_runs).
 
-    A clock that runs fast or slow changes the time column, and with it this.
+    An effect on the clock changes the time column, and so these gaps.
     """
-    return np.asarray(np.diff(_at(columns[str(places.table.time)], places.rows), axis=1))
+    return np.asarray(np.diff(_at(columns[str(places.table.time)], places.row_at_place), axis=1))
 
 
 def starts_of(
@@ -267,7 +270,7 @@ def starts_of(
     """Return the states in which runs start, (n_samples, n_runs) each."""
     start = {}
     for state, given in law.states.items():
-        first = places.rows[:1]
+        first = places.row_at_place[:1]
         at = _at(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
         start[state] = np.array(np.broadcast_to(at, (n_samples, first.shape[1])))
     return start
@@ -340,7 +343,7 @@ class Given:
         start: Mapping[str, FloatArray],
     ) -> Given:
         """Arrange parameters and columns, (n_points,) or (n_samples, n_points), for a law that begins at `start`."""
-        rows, law, time = places.rows, motion.law, places.table.time
+        rows, law, time = places.row_at_place, motion.law, places.table.time
         constant: dict[str, Any] = {}
         moving: dict[str, FloatArray] = {}
         for name, values in parameters.items():
@@ -382,7 +385,7 @@ class Given:
 
 
 class _Asked(dict[str, Any]):
-    """Columns that record which of them a law uses."""
+    """A mapping of columns that records which of them a law reads."""
 
     def __init__(self, columns: Mapping[str, Any]) -> None:
         super().__init__(columns)

@@ -22,12 +22,12 @@ from probewise.recordings.prediction import prediction_summary
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import AnyEffect, NoiseLevel, Stage
 from probewise.systems.fitted import FittedSystem, require_fitted_system
-from probewise.systems.forms.again import forms_again, own_of_runs
+from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, relative_sd_of
 
-__all__ = ["SystemPrediction", "as_recording", "of_another_run", "predict_system", "write_system_prediction"]
+__all__ = ["SystemPrediction", "as_recording", "draw_for_new_run", "predict_system", "write_system_prediction"]
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
@@ -201,7 +201,7 @@ def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any
                 f"a table with this column, which an effect of the model reads; it has {', '.join(table.columns)}",
             )
         new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
-        forms = forms_again(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
+        forms = rebind_forms(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
     out = []
     for name in fitted.effects:
         if name in forms:
@@ -255,15 +255,15 @@ def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
             # One stratified draw from the prior for each sample.
             out[:, k] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
         else:
-            effect = next(own for own in fitted.effects if own_of_runs(own) and name.startswith(f"{own}."))
+            effect = next(own for own in fitted.effects if has_value_per_run(own) and name.startswith(f"{own}."))
             known = fitted.samples[:, [j for own, j in at.items() if own.startswith(f"{effect}.")]]
             positive = effect == NoisePerRun.name  # positive parameters scatter in the logarithm
-            drawn = of_another_run(np.log(known) if positive else known, rng=rng)
+            drawn = draw_for_new_run(np.log(known) if positive else known, rng=rng)
             out[:, k] = np.exp(drawn) if positive else drawn
     return out, any(name not in at for name in chain.names)
 
 
-def of_another_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+def draw_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
     """Draw the value of a new run given those of other runs: (n_samples, n_runs) -> (n_samples,).
 
     Mean and variance of the runs are unknown; the prior of the variance is worth two more runs with the same scatter.

@@ -49,7 +49,7 @@ class System:
     tally
         Counts samples at which a law raises an error.
     trajectories
-        Trajectories of a law, from which others are found.
+        Cache of trajectories of the law, from which nearby ones are solved.
     """
 
     simulator: Simulator
@@ -234,7 +234,7 @@ class System:
         """Add effects; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
-    def standing_still(
+    def with_converged_step(
         self, table: RunTable, theta: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float
     ) -> System:
         """Halve the integration step until predictions change by less than a tolerance (rms).
@@ -268,7 +268,7 @@ class System:
             if moved <= tolerance:
                 return now
             now, coarse = finer, fine
-            if places.n_steps(now.max_step).sum() > _MOST_STEPS + len(places.rows):
+            if places.n_steps(now.max_step).sum() > _MOST_STEPS + len(places.row_at_place):
                 raise ParameterError(
                     "rates",
                     f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
@@ -299,7 +299,7 @@ class SystemChain:
         return self.read(self.look(theta, plan), theta, plan)
 
     def look(self, theta: FloatArray, plan: Any) -> FloatArray:
-        """Simulate, with the effects on inputs, parameters and rates: (n_samples, n_points)."""
+        """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
         system = self.system
         columns: Mapping[str, NDArray[Any]] = given_columns(system.simulator, plan)
         columns = self._applied(Stage.INPUT, columns, theta, plan)

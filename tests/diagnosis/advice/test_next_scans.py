@@ -14,7 +14,7 @@ from probewise.diagnosis.advice.next_scans import PredictiveNormal, Rival, mutua
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.light_sensor.commands import commands, excerpts
-from probewise.diagnosis.light_sensor.scheduling import in_turn, one_after_another, put_off
+from probewise.diagnosis.light_sensor.scheduling import each_directly_after, in_sequence, postponed
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
@@ -196,16 +196,16 @@ def test_a_scan_over_a_new_sheet_takes_longer():
     assert new.minutes == pytest.approx(again.minutes + 1.0)
     # In turn, or behind a plan: what the minutes say passes before the first reading.
     end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))
-    later = put_off(new, plan).plan
+    later = postponed(new, plan).plan
     assert later.time_s[-1] - end_s == pytest.approx(60.0 * new.minutes)
-    both = in_turn([again, new], plan)
+    both = in_sequence([again, new], plan)
     assert both.time_s[-1] - end_s == pytest.approx(60.0 * (again.minutes + new.minutes))
     assert both.time_s[-1] - both.time_s[len(again.plan)] == pytest.approx(lasts_s)
 
 
 def test_a_battery_is_expected_to_stay_as_it_was():
     plan = paper_plan()
-    everywhere, rows = one_after_another(commands(plan)[:3], plan), rows_of(commands(plan)[:3])
+    everywhere, rows = each_directly_after(commands(plan)[:3], plan), rows_of(commands(plan)[:3])
     assert [len(own) for own in rows] == [101, 101, 102]
     assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor())
@@ -213,6 +213,6 @@ def test_a_battery_is_expected_to_stay_as_it_was():
     assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
     after = replace(plan, covariates={"battery_mv": gone, "never_mv": np.full(len(plan), np.nan)})
-    everywhere = one_after_another(commands(plan)[:3], after)
+    everywhere = each_directly_after(commands(plan)[:3], after)
     assert set(everywhere.covariates) == {"battery_mv"}
     assert (everywhere.covariates["battery_mv"] == gone[-2]).all()

@@ -100,7 +100,7 @@ def test_laws_of_one_kind_are_taken_together():
 def test_no_pseudo_observation_is_farther_than_what_was_read():
     law = NoiseLaw(np.ones(5), np.zeros(5), np.zeros(5, dtype=np.bool_), flat=3.0, sigma=0.5)
     z = np.array([[0.0], [0.4], [1.4], [2.5], [-9.0]])
-    pseudo = law.pseudo(z, np.array([0.5]))
+    pseudo = law.pseudo_observations(z, np.array([0.5]))
     assert (np.abs(pseudo) <= np.abs(z)).all()
     np.testing.assert_array_equal(pseudo[3:], z[3:])
     drawn = law.draws(20_000, rng=np.random.default_rng(0))

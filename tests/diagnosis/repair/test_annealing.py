@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.diagnosis.repair.annealing import anneal, by_weight
+from probewise.diagnosis.repair.annealing import anneal, importance_resample
 
 
 def normal(center, factor, n, rng):
@@ -79,7 +79,7 @@ def test_weights_do_where_enough_of_them_count():
     for seed in range(20):
         rng = np.random.default_rng(seed)
         first, log_q = normal(np.zeros(3), np.eye(3), 5000, rng)
-        z = by_weight(first, log_q, counted, n_wanted=500, rng=rng)
+        z = importance_resample(first, log_q, counted, n_wanted=500, rng=rng)
         assert z.shape == (500, 3)
         means.append(z.mean(axis=0))
         spreads.append(z.var(axis=0))
@@ -92,5 +92,7 @@ def test_weights_do_where_enough_of_them_count():
 def test_weights_are_refused_where_too_few_count():
     rng = np.random.default_rng(1)
     first, log_q = normal(np.zeros(8), np.eye(8), 1000, rng)
-    assert by_weight(first, log_q, lambda z: -50 * np.sum((z - 1) ** 2, axis=1), n_wanted=500, rng=rng) is None
-    assert by_weight(first, log_q, lambda z: np.full(len(z), -np.inf), n_wanted=500, rng=rng) is None
+    assert (
+        importance_resample(first, log_q, lambda z: -50 * np.sum((z - 1) ** 2, axis=1), n_wanted=500, rng=rng) is None
+    )
+    assert importance_resample(first, log_q, lambda z: np.full(len(z), -np.inf), n_wanted=500, rng=rng) is None

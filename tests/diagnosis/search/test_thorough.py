@@ -133,7 +133,7 @@ def test_a_prior_that_holds_more_than_what_was_found_in_it_is_a_doubt(stepped, m
     assert all("holds more" in w.doubts[-1] for w in weighings)
     assert all(w.agree for w in weighings)
     assert found is stepped
-    assert "agrees within a nat, but it doubts itself" in with_agreement("A reason.", weighings)
+    assert "agrees to a nat and its own error, but it doubts itself" in with_agreement("A reason.", weighings)
 
 
 @pytest.mark.slow
@@ -202,7 +202,7 @@ def test_a_run_with_doubts_does_not_win(stepped, monkeypatch):
 def test_the_reason_says_whether_they_agree():
     near, far = Weighing(("lag",), 1, -10.0, -10.4, 0.1), Weighing((), 1, -12.0, -14.0, 0.1)
     assert with_agreement("A reason.", ()) == "A reason."
-    assert with_agreement("A reason.", (near,)) == "A reason; nested sampling agrees within a nat."
+    assert with_agreement("A reason.", (near,)) == "A reason; nested sampling agrees to a nat and its own error."
     assert "clean by −2.0 nats" in with_agreement("A reason.", (near, far))
 
 
@@ -235,6 +235,6 @@ def test_a_recording_is_weighed_alike_both_ways():
     assert "ambient_step" in {w.label for w in found.report.weighings}
     assert {w.label for w in found.report.weighings} == {note.partition(", run ")[0] for _, _, _, note in seen[1:]}
     assert all(w.agree for w in found.report.weighings)
-    assert found.reason.endswith("nested sampling agrees within a nat.")
+    assert found.reason.endswith("nested sampling agrees to a nat and its own error.")
     assert [w["agree"] for w in diagnosis_json(found)["thorough"]] == [True] * len(found.report.weighings)
     assert "thorough" not in diagnosis_json(replace(found, report=replace(found.report, weighings=())))

@@ -5,7 +5,7 @@ from typing import cast
 import numpy as np
 from heater import runs
 
-from probewise.diagnosis.system.commands import in_turn, one_after_another, run_commands
+from probewise.diagnosis.system.commands import each_directly_after, in_sequence, run_commands
 from probewise.systems import RunTable
 
 TABLE = runs()
@@ -45,13 +45,13 @@ def test_time_that_goes_on_is_later_than_all_that_was_recorded():
     time = np.arange(float(len(TABLE)))
     table = TABLE.with_columns({"t_s": time})
     commands = list(offered((), table).values())
-    asked = cast(RunTable, in_turn(commands[:2], table))
+    asked = cast(RunTable, in_sequence(commands[:2], table))
     assert (np.diff(asked.time_s) > 0).all()
     assert asked.time_s[0] > time[-1]
 
 
 def test_commands_set_behind_each_other_are_runs_of_their_own():
-    together = cast(RunTable, one_after_another(list(offered().values())[:3], TABLE))
+    together = cast(RunTable, each_directly_after(list(offered().values())[:3], TABLE))
     assert len(together.scan_names) == 3
     assert set(together.like.values()) <= set(TABLE.scan_names)
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.search.proposed import may_be_left
+from probewise.diagnosis.search.proposed import may_be_incomplete
 from probewise.diagnosis.search.searched import Posterior
 from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.systems import RunTable, Simulator
@@ -71,4 +71,4 @@ def test_a_product_of_columns_is_no_pair_of_names():
 def test_formulas_are_weighed_wherever_more_than_noise_without_a_memory_leads(mean, noise, asked):
     """A walk takes up what changes slowly, and one name part of what a formula does."""
     searched = SimpleNamespace(posterior=Posterior({(mean, noise): 0.95, (("drag",), ()): 0.05}, {}))
-    assert may_be_left(searched) is asked
+    assert may_be_incomplete(searched) is asked

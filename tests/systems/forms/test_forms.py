@@ -173,7 +173,7 @@ def test_a_switch_is_proposed_for_each_column_that_takes_many_values():
     assert switch.expression == "a (1 + sign(room_c - at)) / 2"
     shifted = switch.apply(np.zeros((1, N_ROWS)), np.array([[0.3, 20.5]]), TABLE)
     np.testing.assert_array_equal(shifted[0], np.where(TABLE.columns["room_c"] > 20.5, 0.3, 0.0))
-    assert all(low < high for low, high in zip(switch.moments.at[:-1], switch.moments.at[1:], strict=True))
+    assert all(low < high for low, high in zip(switch.change_points.at[:-1], switch.change_points.at[1:], strict=True))
 
 
 def test_a_state_stops_at_a_floor_as_well_as_at_a_ceiling():

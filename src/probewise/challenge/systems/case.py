@@ -114,5 +114,5 @@ def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
 
 
 def _has_formula(diagnosis: Diagnosis) -> bool:
-    """Return whether the unknown effect was given a formula."""
+    """Return whether the diagnosis gives the unknown effect a formula."""
     return any(getattr(effect, "expression", "") for effect in getattr(diagnosis.repaired.chain, "effects", ()))

@@ -15,8 +15,8 @@ from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.errors import NotConvergedError
 from probewise.systems import RunTable
 from probewise.systems.forms import About
-from probewise.systems.forms.again import forms_again, own_of_runs, recorded
-from probewise.systems.prediction import of_another_run
+from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms, recorded
+from probewise.systems.prediction import draw_for_new_run
 from probewise.systems.system import SystemChain
 from probewise.world.systems import SystemCase, right_predictions
 
@@ -88,8 +88,8 @@ def predicted_runs(
     """
     chain = cast(SystemChain, samples.chain)
     system = chain.system.with_runs(table)
-    own = [effect.name for effect in chain.effects if own_of_runs(effect.name)]
-    longer = forms_again(own, system.simulator, recorded(about), more_runs=table.scan_names)
+    own = [effect.name for effect in chain.effects if has_value_per_run(effect.name)]
+    longer = rebind_forms(own, system.simulator, recorded(about), more_runs=table.scan_names)
     effects = tuple(longer.get(effect.name, effect) for effect in chain.effects)
     wider = replace(chain, system=system, effects=effects)
     of_run = [name for name in wider.names if name not in chain.names]
@@ -102,7 +102,7 @@ def predicted_runs(
             drawn[name] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
         else:
             effect = next(own_name for own_name in own if name.startswith(f"{own_name}."))
-            drawn[name] = of_another_run(samples.columns(effect)[chosen], rng=rng)
+            drawn[name] = draw_for_new_run(samples.columns(effect)[chosen], rng=rng)
     theta = np.stack([(known | drawn)[name] for name in wider.names], axis=1)
     with np.errstate(all="ignore"):
         predicted = np.concatenate([wider.predict(part, table) for part in np.array_split(theta, max(n // 500, 1))])

@@ -19,7 +19,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
 from probewise.effects import NamedEffect, first_of
 
-__all__ = ["Alias", "aliased_pairs", "aliases", "settle", "surviving_cosine"]
+__all__ = ["Alias", "aliased_pairs", "aliases", "projected_cosine", "with_separating_plans"]
 
 ALIAS_COSINE = 0.9
 _LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # least nats per reading; less is rounding error
@@ -35,7 +35,7 @@ class Alias:
     readings: int
 
 
-def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
+def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
     """Return the largest principal cosine of two projected templates, each (n_points, k)."""
     bases = []
     for columns in (first, second):
@@ -50,7 +50,7 @@ def surviving_cosine(problem: Linearised, first: FloatArray, second: FloatArray)
 
 
 def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
-    """List pairs of effects whose projected templates have a cosine of 0.9 or more; `settle` adds what separates them.
+    """List pairs of effects whose projected templates have a cosine of 0.9 or more, without separating plans.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwi
     """
     out = []
     for pair in itertools.combinations(sorted(templates), 2):
-        cosine = surviving_cosine(problem, templates[pair[0]], templates[pair[1]])
+        cosine = projected_cosine(problem, templates[pair[0]], templates[pair[1]])
         if cosine >= ALIAS_COSINE:
             out.append(Alias(pair, cosine, otherwise, 0))
     return sorted(out, key=lambda alias: -alias.cosine)
@@ -92,13 +92,13 @@ def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[A
         telling[name], chosen[name] = templates.columns[best], templates.variant(best)
     apparatus = prepared.apparatus
     pairs = aliases(problem, telling, otherwise=apparatus.words.settles_nothing)
-    return settle(pairs, found, chosen, problem.sd, apparatus)
+    return with_separating_plans(pairs, found, chosen, problem.sd, apparatus)
 
 
-def settle(
+def with_separating_plans(
     pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float, apparatus: Apparatus
 ) -> list[Alias]:
-    """Find for each aliased pair the candidate plan that separates it, and the number of readings needed.
+    """Return the pairs, each with the candidate plan that separates it best and the number of readings needed.
 
     Each effect has the size at which 400 readings give lambda 8; the advised plan has the most expected nats per
     reading, with as many readings as three nats need.
@@ -115,7 +115,7 @@ def settle(
     scans = apparatus.commands(found.model.plan, level=null)
     if not (best and scans):
         return list(pairs)
-    everywhere = apparatus.one_after_another(scans, found.model.plan)
+    everywhere = apparatus.each_directly_after(scans, found.model.plan)
     null = replace(found.model, plan=everywhere).predict(found.z[None, :])[0]
     there = {
         name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale

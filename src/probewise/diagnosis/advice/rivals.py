@@ -46,7 +46,7 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated) for candidate in found]
     if len(rivals) > 1:
         return next_scans(rivals, sd, plan, apparatus)
-    if apparatus.refits_are_over():
+    if apparatus.refit_budget_is_spent():
         return None
     others = dict.fromkeys(n for names in ranked for n in names if n in prepared.effects)
     imagined = (_insignificant_rival(searched, null, name) for name in others)

@@ -18,7 +18,7 @@ from probewise.diagnosis.audit.detectability import (
     nats_between,
 )
 from probewise.diagnosis.light_sensor.commands import commands
-from probewise.diagnosis.light_sensor.scheduling import Scan, behind, put_off
+from probewise.diagnosis.light_sensor.scheduling import Scan, append_plans, postponed
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
@@ -62,10 +62,10 @@ def cures_of(
         progress("looking for readings that cure", len(chosen), _MOST_SCANS)
         taken = {command.plan.scan_names for command in chosen}
         offered = [c for c in every if c.plan.scan_names not in taken]
-        options = [put_off(command, current) for command in offered]
+        options = [postponed(command, current) for command in offered]
         if not options:
             break
-        together = behind(current, [option.plan for option in options])
+        together = append_plans(current, [option.plan for option in options])
         laid = PlanTemplates.of(expected, together, effects, most=_MOST_SETTINGS)
         now = np.arange(len(current))
         trouble = _total_deficit(laid, now, ailing)
@@ -78,7 +78,7 @@ def cures_of(
         if worth[best] == 0.0:
             break
         chosen.append(options[best])
-        current = behind(current, [options[best].plan])
+        current = append_plans(current, [options[best].plan])
     return chosen
 
 

@@ -25,7 +25,7 @@ from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.fitting.earlier import SensorPrior, require_sensor_prior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
-from probewise.diagnosis.light_sensor.scheduling import behind
+from probewise.diagnosis.light_sensor.scheduling import append_plans
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.words import unit_in_words
@@ -43,7 +43,7 @@ __all__ = [
     "PlanAudit",
     "audit_plan",
     "audit_recorded",
-    "judged",
+    "audits_of",
 ]
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
@@ -172,7 +172,7 @@ class PlanAudit(ShowsItself):
         if not self.cures:
             return None
         first, *more = (cure.plan for cure in self.cures)
-        return behind(first, more)
+        return append_plans(first, more)
 
     @property
     def extra_readings(self) -> int:
@@ -267,14 +267,14 @@ def audit_plan(
     expected, said = _expected_sensor(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
     progress("judging the plan")
-    before, cosines = judged(PlanTemplates.of(expected, plan, effects), effects, unit)
+    before, cosines = audits_of(PlanTemplates.of(expected, plan, effects), effects, unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
     chosen = cures_of(plan, expected, effects, ailing, progress)
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
-        current = behind(current, [command.plan])
-        steps.append(judged(PlanTemplates.of(expected, current, effects), effects, unit)[0])
+        current = append_plans(current, [command.plan])
+        steps.append(audits_of(PlanTemplates.of(expected, current, effects), effects, unit)[0])
     cured = _cured_at(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
@@ -331,7 +331,7 @@ def audit_recorded(
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
-    effects_seen, cosines = judged(
+    effects_seen, cosines = audits_of(
         PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
     )
     return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
@@ -360,7 +360,7 @@ def _expected_sensor(plan: Plan, sensor: SensorPrior | None, noise_sd: float | N
     ), f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
 
 
-def judged(
+def audits_of(
     laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Return the audit of every effect, and the matrix of cosines (row imitated by column)."""

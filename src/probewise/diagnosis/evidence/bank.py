@@ -101,8 +101,8 @@ class Bank:
             out[members] = mix_scales(explained, gain, n)
         return out
 
-    def surviving(self, problem: Linearised) -> FloatArray:
-        """Return the share of each template that a fit does not absorb, (n_templates,)."""
+    def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
+        """Return the share of each template's norm that a fit does not absorb, (n_templates,)."""
         templates = self._scaled_under(problem.law).templates
         taken = problem.basis[: problem.n_points].T @ templates
         whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._first_columns) for a in (templates, taken))

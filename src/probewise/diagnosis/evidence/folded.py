@@ -2,8 +2,8 @@
 
 The likelihood of exchangeable Gaussians has every mode N! times. (The prior of three or more shares, given by their
 ratios to the first, is not quite the same for all orders.) Folded onto the order nearest to a point, with the prior
-density of all orders summed, the posterior has each mode once. Sampling need not hop between modes: for three
-Gaussians, one hardly needed, with two hundred live points, the error of the log evidence fell from five nats to one.
+density of all orders summed, the posterior has each mode once. Then sampling need not hop between modes. For three
+Gaussians, of which one was hardly needed, and 200 live points, the error of log Z fell from five nats to one.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from probewise.diagnosis.fitting.fit import Fit, fit, residual_degrees_of_freedo
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["LEAST_ROWS", "MOST_PARTS", "HeldOut", "Parts", "compare_parts", "held_out_blocks", "held_out_gain"]
+__all__ = ["LEAST_ROWS", "MOST_PARTS", "HeldOut", "Parts", "gain_by_part", "held_out_blocks", "held_out_gain"]
 
 LEAST_ROWS = 8
 """Least number of rows of a held-out part."""
@@ -53,7 +53,7 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
         repaired_one, null_one = (_log_density(f, recording, rows, law, out) for f in (repaired, null))
         return repaired_one - null_one
 
-    return compare_parts(parts, gain, names)
+    return gain_by_part(parts, gain, names)
 
 
 def held_out_blocks(recording: Recording) -> Parts:
@@ -66,7 +66,7 @@ def held_out_blocks(recording: Recording) -> Parts:
     return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
 
 
-def compare_parts(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
+def gain_by_part(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
     """Hold out one part at a time and collect the gains of its readings.
 
     Parameters

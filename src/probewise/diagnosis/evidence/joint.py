@@ -103,9 +103,12 @@ class JointProblem:
 
 
 def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
-    """Log likelihood of whitened residuals (n_points, n_samples) under one law, log sd integrated out: (n_samples,)."""
+    """Log likelihood of whitened residuals (n_points, n_samples) under one noise distribution: (n_samples,).
+
+    Log sigma, with a flat prior, is integrated out by Laplace's method about its peak.
+    """
     n_points = law.n_points
     sigma = law.scale(whitened)
-    curvature = law.tail.scale_curvature(whitened, sigma, n_points) if not law.tail.is_normal else 2.0 * n_points
+    curvature = law.density.scale_curvature(whitened, sigma, n_points) if not law.density.is_normal else 2.0 * n_points
     peak = -law.misfit(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
     return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.log_det() + law.log_extra)

@@ -92,7 +92,7 @@ def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     every = noise.laws(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
     out = np.empty(len(every.laws))
-    normal = [node for node, law in enumerate(every.laws) if law.tail.is_normal]
+    normal = [node for node, law in enumerate(every.laws) if law.density.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
         out[nodes] = _of_normal_laws(found, [every.laws[node] for node in nodes], joined)
@@ -212,7 +212,7 @@ class Linearised:
         sigma = sigma if known else sigma * math.sqrt(n_points / free)
         sd = float(sigma[0]) / math.sqrt(law.information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
-        augmented = np.concatenate([law.pseudo(whitened, sigma)[:, 0] / sd, -z])
+        augmented = np.concatenate([law.pseudo_observations(whitened, sigma)[:, 0] / sd, -z])
         residual = augmented - basis @ (basis.T @ augmented)
         if known:
             # Rounded readings carry less information, which must not make the noise sd smaller.

@@ -128,13 +128,13 @@ class CalibratedSensor(ABC):
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Invert `theta`."""
-        return self._scores(self.to_natural(theta))
+        return self._z_of_natural(self.to_natural(theta))
 
     def _natural_parameters(self, z: FloatArray) -> FloatArray:
         return self.center + z @ self.factor.T
 
-    def _scores(self, natural: FloatArray) -> FloatArray:
-        """Invert `_natural_parameters`."""
+    def _z_of_natural(self, natural: FloatArray) -> FloatArray:
+        """Return coordinates z of natural parameters, (n_samples, n_params): the inverse of `_natural_parameters`."""
         return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
@@ -183,7 +183,7 @@ class SensorCoordinates(CalibratedSensor):
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
         blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
         parts = [logits[:, 1:] - logits[:, :1], blocks.reshape(len(z), 5 * n), natural[:, -2:]]
-        return self._scores(np.concatenate(parts, axis=1))
+        return self._z_of_natural(np.concatenate(parts, axis=1))
 
 
 @lru_cache(maxsize=32)

@@ -35,11 +35,14 @@ class Predictor(Protocol):
         ...
 
     def look(self, theta: FloatArray, plan: Plan) -> Any:
-        """Compute the stages up to SEEN, for one hypothesis or for all."""
+        """Simulate the view: the result of the stages before `Stage.SEEN`, for one sample or for all.
+
+        For a simulator, these are its own readings, with the effects on inputs, parameters and rates.
+        """
         ...
 
     def read(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Compute the stages from SEEN on, from the result of `look`: (n_samples, n_points)."""
+        """Apply the effects from `Stage.SEEN` on to the view that `look` simulated: readings (n_samples, n_points)."""
         ...
 
 
@@ -72,7 +75,7 @@ class Null(Protocol):
 
     @property
     def exchangeable(self) -> bool:
-        """Whether the Gaussians of its SSF are exchangeable; by default False."""
+        """Whether permuting the Gaussians of its SSF changes neither prior nor predictions; by default False."""
         return False
 
     @property

@@ -115,7 +115,7 @@ class _OwnChain:
         return self.read(self.look(theta, plan), theta, plan)
 
     def look(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Simulate, with the effects on the parameters.
+        """Simulate the readings before any effect on them, with the effects on the parameters: (n_samples, n_points).
 
         Raises
         ------

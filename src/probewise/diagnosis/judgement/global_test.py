@@ -1,4 +1,4 @@
-"""Global test of the most probable null's mean, corrected for all looks (multiple comparisons)."""
+"""Global test of the most probable null's mean, corrected for multiple comparisons."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ class Judged:
 def judge(searched: Searched, test: GlobalTest) -> Judged:
     """Return the verdict on a search and its test."""
     prepared, posterior = searched.prepared, searched.posterior
-    hypotheses = hypotheses_of(posterior.probabilities, searched.evidences.known_as)
+    hypotheses = hypotheses_of(posterior.probabilities, searched.evidences.reported_as)
     pairs = tuple(aliased_pairs(searched, test.problem, test.null.found))
 
     def aliased_with(combination: Names) -> frozenset[Names]:
@@ -144,15 +144,15 @@ def _without_formulas(mean: Names) -> Names:
 
 
 def hypotheses_of(
-    probabilities: Mapping[tuple[Names, Names], float], known_as: Callable[[Names], Names] = _without_formulas
+    probabilities: Mapping[tuple[Names, Names], float], reported_as: Callable[[Names], Names] = _without_formulas
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses; unknown is one hypothesis under any noise.
 
-    `known_as` maps a combination on the mean to the name under which it counts.
+    `reported_as` maps a combination on the mean to the name under which it counts.
     """
     joined: dict[Names, float] = {}
     for (mean, noise), p in probabilities.items():
-        known = known_as(mean)
+        known = reported_as(mean)
         key = known if known == ("unknown",) else tuple(sorted((*known, *in_vocabulary(noise))))
         joined[key] = joined.get(key, 0.0) + p
     total = sum(joined.values())
@@ -169,7 +169,10 @@ def verdict_on(
     aliased_with: Callable[[Names], frozenset[Names]],
     certain: frozenset[str] = frozenset(),
 ) -> tuple[Verdict, Names]:
-    """Decide by probabilities; name physics only if the global test has raised an alarm too, or it is `certain`."""
+    """Return the verdict by `decide`; effects on the mean are named only if the global test is significant too.
+
+    Effects in `certain`, which the readings show beyond doubt, need no significant test.
+    """
     verdict, combination = decide(hypotheses, noise_names, aliases, aliased_with)
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)

@@ -1,4 +1,4 @@
-"""Scans that the arm could take, and their concatenation to a plan."""
+"""Scans that the arm could take, and their concatenation into a plan."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from probewise.sensor import COMMANDED
 
 __all__ = [
     "Scan",
-    "behind",
-    "in_turn",
+    "append_plans",
+    "each_directly_after",
+    "in_sequence",
     "minutes_of",
-    "one_after_another",
-    "put_off",
+    "postponed",
     "start_after",
 ]
 
@@ -45,7 +45,7 @@ class Scan:
         return LAY_S if self.kind == "lay" else 0.0
 
 
-def behind(plan: Plan, more: Sequence[Plan]) -> Plan:
+def append_plans(plan: Plan, more: Sequence[Plan]) -> Plan:
     """Append plans to a plan; patterns of one name are one pattern.
 
     A covariate that the others lack, such as battery voltage, keeps its last known value; commanded columns (LED,
@@ -80,7 +80,7 @@ def minutes_of(plan: Plan) -> float:
     return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
 
 
-def one_after_another(scans: Sequence[Scan], after: Plan) -> Plan:
+def each_directly_after(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate scans, each timed as if directly after a plan, for one joint prediction.
 
     Covariates that they lack, such as battery voltage, keep their last value of that plan.
@@ -88,10 +88,10 @@ def one_after_another(scans: Sequence[Scan], after: Plan) -> Plan:
     return _as_left(_joined_plan(scans), after)
 
 
-def in_turn(scans: Sequence[Scan], after: Plan) -> Plan:
+def in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
 
-    Covariates that they lack are filled as in `one_after_another`, to be replaced by measured values.
+    Covariates that they lack are filled as in `each_directly_after`, to be replaced by measured values.
     """
     out: list[Scan] = []
     for scan in scans:
@@ -110,7 +110,7 @@ def _joined_plan(scans: Sequence[Scan]) -> Plan:
     return join_plans([scan.plan for scan in scans])
 
 
-def put_off(scan: Scan, plan: Plan) -> Scan:
+def postponed(scan: Scan, plan: Plan) -> Scan:
     """Move a scan to after a plan, with time to lay its sheet."""
     return _started_at(scan, start_after(plan))
 

@@ -17,7 +17,7 @@ from probewise.diagnosis.light_sensor.commands import commands, rows_that_need_n
 from probewise.diagnosis.light_sensor.covariates import covariate_of, covariates_of, slope_along_the_move
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
-from probewise.diagnosis.light_sensor.scheduling import Scan, in_turn, one_after_another
+from probewise.diagnosis.light_sensor.scheduling import Scan, each_directly_after, in_sequence
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -44,9 +44,10 @@ class LightSensor:
     )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
-        """Return the scaled vocabulary and the effects with a formula, without those that the null absorbs or excludes.
+        """Scale all effects to a recording: the vocabulary, those with a formula, and nuisances, by name.
 
-        Without a given null the SSF is free, and absorbs effects on the SSF.
+        Left out are effects that cannot act there or on the given null. Without a given null the SSF is free and
+        absorbs effects on the SSF, so these are left out.
         """
         extent, plan = Extent.of(recording), recording.plan
         kinds = {**self.vocabulary, **UNNAMED, **NUISANCES}
@@ -65,7 +66,7 @@ class LightSensor:
         """Return the names of effects defined outside this library."""
         return frozenset(effects.keys() - EFFECTS)
 
-    def refits_are_over(self, share: float = 1.0) -> bool:
+    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
         """Return False: predictions are cheap here."""
         return False
 
@@ -82,8 +83,8 @@ class LightSensor:
     prior_odds = staticmethod(PriorOdds.over)
     covariate_of = staticmethod(covariate_of)
     held_out_parts = staticmethod(held_out_parts)
-    one_after_another = staticmethod(one_after_another)
-    in_turn = staticmethod(in_turn)
+    each_directly_after = staticmethod(each_directly_after)
+    in_sequence = staticmethod(in_sequence)
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
         """Return the slopes by fine structure of the SSF."""

@@ -101,14 +101,14 @@ class NoiseLaw:
         )
 
     @property
-    def remembers(self) -> bool:
+    def has_memory(self) -> bool:
         """Return whether successive readings have some of their noise in common."""
         return bool(self.walk.size or np.any(self.carry))
 
     @property
     def information(self) -> float:
         """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
-        return float(self.tail.information)
+        return float(self.density.information)
 
     def take(self, rows: BoolArray) -> NoiseLaw:
         """Return the distribution of some readings, which must be whole scans."""
@@ -161,8 +161,8 @@ class NoiseLaw:
         return float(np.log(self.sd[kept]).sum() + 0.5 * np.log1p(-(self.carry[kept] ** 2)).sum())
 
     @cached_property
-    def tail(self) -> Tail | Flat:
-        """The density of one whitened reading."""
+    def density(self) -> Tail | Flat:
+        """Density of one whitened reading: a mixture of two normals (`Tail`) or a rounded normal (`Flat`)."""
         return forms([self])
 
     @cached_property
@@ -194,35 +194,36 @@ class NoiseLaw:
 
     def scale(self, whitened: FloatArray) -> FloatArray:
         """Return the most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
-        return self.tail.scale(whitened, self.n_points, floor=self.floor)
+        return self.density.scale(whitened, self.n_points, floor=self.floor)
 
     def misfit(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return minus the log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
 
         Without n/2 log 2 pi.
         """
-        return self.tail.misfit(whitened, sigma, self.n_points)
+        return self.density.misfit(whitened, sigma, self.n_points)
 
     def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Convert whitened residuals (n_points, k) to equally informative normal pseudo-observations."""
-        return self.tail.as_normal(whitened, sigma)
+        return self.density.as_normal(whitened, sigma)
 
-    def pseudo(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Return pseudo-observations like `as_normal`, but never larger than the residuals.
+    def pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Return pseudo-observations as `as_normal` does; for rounded readings, never larger than the residual.
 
-        Beyond a flat top the density falls faster than average, which would exaggerate the residual.
+        A rounded reading has a flat-topped density. On its steep flank, the score over the Fisher information would
+        exceed the residual.
         """
         normal = self.as_normal(whitened, sigma)
         return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
 
     def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw pseudo-observations as from `pseudo`, in units of their sd, (n_points, n_draws)."""
+        """Draw pseudo-observations as from `pseudo_observations`, in units of their sd, (n_points, n_draws)."""
         eps = rng.standard_normal((len(self.sd), n_draws))
-        if not self.tail.is_normal:
+        if not self.density.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
             if self.flat:
                 eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
-            eps = self.pseudo(eps, np.ones(n_draws)) * math.sqrt(self.information)
+            eps = self.pseudo_observations(eps, np.ones(n_draws)) * math.sqrt(self.information)
         return eps * self.kept[:, None]
 
 

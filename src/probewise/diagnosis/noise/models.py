@@ -101,7 +101,7 @@ class NoiseModel:
                 [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
             )
             log_weights = (log_weights[:, None] + log_each).ravel()
-        level = self._level(settings, seen)
+        level = self._noise_at(settings, seen)
         far = np.abs(residuals) > _FAR * sd
         laws = tuple(self._law(level, k, far) for k in range(len(settings)))
         if self.rounding:
@@ -118,8 +118,11 @@ class NoiseModel:
             return self.likely[effect.name]
         return effect.weighed_nodes(residuals, rows)
 
-    def _level(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
-        """Apply the effects with all settings at once to the usable rows."""
+    def _noise_at(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
+        """Return the noise at all nodes at once: relative sds and correlations with every noise effect applied.
+
+        `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) are the predictions.
+        """
         plan, usable = self.recording.plan, self.recording.usable
         everywhere = np.zeros((1, len(plan)))
         everywhere[0, usable] = seen
@@ -165,7 +168,7 @@ class NoiseModel:
 
     @cached_property
     def _rows_on(self) -> FloatArray:
-        """Rows since the previous usable one, across runs too; for the first, since the start of the table."""
+        """Rows from the previous usable row, even of another run; for the first, from the start of the table."""
         return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
 
     @cached_property

@@ -17,7 +17,7 @@ from probewise.errors import NotConvergedError
 from probewise.nested.weights import n_effective, resampled
 from probewise.progress import Progress, silent
 
-__all__ = ["Density", "anneal", "by_weight"]
+__all__ = ["Density", "anneal", "importance_resample"]
 
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
 _LEAST_OF_IT = 0.5  # least acceptable share of the target
@@ -29,7 +29,7 @@ Density: TypeAlias = Callable[[FloatArray], FloatArray]
 """Log densities of samples, unnormalised, (n, n_params) -> (n,)."""
 
 
-def by_weight(
+def importance_resample(
     first: FloatArray,
     log_q: Density,
     log_p: Density,
@@ -71,7 +71,7 @@ def by_weight(
 
 
 def _n_distinct_effective(log_weight: FloatArray, samples: FloatArray) -> float:
-    """Return Kish's effective sample size, with duplicates counted once."""
+    """Return Kish's effective sample size, with the weights of equal samples added up."""
     _, which = np.unique(samples[:, 0], return_inverse=True)
     if not np.isfinite(log_weight).any():
         return 0.0
@@ -96,7 +96,7 @@ def anneal(
     first
         Samples of the other density, (n_walkers, n_params), an even number.
     log_q, log_p, n_wanted, rng
-        As in `by_weight`.
+        As in `importance_resample`.
     n_moves
         Moves of each sample after a step of beta, and between collections of samples.
     progress

@@ -14,14 +14,14 @@ from probewise.diagnosis.repair.improvement import Improvement, improvement_of
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
-__all__ = ["Best", "best_repair", "ruins"]
+__all__ = ["Best", "best_repair", "predicts_far_worse"]
 
 _RUIN = -1.0  # nats per held-out reading below which named effects are withdrawn
 
 
 @dataclass(frozen=True, eq=False)
 class Best:
-    """The fit of the repaired model with its noise model, its linearisation, and its gain.
+    """The best fit: the repaired model, or the null if nothing was found, with noise, linearisation and gain.
 
     `out_of_vocabulary` is its combination with a formula if the verdict is `unknown`, otherwise ().
     """
@@ -49,7 +49,7 @@ class Best:
         return cls(fit, noise, after, gain, out_of_vocabulary)
 
 
-def ruins(gain: Improvement) -> bool:
+def predicts_far_worse(gain: Improvement) -> bool:
     """Return whether a repair predicts held-out readings far worse than the null."""
     return gain.heldout_log_density_per_reading < _RUIN
 
@@ -74,6 +74,8 @@ def best_repair(
         noise = searched.posterior.likeliest_noise(stated)
     on_mean = tuple(name for name in judged.combination if name not in on_noise)
     best = Best.of(searched, test, searched.best(on_mean, noise) or null, noise, rng=rng)
-    if judged.verdict == "named" and ruins(best.improvement):  # a fit that fails on held-out readings is no repair
+    if judged.verdict == "named" and predicts_far_worse(
+        best.improvement
+    ):  # a fit that fails on held-out readings is no repair
         return judged.withdraw(), Best.of(searched, test, null, noise, rng=rng)
     return judged, best

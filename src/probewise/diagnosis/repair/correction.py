@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.held_out import HeldOut, compare_parts, held_out_blocks
+from probewise.diagnosis.evidence.held_out import HeldOut, gain_by_part, held_out_blocks
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
@@ -69,7 +69,7 @@ def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Cor
     def gain(out: BoolArray) -> FloatArray:
         return _log_density(found, problem, columns, out) - _log_density(found, problem, plain, out)
 
-    return Correction(change, columns, compare_parts(scan, gain))
+    return Correction(change, columns, gain_by_part(scan, gain))
 
 
 def corrected(

@@ -13,7 +13,7 @@ from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
-from probewise.diagnosis.repair.best import Best, ruins
+from probewise.diagnosis.repair.best import Best, predicts_far_worse
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
@@ -138,7 +138,7 @@ def _left_open(ensemble: Ensemble, searched: Searched, test: GlobalTest, noise: 
     by_mean = searched.posterior.by_mean
     named = {names for _, names in searched.evidences.fits if not out_of_vocabulary(names)}
     fit = searched.best(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
-    if fit.names and ruins(Best.of(searched, test, fit, noise, rng=ensemble.rng).improvement):
+    if fit.names and predicts_far_worse(Best.of(searched, test, fit, noise, rng=ensemble.rng).improvement):
         return ensemble.of(test.null)
     shares = {names: by_mean.get(names, 0.0) for names in ensemble.likely(fit) if names}
     return ensemble.averaged(fit, {**shares, (): max(1 - sum(shares.values()), 0.0)})

@@ -157,8 +157,8 @@ class Profiled:
     ) -> FloatArray | None:
         """Draw coordinates of a posterior by weight, (n_wanted, n_params); None if too few are independent.
 
-        No weight exceeds the mean by more than the root of the number of draws: one draw in a tail that is heavier
-        than this density's must not stand for many (Ionides 2008).
+        Weights are truncated at the mean weight times the square root of the number of draws (Ionides 2008), so that
+        no draw in a heavy tail dominates.
         """
         first = self.draws(n_first, rng=rng)
         gain = log_p(first) - self.log_density(first)

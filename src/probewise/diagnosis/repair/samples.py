@@ -19,7 +19,7 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
-from probewise.diagnosis.repair.annealing import Density, anneal, by_weight
+from probewise.diagnosis.repair.annealing import Density, anneal, importance_resample
 from probewise.diagnosis.repair.profiled import Profiled
 from probewise.diagnosis.repair.quadratic import Quadratic
 from probewise.diagnosis.repair.surrogate import Surrogate
@@ -217,7 +217,7 @@ def _posterior_draws(
         return posterior(center + e @ steps)
 
     def carried(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
-        weighed = by_weight(first, log_q, log_p, n_wanted=n, rng=rng)
+        weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng)
         if weighed is not None:
             return weighed
         return anneal(first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)

@@ -26,7 +26,7 @@ _MEMORIES = (3.0, 10.0, 30.0)  # readings
 
 
 @dataclass(frozen=True, eq=False)
-class _Ways:
+class _MismatchFactors:
     """Factors of the kinds of mismatch, (n_points,) each: additive, gain, displacement along the axis of motion."""
 
     adds: FloatArray
@@ -57,7 +57,7 @@ def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope
         if covariate.name == "direction":
             sign[covariate.rows] = covariate.values
     along_axis = slope * np.where(sign == 0, 1.0, sign)
-    ways = _Ways(np.ones(len(signal)), signal, along_axis, sign, len(starts))
+    ways = _MismatchFactors(np.ones(len(signal)), signal, along_axis, sign, len(starts))
     found = [
         (_family_name(covariate, template), template)
         for covariate in covariates
@@ -91,7 +91,7 @@ def _family_name(covariate: Covariate, template: FloatArray) -> str:
     return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
 
 
-def _bases_of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
+def _bases_of(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArray]:
     if covariate.groups:
         yield from _of_groups(covariate, ways)
     elif covariate.scan is not None:
@@ -134,7 +134,7 @@ def _bases_of(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
             yield _smooth(covariate, way, 8)
 
 
-def _of_groups(covariate: Covariate, ways: _Ways) -> Iterator[FloatArray]:
+def _of_groups(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArray]:
     codes = np.unique(covariate.values, return_inverse=True)[1]
     if codes.max() >= _MOST_GROUPS:
         return

@@ -17,7 +17,7 @@ from probewise.diagnosis.noise.law import NoiseLaw, Tail
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import windows
 
-__all__ = ["FAR_OUT", "outlying", "score_together"]
+__all__ = ["FAR_OUT", "score_clustering", "tail_probability"]
 
 FAR_OUT = ", far out"
 """Suffix of the names of families of unknown effects in which outlying readings cluster."""
@@ -25,13 +25,13 @@ FAR_OUT = ", far out"
 _A = 0.5  # parameter of the beta prior of the share of outlying readings (Jeffreys)
 
 
-def outlying(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
+def tail_probability(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
     """Return the probability that each reading is in the tail of the noise distribution, (n_points,)."""
     whitened = law(residuals)
     return Tail(law.share, law.times).wide((whitened / law.scale(whitened[:, None])[0]) ** 2)
 
 
-def score_together(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
+def score_clustering(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
     """Return log Bayes factors for a different share of outlying readings in a window of a covariate.
 
     Parameters

@@ -31,7 +31,7 @@ __all__ = ["Proposal", "promising", "proposals_for", "select_forward"]
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A refit that screening promises `score` of, in log evidence: of a candidate, with one more effect."""
+    """A possible refit: the candidate `parent` with one more effect, and its log evidence `score` by screening."""
 
     score: float
     parent: WeighedFit
@@ -60,7 +60,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
             chosen += [names for names in _both_copies(state, null) if names in proposals and names not in chosen]
         asked = [proposals[names] for names in chosen]
         if size == 1:
-            asked = [*asked[:1], *_plainly(state, null), *asked[1:]]
+            asked = [*asked[:1], *_proposals_under_plain_noise(state, null), *asked[1:]]
         state.share = SHARES[size - 1] if size <= len(SHARES) else 1.0
         refitted = []
         for k, proposal in enumerate(asked):
@@ -77,7 +77,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
 
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
-    """Weigh all pairs about a null by templates, under the noise models that steer."""
+    """Store the log evidence of pairs of effects about a null, by templates, under the noise models of `steering`."""
     for noise, evidence in null.steering():
         singles = state.scores(null, evidence.law, null)
         alone = [name for name in singles if first_of(name) is None]
@@ -95,7 +95,7 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
 
     Returns
     -------
-    The best of these proposals and those already had, by the combination that would come of them.
+    The best proposal, new or given, for each resulting combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
     against = 0.0 if parent.names else state.complexity_penalty(parent.degrees_of_freedom)
@@ -116,9 +116,9 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
 
 
 def promising(state: SearchState, proposals: Mapping[Names, Proposal], *, width: int, behind: float) -> list[Names]:
-    """Choose the combinations of the best odds by screening, up to `width` of names alone.
+    """Choose the combinations with the best odds by screening, at most `width` of them in the vocabulary.
 
-    One that screening puts `behind` nats behind what it competes with is seldom worth its cost.
+    Combinations more than `behind` nats behind the best refitted one that they compete with are left out.
     """
     odds = {names: proposal.score + state.prior.log_mean(names) for names, proposal in proposals.items()}
     ranked = sorted(odds, key=lambda names: -odds[names])
@@ -131,15 +131,15 @@ def promising(state: SearchState, proposals: Mapping[Names, Proposal], *, width:
 
 
 def _refitted_alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Names]:
-    """Choose the effects that are refitted alone: the leader, what is not far behind, and what screening cannot judge.
+    """Choose the effects to refit alone: the leader, those not far behind, and those that screening cannot judge.
 
-    A user's own effect was named to be tried, however far it leads from where screening is linear; and screening says
-    nothing of what the null takes up all but a little of to first order.
+    Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
+    null absorbs nearly completely to first order.
     """
     ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_mean(names)))
     faint, about = set[str](), Linearised.of(null.found, null.law)
     for bank in state.banks(null):
-        left = bank.surviving(about)
+        left = bank.unabsorbed_shares(about)
         faint |= {name for name, of in bank.members.items() if ABSORBED < left[of].max() < FAINT}
     # One of two waves alone explains little: the other is noise to it.
     twice = {name for name in state.effects if name + AGAIN in state.effects}
@@ -149,9 +149,9 @@ def _refitted_alone(state: SearchState, null: WeighedFit, proposals: Mapping[Nam
 
 
 def _both_copies(state: SearchState, null: WeighedFit) -> list[Names]:
-    """Return the pairs of an effect with itself, if one alone explains something under plain noise.
+    """Return the pairs of an effect that may occur twice, if it explains something alone under the simplest noise.
 
-    To either of two waves the other is noise with memory, and may make it look like no more than that.
+    While only one of two waves is fitted, the other looks like noise with memory, which may hide both.
     """
     plain = state.noises.certain
     pairs = [(first, name) for name in state.effects if (first := first_of(name)) is not None]
@@ -162,11 +162,11 @@ def _both_copies(state: SearchState, null: WeighedFit) -> list[Names]:
     ]
 
 
-def _plainly(state: SearchState, null: WeighedFit) -> list[Proposal]:
-    """Propose the effects that lead under plain noise, about the null as it is fitted then.
+def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
+    """Propose the effects that lead about the null as fitted under the simplest noise, if it predicts differently.
 
-    To a walk of the noise, or a correlation, what is missing is noise, and the null is fitted beside it: there the
-    effect that is missing may show in nothing. Only a null that then predicts otherwise says more.
+    A random walk or a correlation of the noise absorbs the missing effect, and the null is fitted in its presence:
+    the effect may then be undetectable.
     """
     plain = state.refits.under_plain_noise(null)
     if plain is None:
@@ -180,7 +180,7 @@ def _plainly(state: SearchState, null: WeighedFit) -> list[Proposal]:
 
 
 def _with_scores_about_null(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
-    """Let pairs promise what they do about the null, where neither effect leads alone."""
+    """Raise the score of each proposal to that of its combination about the null, if that is larger."""
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():
         best[names] = max(value, best.get(names, value))

@@ -16,8 +16,8 @@ __all__ = ["fit_nulls"]
 def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None:
     """Fit the null, or each form of the SSF: one Gaussian, the free form, more Gaussians.
 
-    Up to one more than `max_order`, as long as the last is not far behind the best. Noises that only show in pairs are
-    added once a null is known.
+    Up to one more than `max_order`, as long as the last is not far behind the best. Noise effects that are significant
+    only in pairs are added once a null is fitted.
     """
     noises, refits, null = state.noises, state.refits, prepared.null
     recording = prepared.recording

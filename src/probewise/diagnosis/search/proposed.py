@@ -1,4 +1,4 @@
-"""Propose formulas for what has no name, wherever more than noise may be left, since a name may stand in for it."""
+"""Search again with formulas, unless noise without memory explains the readings: a name may replace a formula."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
 
-__all__ = ["may_be_left", "with_proposals"]
+__all__ = ["may_be_incomplete", "with_proposals"]
 
 _LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
 _MOST = 8  # formulas that are refitted
@@ -26,11 +26,11 @@ _WITHIN = 12.0  # nats behind the best of what was refitted, within which screen
 def with_proposals(searched: Searched, *, progress: Progress = silent) -> Searched:
     """Search again with the formulas that screening favours; return the search unchanged if there are none.
 
-    Names explain in part what one formula does, an exponential leak as a square law, a product as a step beside a
-    sensitivity, and predict other runs badly. Noise with a memory takes up what changes slowly, and predicts nothing.
+    Named effects can partly explain what one formula explains, and then predict other runs badly: a square law an
+    exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
     """
     prepared = searched.prepared
-    if not may_be_left(searched) or prepared.apparatus.refits_are_over():
+    if not may_be_incomplete(searched) or prepared.apparatus.refit_budget_is_spent():
         return searched
     proposals = prepared.apparatus.proposals()
     if not proposals:
@@ -47,11 +47,11 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
         return searched
     more = replace(prepared, effects={**prepared.effects, **kept})
     again = search(more, prior=prior, after=searched, progress=progress)
-    return searched if prepared.apparatus.refits_are_over() else again
+    return searched if prepared.apparatus.refit_budget_is_spent() else again
 
 
-def may_be_left(searched: Searched) -> bool:
-    """Tell whether more may be left than noise without a memory."""
+def may_be_incomplete(searched: Searched) -> bool:
+    """Return whether effects on the mean or noise with memory have together a probability above 0.1."""
     plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
     return 1.0 - sum(plain) > _LEFT_FROM
 

@@ -12,10 +12,10 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.convergence import require_finite
+from probewise.diagnosis.evidence.detectable import log_detectable
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
 from probewise.diagnosis.evidence.screening import log_mean, score_effects
 from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateMemory
-from probewise.diagnosis.evidence.visible import log_visible
 from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
@@ -36,7 +36,7 @@ _SAME_START = 0.1  # in prior sds: starts that are closer together are duplicate
 
 @dataclass(frozen=True, eq=False)
 class Refits:
-    """How a recording is fitted: prior of the sensor, noise models, templates."""
+    """Refits of one recording, cached: a given null, the noise models, and the templates."""
 
     sensor: Null | None
     noises: Noises
@@ -72,11 +72,11 @@ class Refits:
     ) -> WeighedFit:
         """Fit under one noise distribution, compute the evidence under all, and refit if another is more probable.
 
-        A fit that gains nothing `beyond` another one is given the evidence of that: nobody asks for its own. Under
-        noise with memory it may gain under white noise alone, and is weighed.
+        A fit that gains nothing `beyond` another one takes over the evidence of that one, to save the computation,
+        unless the noise has memory: there it may still gain under white noise.
         """
         found = self._fit(model, starts, law, max_steps)
-        if beyond is not None and not law.remembers and not _gains(found, beyond.found, law):
+        if beyond is not None and not law.has_memory and not _gains(found, beyond.found, law):
             return WeighedFit.of(found, law, beyond.evidence, 0.0)
         for _ in range(2):
             evidence = self.noises.weigh(found)
@@ -87,7 +87,7 @@ class Refits:
             found = self._fit(model, found.z[None, :], law, max_steps)
         else:
             evidence = self.noises.weigh(found)
-        return WeighedFit.of(found, law, evidence, log_visible(found, law, self.templates.usable))
+        return WeighedFit.of(found, law, evidence, log_detectable(found, law, self.templates.usable))
 
     def is_better_at(self, z: FloatArray, candidate: WeighedFit) -> bool:
         """Return whether a candidate's model is better at coordinates z (n_params,) than at its fit."""
@@ -98,8 +98,8 @@ class Refits:
         return there < found.objective - SAME_MODE
 
     def under_plain_noise(self, null: WeighedFit) -> WeighedFit | None:
-        """Fit a given null under the plainest noise too; None if it predicts the same, or its noise has no memory."""
-        if self.sensor is None or not self.law_of(null).remembers:
+        """Fit a given null under the simplest noise too; None if it predicts the same, or its noise has no memory."""
+        if self.sensor is None or not self.law_of(null).has_memory:
             return None
         if null not in self.plain:
             law = null.evidence[self.noises.certain].law
@@ -112,12 +112,12 @@ class Refits:
     def extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
         """Refit with one more effect, for its likely variants, unless that was done before.
 
-        An effect that changes the readings exactly as another one did has its fit and its evidence.
+        An effect that changes the readings exactly as one refitted before takes over its fit and evidence.
 
         Returns
         -------
-        The best, as the share that it has of all variants, less the nats `against` it; and the closed-form scores of
-        the effect by the noise models that steer.
+        The best variant, its evidence averaged over all variants and reduced by `against` nats; and the closed-form
+        scores of the effect, by the noise models of `steering`.
         """
         key = parent, effect, against
         if key not in self.known:
@@ -126,7 +126,7 @@ class Refits:
         return self.known[key]
 
     def _as_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
-        """Return the refit of another effect that predicts the same, as the refit of this one."""
+        """Return the earlier refit of a twin with this effect in its place; None if no twin was refitted."""
         own = self.templates.of(parent.found, effect)
         for (held, other, less), (candidate, scores) in list(self.known.items()):
             if held is parent and less == against and are_proportional(own, self.templates.of(held.found, other)):
@@ -138,7 +138,7 @@ class Refits:
         return None
 
     def _beside_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
-        """Return the refit with this effect beside the twin of one that a candidate holds, as beside that."""
+        """Reuse the refit of this effect with a twin of the parent's last effect; None if there is none."""
         first, swap = self.twins.get(parent, (None, None))
         known = None if first is None else self.known.get((first, effect, against))
         if known is None or swap is None:
@@ -165,7 +165,7 @@ class Refits:
         plain = self._under_simplest_noise(parent, problem)
         seen = [(problem, scores), *((about, scores_about(about)) for about in plain)]
         likeliest = (int(np.argmax(templates.weights(own_scores))) for _, own_scores in seen[1:])
-        tried = list(dict.fromkeys([*_worth_trying(templates, weights), *likeliest]))
+        tried = list(dict.fromkeys([*_variants_to_refit(templates, weights), *likeliest]))
         refitted = [self._of_variant(parent, effect, templates, k, seen) for k in tried]
         # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
@@ -222,7 +222,7 @@ class Refits:
             # With several modes of the null, the best one may change with the effect.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
         fitted = [self.weighed(model, np.stack(starts), seen[0][0].law, beyond=parent)]
-        if seen[0][0].law.remembers:  # to a walk a slow effect is noise: its amplitude would stay at 0
+        if seen[0][0].law.has_memory:  # to a walk a slow effect is noise: its amplitude would stay at 0
             plain = self.noises.certain
             for about, scores in seen[1:]:
                 promised = parent.evidence[plain].log_z + log_mean(scores)
@@ -266,11 +266,11 @@ def _gains(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
     return 2 * (misfit(beyond) - misfit(found)) > 3.0
 
 
-def _worth_trying(templates: EffectTemplates, weights: FloatArray) -> list[int]:
+def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:
     """Choose the variants of an effect to refit: the leading one, and the next if they are bound to scans.
 
-    Two scans of opposite direction are aliased to first order; a refit shows which one was turned by 30 degrees. Of few
-    variants, as of a tank that overflows to waste or into the next one, all are refitted.
+    Two scans of opposite direction are aliased to first order; a refit shows which one was turned by 30 degrees. If
+    there are few variants (a tank may overflow to waste or into the next one), all are refitted.
     """
     if len(weights) <= FEW_VARIANTS:
         return [int(k) for k in np.argsort(-weights)]

@@ -89,7 +89,9 @@ def search(
     noises, templates, own = refits.noises, refits.templates, prepared.apparatus.own_effects(on_mean)
     if prepared.null is not None and prepared.null.nuisance:
         own = frozenset(on_mean)  # about a shape that is far off without the right effect, screening is no guide
-    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, prepared.apparatus.refits_are_over)
+    state = SearchState(
+        on_mean, prior, noises, templates, refits, own, progress, prepared.apparatus.refit_budget_is_spent
+    )
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
     else:

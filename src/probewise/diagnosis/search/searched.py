@@ -59,10 +59,11 @@ class Evidences:
         named = self.fits[order, names].evidence[noise].log_z
         return named - self.fits[order, ()].evidence[noise].log_z > self.unknown[order, names, noise] - named
 
-    def known_as(self, mean: Names) -> Names:
-        """Return a combination's reported name: unknown if out of vocabulary, unless names explain more.
+    def reported_as(self, mean: Names) -> Names:
+        """Return the reported names of a combination: ("unknown",) if it is out of vocabulary, with two exceptions.
 
-        These are its named part, or the one effect that explains nearly all that a formula alone does.
+        Its named part is reported if that has over half of its gain; instead of a formula alone, a single name that
+        has nearly all of its gain.
         """
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
@@ -76,9 +77,9 @@ class Evidences:
         return named if named and gain > share * (self._log_z(mean) - nothing) else ("unknown",)
 
     def one_name_explains_more(self) -> bool:
-        """Tell whether one effect, on the mean or on the noise, explains more than what has no name does by itself.
+        """Return whether one named effect, on mean or noise, has more evidence than any one effect without a name.
 
-        Several names together were chosen from too many combinations for their evidence alone to say so.
+        Combinations of names do not count: they were chosen from too many for their evidence alone to decide.
         """
         plain = self._simplest_noise
         nameless = [v for (_, names, noise), v in self.unknown.items() if not names and noise == plain]
@@ -91,7 +92,7 @@ class Evidences:
 
     @property
     def _simplest_noise(self) -> Names:
-        """The plainest noise: that which the readings show without doubt."""
+        """The noise model with the fewest effects: those that the readings show beyond doubt."""
         return min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
 
     def _log_z(self, names: Names) -> float:
@@ -266,7 +267,7 @@ class Searched:
         return out
 
     def looks(self, found: Fit) -> list[Bank]:
-        """Return all templates for testing a fit: of the effects that it lacks, and of unknown effects."""
+        """Return the template banks for testing a fit: of the effects that it lacks, and of unknown effects."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]
         missing = [effect for effect in on_mean if effect.name not in found.model.names]
         return [self.screening.templates.bank(self.screening.about, missing), self.screening.unknown_bases]

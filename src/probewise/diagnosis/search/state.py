@@ -160,7 +160,7 @@ class SearchState:
         return None
 
     def improve_null(self, candidate: WeighedFit) -> None:
-        """Fit a given null again from where a fit with one more effect left it, if it is better there."""
+        """Refit a given null from its coordinates in a fit with one more effect, if it fits better there."""
         null = self.candidates[candidate.n_gaussians, ()]
         start = candidate.found.z[: null.found.model.n_params]
         if self.refits.sensor is None or not self.refits.is_better_at(start, null):

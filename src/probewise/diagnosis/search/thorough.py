@@ -55,8 +55,9 @@ def weigh_thoroughly(
 ) -> tuple[Searched, tuple[Weighing, ...]]:
     """Compute the evidence of two or three leading hypotheses, and the null, by nested sampling.
 
-    If the two methods disagree by more than a nat and no run has warnings, nested sampling takes precedence: the
-    evidences of these hypotheses, and of unknown effects beside them, are shifted, and all probabilities recomputed.
+    If the two methods differ by more than a nat plus the standard error, and no run has warnings, nested sampling takes
+    precedence: the evidences of these hypotheses, and of unknown effects beside them, are shifted, and all
+    probabilities recomputed.
     Laplace's error for the null is assumed for every hypothesis that was not recomputed, so shifts are relative to the
     null. Hypotheses pruned by Laplace's evidence are not restored.
 

@@ -1,4 +1,4 @@
-"""Twins: two effects that change the readings alike, of which one fit serves both."""
+"""Twins: two effects with proportional templates, so that the fit of one is reused for the other."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _SAME_SLOPES = 1e-3  # of the norm of a slope
 
 
 def are_proportional(first: EffectTemplates, second: EffectTemplates) -> bool:
-    """Tell whether each entry of two effects' banks is the same curve, up to its size and sign."""
+    """Return whether corresponding templates of two effects' banks are proportional to each other."""
     if first is second or [a.shape for a in first.settings] != [b.shape for b in second.settings]:
         return False
     if len(first.variants) != len(second.variants):

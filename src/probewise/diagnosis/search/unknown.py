@@ -16,7 +16,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.outlying import outlying, score_together
+from probewise.diagnosis.residuals.outlying import score_clustering, tail_probability
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
@@ -63,8 +63,8 @@ class Unknown:
                 scores = self.scores(candidate.found, evidence.law, self.bases)
                 by_family = {family: log_mean(own) for family, own in scores.items()}
                 if evidence.law.share > 0:
-                    far_out = outlying(candidate.found.residuals, evidence.law)
-                    by_family |= score_together(far_out, self.covariates)
+                    far_out = tail_probability(candidate.found.residuals, evidence.law)
+                    by_family |= score_clustering(far_out, self.covariates)
                 if not by_family:
                     continue
                 value = evidence.log_z + log_mean(np.array(list(by_family.values())))
@@ -77,10 +77,11 @@ class Unknown:
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
     def prune(self, candidates: Collection[WeighedFit]) -> None:
-        """Drop it, alone or beside named effects, if one or two more named effects explain as much and leave nothing.
+        """Drop an unknown effect, alone or beside named ones, if one or two more named effects explain as much.
 
-        A basis of many columns, such as one value per scan, can imitate named effects. Two names are chosen from many
-        more combinations than one, so they must explain correspondingly more.
+        No unknown effect may then be significant beside them. A basis of many columns, such as one value per scan, can
+        imitate named effects. Two names are chosen from many more combinations than one, so they must explain
+        correspondingly more.
         """
         named = [c for c in candidates if not out_of_vocabulary(c.names)]
         for known in {c.names for c in named if len(c.names) <= 1}:

@@ -31,7 +31,7 @@ class WeighedFit:
     law: NoiseLaw  # noise distribution of the fit
     evidence: Mapping[Names, NoiseEvidence]
     log_share: float  # log prior factor of the effects' discrete choices (variants)
-    log_visible: float  # log probability that all effects have a detectable size
+    log_detectable: float  # log probability that all effects have a detectable size
     weights: Mapping[str, FloatArray]  # weights of each effect's variants
 
     @property
@@ -40,14 +40,14 @@ class WeighedFit:
         return tuple(sorted(self.found.model.names))
 
     @classmethod
-    def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_visible: float) -> WeighedFit:
+    def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_detectable: float) -> WeighedFit:
         """Build from a fit and the evidence of its parameters, without factors for discrete choices."""
-        return cls(found, law, {}, 0.0, log_visible, {}).with_evidence(plain)
+        return cls(found, law, {}, 0.0, log_detectable, {}).with_evidence(plain)
 
     @property
     def log_factor(self) -> float:
         """Log of the factor on the evidence of its parameters."""
-        return self.log_share + self.log_visible
+        return self.log_share + self.log_detectable
 
     def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
         """Return it with other evidences of its parameters under each noise model."""

@@ -37,18 +37,18 @@ class Weighing:
 
     @property
     def agree(self) -> bool:
-        """Whether the two agree within a nat, beyond the standard error of nested sampling."""
+        """Whether the two log evidences differ by at most a nat plus one standard error of nested sampling."""
         return abs(self.gap) <= A_NAT + self.error
 
 
 def with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
-    """Add to a sentence whether nested sampling agrees, the differences, and its warnings."""
+    """Add to a sentence whether nested sampling agrees, the differences in nats, and its first warning."""
     if not weighings:
         return reason
     apart = ", ".join(f"{w.label} by {w.gap:+.1f} nats".replace("-", "−") for w in weighings if not w.agree)
     doubt = next((f"{w.label}: {doubt}" for w in weighings for doubt in w.doubts), None)
     if not apart:
-        said = "nested sampling agrees within a nat"
+        said = "nested sampling agrees to a nat and its own error"
     elif doubt is not None:
         said = f"nested sampling would move {apart}, and probabilities are left as they were"
     else:

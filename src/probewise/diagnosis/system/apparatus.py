@@ -15,7 +15,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.system.commands import RunCommand, in_turn, one_after_another, run_commands
+from probewise.diagnosis.system.commands import RunCommand, each_directly_after, in_sequence, run_commands
 from probewise.effects import (
     CorrelatedNoise,
     DriftingNoise,
@@ -66,7 +66,7 @@ class SimulatorApparatus:
     about
         The fit, and the sd of a reading.
     stop
-        The end of the meter's range, where readings stand at one that was not declared.
+        The undeclared stop of the meter, if the readings show one.
     """
 
     about: About
@@ -113,7 +113,7 @@ class SimulatorApparatus:
         """Return the names of the extra effects of the user's file."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
-    def refits_are_over(self, share: float = 1.0) -> bool:
+    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
         """Return whether this share of the budget of calls of `simulate`, or of integration steps, is spent."""
         caller, tally = self.system.caller, self.system.tally
         if caller is None:
@@ -193,8 +193,8 @@ class SimulatorApparatus:
         own = self.system.simulator
         return run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
-    one_after_another = staticmethod(one_after_another)
-    in_turn = staticmethod(in_turn)
+    each_directly_after = staticmethod(each_directly_after)
+    in_sequence = staticmethod(in_sequence)
 
 
 def _change(values: FloatArray, table: RunTable) -> FloatArray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
-from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, judged
+from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, audits_of
 from probewise.diagnosis.system.apparatus import ON_NOISE, SimulatorApparatus
 from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, first_of
 from probewise.errors import ParameterError
@@ -50,7 +50,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     system = System.of(simulator, own)
     z, predicted, where = _typical_point(system, own)
     sd, noise = _noise(simulator, own, predicted)
-    system = system.standing_still(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
+    system = system.with_converged_step(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
@@ -66,7 +66,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     stride = -(-len(own) // _MOST_ROWS)
     laid = PlanTemplates.of_built(expected, cast(Plan, own), built, most=_SETTINGS)
     laid = replace(laid, slopes=laid.slopes[::stride], columns=laid.columns[::stride])
-    found, cosines = judged(laid, cast(Any, names), simulator.unit)
+    found, cosines = audits_of(laid, cast(Any, names), simulator.unit)
     effects = tuple(_with_rows(effect, reasons) for effect in found)
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words

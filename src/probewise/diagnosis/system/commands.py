@@ -13,9 +13,9 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable
-from probewise.systems.joining import behind, unused_name
+from probewise.systems.joining import append_tables, unused_name
 
-__all__ = ["RunCommand", "in_turn", "one_after_another", "run_commands"]
+__all__ = ["RunCommand", "each_directly_after", "in_sequence", "run_commands"]
 
 _LEAST_ROWS = 4
 _MOST_RUNS = 4  # recorded runs to start from
@@ -139,13 +139,13 @@ def _next_start(table: RunTable) -> float:
     return float(table.time_s.max()) + (float(np.median(apart)) if apart else 10 * gap)
 
 
-def one_after_another(commands: Sequence[RunCommand], after: Plan) -> Plan:
+def each_directly_after(commands: Sequence[RunCommand], after: Plan) -> Plan:
     """Concatenate runs, each as if it came next, for one joint prediction."""
     first, *more = (command.table for command in commands)
-    return cast(Plan, behind(first, more))
+    return cast(Plan, append_tables(first, more))
 
 
-def in_turn(commands: Sequence[RunCommand], after: Plan) -> Plan:
+def in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
     """Concatenate runs in turn: unless time restarts with each run, each begins after the one before."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []
@@ -155,7 +155,7 @@ def in_turn(commands: Sequence[RunCommand], after: Plan) -> Plan:
             later = float(out[-1].time_s[-1]) + _next_start(recorded) - float(recorded.time_s.max())
             table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
         out.append(table)
-    return cast(Plan, behind(out[0], out[1:]))
+    return cast(Plan, append_tables(out[0], out[1:]))
 
 
 def _distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:

@@ -25,7 +25,7 @@ from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, S
 from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import About
 from probewise.systems.forms.readings import since_start_of_run
-from probewise.systems.forms.stop import MeterStop, stop_of
+from probewise.systems.forms.stop import MeterStop, find_meter_stop
 
 __all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
 
@@ -90,8 +90,8 @@ def diagnose_system(
 def _step_of_the_repair(diagnosis: Diagnosis) -> float | None:
     """Return the integration step that the repaired law needs; None if it is that of the diagnosis, or out of reach.
 
-    A law that lacks an effect is integrated as precisely as its own large residuals ask for. The repair may leave so
-    little that the integration's error is what remains.
+    The step was chosen for the residuals of the law without effects. The repair may leave residuals so small that the
+    integration error would dominate them.
     """
     system = cast(SimulatorApparatus, diagnosis.apparatus).system
     model, table = diagnosis.repaired, cast(RunTable, diagnosis.recording.plan)
@@ -100,7 +100,7 @@ def _step_of_the_repair(diagnosis: Diagnosis) -> float | None:
         return None
     tolerance = _STANDS_STILL * float(np.median(model.noise_sd))
     try:
-        still = system.standing_still(table, model.theta[:_N_HALVED], effects, tolerance=tolerance)
+        still = system.with_converged_step(table, model.theta[:_N_HALVED], effects, tolerance=tolerance)
     except ParameterError:  # a friction or a bound that no step meets exactly
         return None
     return still.max_step if still.max_step < system.max_step else None
@@ -167,8 +167,8 @@ def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
 def without_stop(
     simulator: Simulator, table: RunTable, recording: RunRecording
 ) -> tuple[RunRecording, MeterStop | None]:
-    """Leave out, with a note, readings at which the meter stands at the end of its range; and return where it ends."""
-    found = stop_of(as_recording(simulator, table), simulator.reading)
+    """Leave out, with a note, readings at an undeclared stop of the meter; return the rest, and the stop if any."""
+    found = find_meter_stop(as_recording(simulator, table), simulator.reading)
     if found is None:
         return recording, None
     stop, rows = found
@@ -259,7 +259,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     found = _from_best_start(system, recording, law)
     sd = _sd(system.simulator, table, recording, found)
     for _ in range(4):
-        finer = system.standing_still(table, system.theta(found.z[None, :]), tolerance=_STANDS_STILL * sd)
+        finer = system.with_converged_step(table, system.theta(found.z[None, :]), tolerance=_STANDS_STILL * sd)
         if finer is system:
             break
         system = finer
@@ -281,7 +281,8 @@ def _from_best_start(system: System, recording: Recording, law: NoiseLaw) -> Fit
 def _lengthened(model: Model, recording: Recording) -> list[FloatArray]:
     """Fit the beginning of every run, then more of it: coordinates (n_params,) of the lowest fits.
 
-    A system that swings has a valley for every period that a run may be wrong by; over its first quarter it has few.
+    For an oscillating system the objective has a local minimum for every period by which a run can be wrong; over the
+    first quarter of a run there are few.
     """
     system, table = cast(System, model.sensor), cast(RunTable, recording.plan)
     if not (system.in_bulk and table.has_time):

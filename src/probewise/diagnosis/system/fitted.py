@@ -16,7 +16,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, System, write_run_table
 from probewise.systems.forms import About
-from probewise.systems.forms.again import Recorded, recorded
+from probewise.systems.forms.rebinding import Recorded, recorded
 
 __all__ = ["bound_about", "calibrated_of", "fitted_system", "repaired_of"]
 

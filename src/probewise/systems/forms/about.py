@@ -1,4 +1,4 @@
-"""The fit about which forms are bound: the sensitivity of the readings there sets each form's scale."""
+"""The reference fit for binding forms: the sensitivity of its readings sets the scale of each form."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without
 
 @dataclass(frozen=True, eq=False)
 class About:
-    """A fit of a system: coordinates z (n_params,), and the sd of a reading.
+    """The reference fit about which forms are bound: coordinates z (n_params,), and the sd of a reading.
 
     The typical size of a form changes the readings here by one sd, so that no quantity needs a declared range.
     """

@@ -17,7 +17,7 @@ from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable
 
-__all__ = ["Act", "Form", "Moments", "Say", "with_unit"]
+__all__ = ["Act", "ChangePoints", "Form", "Say", "with_unit"]
 
 Act = Callable[[Any, FloatArray, RunTable], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the table; returns the value with the effect."""
@@ -27,7 +27,7 @@ Say = Callable[[FloatArray, FloatArray], str]
 
 
 @dataclass(frozen=True)
-class Moments:
+class ChangePoints:
     """Candidate positions of a change point (times, row numbers or values of a column), a form's last parameter.
 
     `gated`: the form has no effect before the change point and the same effect everywhere after it, so that one
@@ -46,7 +46,7 @@ class Moments:
             return table.covariates[self.column]
         return np.arange(float(len(table))) if self.by_row else table.time_s
 
-    def thinned(self) -> Moments:
+    def thinned(self) -> ChangePoints:
         """Keep a subset of positions that is dense enough to detect a change."""
         stride = -(-(len(self.at) - 1) // self.few)
         return replace(self, at=(*self.at[:-1:stride], self.at[-1]))
@@ -78,16 +78,16 @@ class Form:
         Function that describes it in a sentence.
     absent
         Parameter values at which it has no effect, if these are not zero amplitudes.
-    moments
+    change_points
         Candidate positions of its change point, if it has one.
     joined
         Converts an entry and the fitted amounts of its columns to a setting, if amplitudes do not scale independently.
     expression
         Formula of a proposal, which has no name in the vocabulary; otherwise empty.
     alternatives
-        The same form with other priors and entries, of which one holds: variants beside this one.
+        Mutually exclusive variants of this form, with other priors and entries; this form itself is another variant.
     fixed
-        Names of parameters that this one of several alternatives has at zero; reports leave them out.
+        Names of parameters that are zero in this one of several alternatives; reports leave them out.
     """
 
     name: str
@@ -100,7 +100,7 @@ class Form:
     amplitudes: tuple[int, ...]
     says: Say
     absent: Mapping[int, float] = field(default_factory=dict)
-    moments: Moments | None = None
+    change_points: ChangePoints | None = None
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
     expression: str = ""
     alternatives: tuple[Form, ...] = ()
@@ -139,7 +139,7 @@ class Form:
 
     @property
     def n_peaks(self) -> int:
-        """Number of equivalent modes: phases span two turns, so each wave has two, and of two either may be first."""
+        """Number of equivalent modes: two for a wave, whose phase spans two turns; four if two waves may swap."""
         if self.joined is None:
             return 1
         return 2 if first_of(self.name) is None else 4
@@ -161,11 +161,11 @@ class Form:
 
     def variants(self) -> tuple[Form, ...]:
         """Return its alternatives, or a variant for each interval between readings in which a change point may lie."""
-        if self.moments is None:
+        if self.change_points is None:
             return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
         last = list(self.marginals)[-1]
         out = []
-        for low, high in pairwise(self.moments.at):
+        for low, high in pairwise(self.change_points.at):
             entries = self.entries.copy()
             entries[:, :, -1] = 0.5 * (low + high)
             out.append(replace(self, marginals={**self.marginals, last: Uniform(low, high)}, entries=entries))
@@ -173,22 +173,22 @@ class Form:
 
     def coarse(self) -> Form:
         """Return the form with a thinned set of change points."""
-        return self if self.moments is None else replace(self, moments=self.moments.thinned())
+        return self if self.change_points is None else replace(self, change_points=self.change_points.thinned())
 
     def gates(self, plan: Any) -> Gates | None:
         """Return the ungated form, and the change points at the middle of each interval."""
-        if self.moments is None or not self.moments.gated:
+        if self.change_points is None or not self.change_points.gated:
             return None
         always = self.entries[0].copy()
         always[:, -1] = -np.inf
-        along = self.moments.along(plan)
-        return Gates(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.moments.at)]))
+        along = self.change_points.along(plan)
+        return Gates(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.change_points.at)]))
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw the change point from all intervals by weight."""
-        if self.moments is None:
+        if self.change_points is None:
             return theta
-        at = np.array(self.moments.at)
+        at = np.array(self.change_points.at)
         chosen = rng.choice(len(weights), len(theta), p=weights)
         drawn = at[chosen] + np.diff(at)[chosen] * rng.random(len(theta))
         return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)

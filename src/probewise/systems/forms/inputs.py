@@ -12,7 +12,7 @@ from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
-from probewise.systems.forms.ends import ends_of
+from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, Form, Say, with_unit
 from probewise.systems.forms.modulations import wave_joined, wave_numbers
 from probewise.systems.forms.readings import earlier
@@ -76,7 +76,7 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
                 about,
                 f"input_delay:{name}",
                 "tau_s",
-                _on(name, late_where_held if holds else late),
+                _on(name, delayed_while_held if holds else delayed),
                 about.duration,
                 about.time_unit,
                 says,
@@ -130,7 +130,7 @@ def _form_with_sizes(
 
 
 def _cut_off(about: About, name: str, low: float, high: float) -> Iterator[Form]:
-    ends = ends_of(low, high)
+    ends = clipping_levels(low, high)
     if ends is None:
         return
 
@@ -152,7 +152,7 @@ def _cut_off(about: About, name: str, low: float, high: float) -> Iterator[Form]
             lambda m, s: (
                 f"{name} {'rises' if m[0] > ends.middle else 'falls'} no further than {with_unit(m[0], s[0], '')}"
             ),
-            absent={0: ends.nowhere},
+            absent={0: ends.out_of_reach},
         )
 
 
@@ -202,7 +202,7 @@ def _dead_zone(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
 
 
-def late(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+def delayed(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     """Delay a column by a dead time, within runs."""
     values = np.atleast_2d(c)
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
@@ -211,7 +211,7 @@ def late(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return out
 
 
-def late_where_held(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+def delayed_while_held(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     """Return the mean over each gap of a column that is held between rows and delayed by a dead time.
 
     The column at any time has the held value of one dead time earlier.

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
-from probewise.systems.forms.form import Moments, with_unit
+from probewise.systems.forms.form import ChangePoints, with_unit
 from probewise.systems.table import RunTable
 
 __all__ = [
@@ -44,7 +44,7 @@ class Modulation:
     says: Callable[[str, str, FloatArray, FloatArray], str]
     covariates: tuple[str, ...]
     amplitudes: tuple[int, ...] = (0,)
-    moments: Moments | None = None
+    change_points: ChangePoints | None = None
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
 
@@ -88,10 +88,10 @@ def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
     along = np.unique(np.arange(float(len(table))) if by_row else table.time_s)
     stride = -(-(len(along) - 1) // _MOST_MOMENTS)
     at = tuple(np.append(along[:-1:stride], along[-1]).tolist())
-    moments, name = Moments(at, by_row, gated), "at_row" if by_row else "at_s"
+    change_points, name = ChangePoints(at, by_row, gated), "at_row" if by_row else "at_s"
 
     def over(theta: FloatArray, rows: RunTable) -> FloatArray:
-        return np.asarray(theta[:, :1] * (moments.along(rows) > theta[:, 1:2]))
+        return np.asarray(theta[:, :1] * (change_points.along(rows) > theta[:, 1:2]))
 
     def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
         when = f"row {mean[1]:.0f}" if by_row else with_unit(mean[1], sd[1], time_unit)
@@ -104,7 +104,7 @@ def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
         units=lambda unit: (unit, "row" if by_row else time_unit),
         says=says,
         covariates=("row",) if by_row else ("time",),
-        moments=moments,
+        change_points=change_points,
     )
 
 

@@ -18,7 +18,7 @@ from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
-from probewise.systems.forms.form import Act, Form, Moments, with_unit
+from probewise.systems.forms.form import Act, ChangePoints, Form, with_unit
 from probewise.systems.forms.modulations import wave_numbers
 from probewise.systems.motion import Motion
 from probewise.systems.table import RunTable
@@ -159,7 +159,7 @@ def _switch(about: About, name: str) -> Iterator[Form]:
             f"{own.reading} shifts by {with_unit(mean[0], sd[0], own.unit)} where {name} is above "
             f"{with_unit(mean[1], sd[1], '')}: a proposal, not a known effect"
         ),
-        moments=Moments(tuple(at), by_row=False, gated=True, column=name),
+        change_points=ChangePoints(tuple(at), by_row=False, gated=True, column=name),
         expression=f"a {text}",
     )
 

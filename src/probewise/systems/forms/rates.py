@@ -13,7 +13,7 @@ from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
-from probewise.systems.forms.ends import ends_of
+from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, with_unit
 from probewise.systems.forms.modulations import wave_joined, wave_numbers
 from probewise.systems.motion import Limit, Motion
@@ -154,8 +154,8 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
 
 
 def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
-    """Bind a bound of a state; what it stops is lost, or a state that it drives takes up a share, as of an overflow."""
-    ends = ends_of(float(np.nanmin(values)), float(np.nanmax(values)))
+    """Bind a bound of a state: the rate beyond it is lost, or a state downstream takes up a share (overflow)."""
+    ends = clipping_levels(float(np.nanmin(values)), float(np.nanmax(values)))
     if ends is None:
         return
     others = [other for other in about.states if other != state]
@@ -198,7 +198,7 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
         entries(None),
         (),
         says,
-        absent={0: ends.nowhere},
+        absent={0: ends.out_of_reach},
         fixed=fixed(None),
     )
     if np.nanmax(about.rms(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:

@@ -46,7 +46,7 @@ def modulated(
             how.entries(typical),
             how.amplitudes,
             lambda mean, sd: how.says(what, unit, mean, sd),
-            moments=how.moments,
+            change_points=how.change_points,
             joined=how.joined,
         )
 
@@ -205,7 +205,10 @@ def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
 
 
 def way(values: FloatArray, table: RunTable) -> FloatArray:
-    """Return the sign of change of values (n_samples, n_points) within runs; rests keep the last, starts the next."""
+    """Return the sign of change, (n_samples, n_points), from the previous row of the run.
+
+    Where values do not change it is the sign before; at the start of a run, the first that is not 0.
+    """
     out = np.zeros_like(values)
     for rows in table.rows_by_scan():
         if len(rows) < 2:

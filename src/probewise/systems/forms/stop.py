@@ -1,4 +1,4 @@
-"""A meter that stands at the end of its range: seen from the readings alone, before any fit."""
+"""A meter that stops at an undeclared end of its range, found from equal extreme readings before any fit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["MeterStop", "stop_of"]
+__all__ = ["MeterStop", "find_meter_stop"]
 
 _LEAST_IN_TURN = 5  # successive readings of exactly one value
 _LEAST_IN_ALL = 8
@@ -28,10 +28,10 @@ _OFTEN = 0.1
 
 @dataclass(frozen=True)
 class MeterStop(NoiseEffect):
-    """A meter that reads no further than `level`, its noise included; rows that stand there say nothing else.
+    """Saturation of a meter at `level`, after the noise: its readings there are exactly equal.
 
-    It changes no noise: the readings at the stop are left out of the fit. In the stored model it is the form
-    `saturation` of the reading.
+    Readings at the stop are left out of the fit, so that the noise model does not change. In the stored model it is
+    the form `saturation` of the reading.
     """
 
     level: float
@@ -77,11 +77,11 @@ class MeterStop(NoiseEffect):
         return f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip() + ", where the meter stops"
 
 
-def stop_of(recording: Recording, reading: str = "the reading") -> tuple[MeterStop, BoolArray] | None:
-    """Find the value at the end of their range at which readings stand, and the rows that do, (n_points,).
+def find_meter_stop(recording: Recording, reading: str = "the reading") -> tuple[MeterStop, BoolArray] | None:
+    """Find an extreme value that readings repeat exactly, and the mask of the rows at it, (n_points,).
 
-    Noise makes each reading another one, unless the meter stops after it. None where nothing stands, where the lattice
-    of the readings is too coarse to tell, and at an end of the range that was declared.
+    Noise makes successive readings differ, unless the meter saturates after the noise. None if no extreme value is
+    repeated in succession, if rounding is too coarse to tell, or if that end of the range was declared.
     """
     usable = np.flatnonzero(recording.usable)
     readings, scan = recording.readings[usable], recording.plan.scan[usable]
@@ -105,7 +105,7 @@ def stop_of(recording: Recording, reading: str = "the reading") -> tuple[MeterSt
 
 
 def _longest(stands: BoolArray, in_turn: BoolArray) -> int:
-    """Return the largest number of successive rows that stand."""
+    """Return the largest number of successive rows at the stop."""
     longest = current = int(stands[0])
     for at, follows in zip(stands[1:].tolist(), in_turn.tolist(), strict=True):
         current = (current + 1 if follows else 1) if at else 0

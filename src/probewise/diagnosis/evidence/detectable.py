@@ -10,10 +10,10 @@ from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw
 
-__all__ = ["log_visible"]
+__all__ = ["log_detectable"]
 
 
-def log_visible(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
+def log_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
     """Return the log probability that every effect of a fit has a detectable size (lambda).
 
     The size is the norm of the effect's change after a (linearised) refit of all other parameters; its posterior is

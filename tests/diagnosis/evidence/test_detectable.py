@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.special import log_ndtr
 
+from probewise.diagnosis.evidence.detectable import log_detectable
 from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
-from probewise.diagnosis.evidence.visible import log_visible
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.noise.law import white
@@ -32,11 +32,11 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
     null = Model(sensor, (), PLAN)
     left = fit(null, Recording(PLAN, predicted), z[: sensor.n_params], law.at_least(SD), tolerance=1e-6).residuals
     expected = float(log_ndtr(np.linalg.norm(left) / SD - LEAST_VISIBLE))
-    assert log_visible(found, law, np.arange(len(PLAN))) == pytest.approx(expected, abs=0.1 + 0.02 * abs(expected))
+    assert log_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(expected, abs=0.1 + 0.02 * abs(expected))
 
 
 def test_a_fit_without_effects_is_as_it_is():
     model = Model(default_sensor(EXTENT, 1), (), PLAN)
     predicted, slopes = model.jacobian(np.zeros(7))
     found = Fit(model, np.zeros(7), predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
-    assert log_visible(found, white(len(PLAN)), np.arange(len(PLAN))) == 0.0
+    assert log_detectable(found, white(len(PLAN)), np.arange(len(PLAN))) == 0.0

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.priors import Uniform
 
-__all__ = ["Ends", "ends_of"]
+__all__ = ["ClippingLevels", "clipping_levels"]
 
 _LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
 _LEAST = 0.003  # of a range, that is cut off at least by what is looked for
@@ -17,7 +17,7 @@ _N_LEVELS = 10  # of either
 
 
 @dataclass(frozen=True, eq=False)
-class Ends:
+class ClippingLevels:
     """Clipping levels between `low` and `high`: above `middle` a ceiling, otherwise a floor."""
 
     low: float
@@ -30,7 +30,7 @@ class Ends:
 
     @property
     def levels(self) -> FloatArray:
-        """Settings to look with, (n_levels,): dense at both ends."""
+        """Trial levels for the template bank, (n_levels,): dense at both ends."""
         range_ = self.high - self.low
         ceilings = self.high - range_ * np.geomspace(_LEAST, 0.97 * (1 - _LOWER_PART), _N_LEVELS)
         return np.append(ceilings, self.low + range_ * np.geomspace(_LEAST, 0.97 * _LOWER_PART, _N_LEVELS))
@@ -41,11 +41,11 @@ class Ends:
         return Uniform(self.low, self.high)
 
     @property
-    def nowhere(self) -> float:
+    def out_of_reach(self) -> float:
         """A level out of reach, which has no effect."""
         return self.high + (self.high - self.low)
 
 
-def ends_of(low: float, high: float) -> Ends | None:
+def clipping_levels(low: float, high: float) -> ClippingLevels | None:
     """Build from a range of values; None if they are constant."""
-    return Ends(low, high) if low < high else None
+    return ClippingLevels(low, high) if low < high else None

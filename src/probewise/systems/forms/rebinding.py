@@ -19,14 +19,14 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import RunTable
 
-__all__ = ["Recorded", "forms_again", "own_of_runs", "recorded"]
+__all__ = ["Recorded", "has_value_per_run", "rebind_forms", "recorded"]
 
-_OWN_OF_RUNS = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
+_WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """The table that forms were bound about, and the readings and states that the fit predicts there, (n_points,)."""
+    """What rebinding needs of a reference fit: its table, and its predicted readings and states, (n_points,)."""
 
     table: RunTable
     predicted: FloatArray
@@ -64,11 +64,11 @@ class _AsRecorded(About):
 
 
 def recorded(about: About) -> Recorded:
-    """Store the table and the predictions about which forms are bound."""
+    """Extract from a reference fit what rebinding its forms needs."""
     return Recorded(about.table, about.predicted, about.states)
 
 
-def forms_again(
+def rebind_forms(
     names: Iterable[str], simulator: Simulator, known: Recorded, *, more_runs: Iterable[str] = ()
 ) -> dict[str, Form]:
     """Rebind forms about a recording, by name; names of other effects are left out.
@@ -99,7 +99,7 @@ def forms_again(
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
         beyond = Recorded(longer, known.predicted[rows], {name: values[rows] for name, values in known.states.items()})
         again = forms_of(_AsRecorded(system, longer, np.zeros(system.n_params), 1.0, beyond))
-        found |= {name: form for name, form in again.items() if own_of_runs(name)}
+        found |= {name: form for name, form in again.items() if has_value_per_run(name)}
     if any(name.startswith(PROPOSAL) for name in wanted):
         found |= {form.name: form for form in proposals(about)}
     lost = [name for name in wanted if name.startswith(PROPOSAL) and name not in found]
@@ -108,13 +108,13 @@ def forms_again(
     return {name: found[name] for name in wanted if name in found}
 
 
-def own_of_runs(name: str) -> bool:
+def has_value_per_run(name: str) -> bool:
     """Return whether a form has one value per run."""
-    return name.partition(":")[0] in _OWN_OF_RUNS
+    return name.partition(":")[0] in _WITH_VALUE_PER_RUN
 
 
 def _with_more_runs(table: RunTable, more_runs: list[str]) -> RunTable:
-    """Repeat the last row in each of further runs."""
+    """Append one row for each further run: the last row of the table, under the run's name."""
     if not more_runs or table.run is None:
         return table
     rows = np.append(np.arange(len(table)), np.full(len(more_runs), len(table) - 1))

@@ -31,7 +31,7 @@ import numpy as np
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.experiment import ArmOverGrid, Experiment, Step, explore
 from probewise.experiment.acquisition import inquire
-from probewise.experiment.loop import from_scratch
+from probewise.experiment.method import from_scratch
 from probewise.experiment.particles import Particles, update
 from probewise.inquiry import Grid
 from probewise.scene import SHAPES, HypothesisScene

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from probewise.calibration import Calibration, Climb, Found, calibrate, default_prior, ladder
 from probewise.calibration.ladder import climb_orders
+from probewise.calibration.order_search import search_order
 from probewise.calibration.posing import Posing
 from probewise.calibration.vouching import missed, share_apart
 from probewise.recordings import Disc, HalfPlane, Plan, Recording
@@ -49,7 +51,7 @@ def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording
     posing, rng = Posing(mirrored, default_prior), np.random.default_rng(3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ladder, "missed", lambda *_, **__: "")
-        found, why = climb_orders(posing, (1,), n_live=50, rng=rng)
+        found, why = climb_orders(posing, (1,), search=partial(search_order, posing, n_live=50), rng=rng)
     made = found[1].result
     assert not why
     assert isinstance(made, Climb)
@@ -60,7 +62,9 @@ def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording
 
 @pytest.fixture(scope="module")
 def vouched(recording: Recording) -> Found:
-    return climb_orders(Posing(recording, default_prior), (1,), n_live=50, rng=np.random.default_rng(4))[0][1]
+    posing = Posing(recording, default_prior)
+    search = partial(search_order, posing, n_live=50)
+    return climb_orders(posing, (1,), search=search, rng=np.random.default_rng(4))[0][1]
 
 
 def test_a_search_vouches_for_a_climb_that_missed_nothing(vouched: Found) -> None:
@@ -74,7 +78,7 @@ def test_the_order_that_missed_a_peak_and_those_above_are_searched(
     """Of three the second is chosen; the first stays as it is."""
     searched: list[int] = []
 
-    def search(_: Posing, n: int, __: np.random.Generator, **___: object) -> Found:
+    def search(n: int, _: np.random.Generator) -> Found:
         searched.append(n)
         return calibration.chosen.found
 
@@ -82,12 +86,11 @@ def test_the_order_that_missed_a_peak_and_those_above_are_searched(
     assert isinstance(made, Climb)
     low = Found(replace(made, log_z_of_clouds=made.log_z_of_clouds - 90.0), None)
     monkeypatch.setattr(ladder, "missed", lambda *_, **__: "it lies elsewhere")
-    monkeypatch.setattr(ladder, "search_order", search)
     found = ladder._vouched_for(
         Posing(recording, default_prior),
         {1: low, 2: vouched, 3: low},
         np.random.default_rng(0),
-        n_live=40,
+        search=search,
         progress=None,
     )
     assert searched == [2, 3]

@@ -199,7 +199,7 @@ def calibrate(
     why: tuple[str, ...] = ()
     if quick:
         climbing = rng.spawn(1)[0]
-        climbed, why = climb_orders(posing, wanted, n_live=n_live, rng=climbing, progress=progress)
+        climbed, why = climb_orders(posing, wanted, search=search, rng=climbing, progress=progress)
     each = {n: partial(one, n, streams[n], found=climbed.get(n), why=why) for n in wanted}
     if executor is None:
         fits = [fit() for fit in each.values()]

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray
 from probewise.calibration.around_peak import around_peak, missed_about
 from probewise.calibration.climb import N_SNAPSHOTS, Climb, Rung, climb
 from probewise.calibration.compensation import Compensation
-from probewise.calibration.order_search import Found, Progress, search_order
+from probewise.calibration.order_search import Found, Progress, Search
 from probewise.calibration.peaks import Peak, find_peaks
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
@@ -56,11 +56,11 @@ def climb_orders(
     posing: Posing,
     orders: Sequence[int],
     *,
-    n_live: int,
+    search: Search,
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> tuple[dict[int, Found], tuple[str, ...]]:
-    """Climb as far as the greatest of the orders.
+    """Climb as far as the greatest of the orders; `search` serves those that must be searched in full.
 
     Returns
     -------
@@ -79,9 +79,9 @@ def climb_orders(
     for n in range(1, highest + 1):
         needed = n == 1 or peaks[n].log_likelihood - peaks[n - 1].log_likelihood > _NEEDED
         found[n] = next_order(
-            posing, n, found.get(n - 1), peaks[n], climbing, needed=needed, n_live=n_live, progress=progress
+            posing, n, found.get(n - 1), peaks[n], climbing, needed=needed, search=search, progress=progress
         )
-    return _vouched_for(posing, {n: found[n] for n in orders}, climbing, n_live=n_live, progress=progress), ()
+    return _vouched_for(posing, {n: found[n] for n in orders}, climbing, search=search, progress=progress), ()
 
 
 def _vouched_for(
@@ -89,7 +89,7 @@ def _vouched_for(
     found: dict[int, Found],
     rng: np.random.Generator,
     *,
-    n_live: int,
+    search: Search,
     progress: Progress | None,
 ) -> dict[int, Found]:
     """Let a search of the prior vouch for the chosen order; where it does not, search that and those above in full.
@@ -107,7 +107,7 @@ def _vouched_for(
         if why:
             note = f"searched in full, since the quick way missed a peak of order {chosen}: {why}"
             for n in (n for n in found if n >= chosen):
-                full = search_order(posing, n, rng, n_live=n_live, progress=progress)
+                full = search(n, rng)
                 found[n] = replace(full, notes=(*full.notes, f"order {n} was {note}"))
 
 
@@ -129,7 +129,7 @@ def next_order(
     rng: np.random.Generator,
     *,
     needed: bool,
-    n_live: int,
+    search: Search,
     progress: Progress | None,
 ) -> Found:
     """Climb to an order; search it in full where the climb is doubtful.
@@ -148,8 +148,8 @@ def next_order(
         Source of randomness.
     needed
         Whether the readings need the last Gaussian, so that the posterior lies about the peak.
-    n_live
-        Live points where it is searched in full.
+    search
+        Searches it in full.
     progress
         Told of each temperature.
     """
@@ -165,7 +165,7 @@ def next_order(
         if not made.warnings:
             return Found(made, None)
         notes.extend(made.warnings)
-    full = search_order(posing, n, rng, n_live=n_live, progress=progress)
+    full = search(n, rng)
     note = f"order {n} was searched in full, since the climb to it is doubtful: {'; '.join(dict.fromkeys(notes))}"
     return replace(full, notes=(*full.notes, note))
 

@@ -12,7 +12,7 @@ from probewise.calibration.climb import Climb, Rung
 from probewise.calibration.posing import Posing
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 
-__all__ = ["Found", "Progress", "report_of", "search_order"]
+__all__ = ["Found", "Progress", "Search", "report_of", "search_order"]
 
 Progress = Callable[[int, RoundSummary | Rung], None]
 
@@ -36,6 +36,10 @@ class Found:
     def evidence(self) -> NestedResult | Climb | Weighted:
         """The result whose log Z is used: the refined one if it is reliable."""
         return self.refined if self.refined is not None and self.refined.sound else self.result
+
+
+Search = Callable[[int, np.random.Generator], Found]
+"""Function that searches the whole prior of an order."""
 
 
 def search_order(

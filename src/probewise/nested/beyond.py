@@ -20,6 +20,7 @@ from probewise._arrays import FloatArray
 from probewise.nested.evaluate import Evaluator, Points, Samplable
 from probewise.nested.repartition import principal_root
 from probewise.nested.result import NestedResult
+from probewise.nested.space import is_within
 
 __all__ = ["NOTHING", "Beyond", "look_beyond"]
 
@@ -145,10 +146,8 @@ def _drawn(
     evaluate: Evaluator, centre: FloatArray, scale: float, root: FloatArray, n_draws: int, rng: np.random.Generator
 ) -> _Level:
     """Draw and evaluate; draws outside the space count without points."""
-    space = evaluate.space
     tried = centre + scale * rng.standard_normal((n_draws, len(centre))) @ root.T
-    inside = ((tried > space.low) & (tried < space.high)).all(axis=1)
-    return _Level(centre, scale, n_draws, evaluate(tried[inside], rng))
+    return _Level(centre, scale, n_draws, evaluate(tried[is_within(evaluate.space, tried)], rng))
 
 
 def _evidence(levels: list[_Level], root: FloatArray) -> float:

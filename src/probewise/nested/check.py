@@ -15,9 +15,9 @@ with hops between the modes that are then known.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -52,6 +52,8 @@ _SHARE = 0.1  # of the first run's live points times nats, spent on the second e
 _LEAST_LIVE = 40
 _MATTERS = 0.25  # errors by which a lost mode raises log Z, above which the run is repeated
 _MISSING = 1.0  # errors by which a mode that is still lost raises log Z, above which it is a doubt
+
+_Part = TypeVar("_Part", Lost, Beyond)
 
 
 class SingleRun(Protocol):
@@ -154,14 +156,14 @@ def checked(
 
     now, lost, above, estimates, modes = first, NOTHING_LOST, NOTHING, list[NestedResult](), None
     try:
-        lost = _search_lost(first, problem, int(budget - spent), rng)
+        lost = _missing_part(look_for_lost, NOTHING_LOST, first, problem, int(budget - spent), rng)
         spent += lost.n_calls
         if _raised(first, lost.not_in(first)) > _MATTERS:
             modes = _modes(first, lost, problem, rng)
             chain = move if isinstance(move, SliceMove) else SliceMove()
             again = estimated(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
             now = first if again is None else again
-        above = _search_above(now, problem, int(budget - spent), rng)
+        above = _missing_part(look_beyond, NOTHING, now, problem, int(budget - spent), rng)
         spent += above.n_calls
         curved = False
         for route in _second_routes(now, problem, move, least_live, rng):
@@ -198,28 +200,21 @@ def checked(
     return _with_peaks(_with_check(now, name, estimates, n_check, spent), lost, above)
 
 
-def _search_lost(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Lost:
-    """Look for modes that died out, where the prior's coordinates allow it."""
-    if not _has_coordinates(problem):
-        return NOTHING_LOST
+def _missing_part(
+    look: Callable[..., _Part],
+    nothing: _Part,
+    run: NestedResult,
+    problem: Samplable,
+    max_calls: int,
+    rng: np.random.Generator,
+) -> _Part:
+    """Look for a part of the posterior that a run missed, where the prior's coordinates allow it."""
+    if not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
+        return nothing
     try:
-        return look_for_lost(first, problem, max_calls=max_calls, rng=rng)
+        return look(run, problem, max_calls=max_calls, rng=rng)
     except NotConvergedError as error:
         raise _FailedError(str(error)) from error
-
-
-def _search_above(first: NestedResult, problem: Samplable, max_calls: int, rng: np.random.Generator) -> Beyond:
-    """Look for a higher peak, where the prior's coordinates allow it."""
-    if not _has_coordinates(problem):
-        return NOTHING
-    try:
-        return look_beyond(first, problem, max_calls=max_calls, rng=rng)
-    except NotConvergedError as error:
-        raise _FailedError(str(error)) from error
-
-
-def _has_coordinates(problem: Samplable) -> bool:
-    return hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")
 
 
 def _modes(first: NestedResult, lost: Lost, problem: Samplable, rng: np.random.Generator) -> Clusters:

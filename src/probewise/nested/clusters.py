@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -46,6 +46,20 @@ class Clusters:
         inverse = np.asarray(np.linalg.inv(root), dtype=np.float64)
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         return Clusters(mean, root, inverse, log_det, np.array([len(g) for g in groups]))
+
+    def counterparts(self, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Map points of clusters `home` to clusters `goal`, affinely; also return the log of the volume ratio.
+
+        Points are (n, n_params), clusters (n,).
+        """
+        z = np.matmul(self.inverse_root[home], (u - self.mean[home])[:, :, None])
+        moved = self.mean[goal] + np.matmul(self.root[goal], z)[:, :, 0]
+        return moved, self.log_det[goal] - self.log_det[home]
+
+    def joined(self, other: Clusters) -> Clusters:
+        """Return these clusters, then the others."""
+        pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return Clusters(*map(np.concatenate, pairs))
 
     def without(self, u: FloatArray, home: IntArray) -> Clusters:
         """Compute each point's cluster without the point itself.

@@ -10,6 +10,7 @@ from probewise._arrays import FloatArray
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.moves import SliceMove, Tally
+from probewise.nested.space import is_within
 
 __all__ = ["HoppingMove"]
 
@@ -45,11 +46,9 @@ class HoppingMove:
         modes, space = self.modes, evaluate.space
         home = modes.assign(now.u)
         goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
-        z = np.einsum("nij,nj->ni", modes.inverse_root[home], now.u - modes.mean[home])
-        u = modes.mean[goal] + np.einsum("nij,nj->ni", modes.root[goal], z)
-        log_growth = modes.log_det[goal] - modes.log_det[home]
+        u, log_growth = modes.counterparts(now.u, home, goal)
         # The way back must be the same map.
-        able = ((u > space.low) & (u < space.high)).all(axis=1) & (modes.assign(u) == goal)
+        able = is_within(space, u) & (modes.assign(u) == goal)
         level = now.log_density - log_growth - rng.standard_exponential(len(home))
         rows = able.nonzero()[0]
         theta, log_density = space.leave(u[rows])

@@ -24,7 +24,7 @@ from probewise.nested.mixture import single
 from probewise.nested.moves import SliceMove
 from probewise.nested.repartition import principal_root
 from probewise.nested.result import NestedResult
-from probewise.nested.space import Space, unbounded
+from probewise.nested.space import Space, is_within, unbounded
 from probewise.nested.weights import n_effective
 
 __all__ = ["NOTHING_LOST", "Hill", "Lost", "look_for_lost"]
@@ -180,7 +180,7 @@ class _Climbers:
             for _ in range(_TRIES):
                 t = low[climbing] + (high - low)[climbing] * rng.random(climbing.size)
                 u = now.u[climbing] + t[:, None] * line[climbing]
-                inside = ((u > space.low) & (u < space.high)).all(axis=1).nonzero()[0]
+                inside = is_within(space, u).nonzero()[0]
                 tried = evaluate(u[inside], rng)
                 higher = (tried.log_likelihood > now.log_likelihood[climbing[inside]]).nonzero()[0]
                 now.put(climbing[inside[higher]], tried, higher)

@@ -190,7 +190,7 @@ class SliceMove:
             turned, along, follow = ((kinds == one).nonzero()[0] for one in (_FRAME, _AXIS, _DIFFERENCE))
             if turned.size:
                 frame = frames[rows[turned], at[turned]]
-                toward[turned] = self.width * np.matmul(metrics.root[measure[turned]], frame[:, :, None])[:, :, 0]
+                toward[turned] = self.width * np.matmul(metrics.each.root[measure[turned]], frame[:, :, None])[:, :, 0]
             if along.size:
                 which = axis[rows[along], at[along]]
                 least, widening = metrics.conditional[measure[along], which], metrics.widening[measure[along], which]
@@ -342,14 +342,11 @@ class _Metrics:
     A metric that includes the start stretches the lines through it and shrinks the others; with
     150 live points in 20 dimensions that alone raised log Z by more than one.
 
-    The rows are the clusters, then each chain's version of its starting cluster: mean, Cholesky factor, its inverse
-    and log determinant, and for every axis the conditional sd and the ratio of the marginal sd to it.
+    The rows are the clusters, then each chain's version of its starting cluster: `each`, and for every axis the
+    conditional sd and the ratio of the marginal sd to it.
     """
 
-    mean: FloatArray
-    root: FloatArray
-    inverse_root: FloatArray
-    log_det: FloatArray
+    each: Clusters
     conditional: FloatArray
     widening: FloatArray
     n_clusters: int
@@ -363,19 +360,12 @@ class _Metrics:
         )
         # A start that is not a live point is in no cluster.
         own_home = np.where(same.any(axis=1), home, -1)
-        own = clusters.without(u, home)
-        root, inverse = (
-            np.concatenate([clusters.root, own.root]),
-            np.concatenate([clusters.inverse_root, own.inverse_root]),
-        )
-        conditional = 1.0 / np.sqrt((inverse**2).sum(axis=1))
+        each = clusters.joined(clusters.without(u, home))
+        conditional = 1.0 / np.sqrt((each.inverse_root**2).sum(axis=1))
         return cls(
-            np.concatenate([clusters.mean, own.mean]),
-            root,
-            inverse,
-            np.concatenate([clusters.log_det, own.log_det]),
+            each,
             conditional,
-            np.sqrt((root**2).sum(axis=2)) / conditional,
+            np.sqrt((each.root**2).sum(axis=2)) / conditional,
             len(clusters),
             own_home,
             np.argmax(same, axis=1),
@@ -387,10 +377,7 @@ class _Metrics:
 
     def hop(self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
         """Map points to their counterparts in other clusters; also return the log of the volume ratio."""
-        here, there = self.row_of(rows, home), self.row_of(rows, goal)
-        z = np.matmul(self.inverse_root[here], (u - self.mean[here])[:, :, None])
-        moved = self.mean[there] + np.matmul(self.root[there], z)[:, :, 0]
-        return moved, self.log_det[there] - self.log_det[here]
+        return self.each.counterparts(u, self.row_of(rows, home), self.row_of(rows, goal))
 
 
 @dataclass(frozen=True, eq=False)

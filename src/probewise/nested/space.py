@@ -9,11 +9,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError
 from probewise.priors import Coordinates, Prior, require_prior
 
-__all__ = ["Space", "space_of", "unbounded"]
+__all__ = ["Space", "is_within", "space_of", "unbounded"]
 
 _EDGE = 1e-15
 
@@ -47,6 +47,11 @@ class Space(Protocol):
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates from the prior, (n, n_params)."""
         ...
+
+
+def is_within(space: Space, u: FloatArray) -> BoolArray:
+    """Return whether coordinates (n, n_params) lie within the range of the space, (n,)."""
+    return np.asarray(((u > space.low) & (u < space.high)).all(axis=1))
 
 
 @dataclass(frozen=True)

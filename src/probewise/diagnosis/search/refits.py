@@ -173,8 +173,10 @@ class Refits:
         # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
         # a change point is far better known.
         law = self.law_of(refitted[best])
-        if not law.alike(problem.law):
-            weights = templates.weights(scores_about(Linearised.of(parent.found, law)))
+        if len(weights) > 1 and not law.alike(problem.law):
+            known = (own_scores for about, own_scores in seen if law.alike(about.law))
+            later = next(known, None)
+            weights = templates.weights(scores_about(Linearised.of(parent.found, law)) if later is None else later)
         if np.isfinite(log_z[best]):  # otherwise no variant could be fitted, and weights are unchanged
             weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
             weights[tried] = np.exp(log_z - log_z[best])

@@ -74,17 +74,19 @@ def diagnose_system(
     table = table_for(simulator, table)
     require_rng(rng)
     require_progress(progress)
-    prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
-    told = _with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
-    diagnosis = diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
+
+    def diagnosed(simulator: Simulator) -> Diagnosis:
+        prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
+        told = _with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
+        return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
+
+    diagnosis = diagnosed(simulator)
     step = _step_of_the_repair(diagnosis)
     if step is None:
         return diagnosis
     assert simulator.law is not None
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
-    finer = replace(simulator, law=replace(simulator.law, max_step_s=step))
-    prepared = prepare_system(finer, table, source=source, notes=notes, progress=progress)
-    return diagnose_prepared(prepared, thorough=thorough, progress=progress, rng=rng)
+    return diagnosed(replace(simulator, law=replace(simulator.law, max_step_s=step)))
 
 
 def _step_of_the_repair(diagnosis: Diagnosis) -> float | None:

@@ -170,19 +170,19 @@ class Refits:
         # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
-        # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
-        # a change point is far better known.
-        law = self.law_of(refitted[best])
-        if len(weights) > 1 and not law.alike(problem.law):
-            known = (own_scores for about, own_scores in seen if law.alike(about.law))
-            later = next(known, None)
-            weights = templates.weights(scores_about(Linearised.of(parent.found, law)) if later is None else later)
         if np.isfinite(log_z[best]):  # otherwise no variant could be fitted, and weights are unchanged
             weights = weights / weights[tried[0]] * np.exp(log_z[0] - log_z[best])
             weights[tried] = np.exp(log_z - log_z[best])
             weights /= weights.sum()
         log_share = parent.log_share - math.log(weights[tried[best]]) - math.log(len(weights)) - against
         log_share += math.log(effect.n_peaks)
+        # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
+        # a change point is far better known. To first order: only where that leads to the variant of the best refit.
+        law = self.law_of(refitted[best])
+        if len(weights) > 1 and not law.alike(problem.law):
+            later = next((own_scores for about, own_scores in seen if law.alike(about.law)), None)
+            later = templates.weights(scores_about(Linearised.of(parent.found, law)) if later is None else later)
+            weights = later if int(np.argmax(later)) == tried[best] else weights
         return refitted[best].as_share(log_share, {**parent.weights, effect.name: weights}), by_noise
 
     def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:

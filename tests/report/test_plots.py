@@ -106,7 +106,9 @@ def test_drawing_on_given_axes_makes_no_figure_of_its_own(recording):
     assert plots.readings_by_orientation(recording, ax=given) is given
 
 
-def test_many_long_names_above_a_single_round_leave_room_for_its_bar():
-    """Warnings are errors: matplotlib warns where a legend leaves its axes no height."""
-    names = [f"noise that neighbouring readings share and an effect with a long name, number {k}" for k in range(9)]
+@pytest.mark.parametrize("repeats", [1, 2, 5])
+def test_many_long_names_above_a_single_round_leave_room_for_its_bar(repeats):
+    """Warnings are errors: matplotlib warns where a legend leaves its axes no width or no height."""
+    long = " and ".join(["noise that neighbouring readings share and an effect with a long name"] * repeats)
+    names = [f"{long}, number {k}" for k in range(9)]
     assert plots.png(plots.beliefs_by_round({"round 1: 30 readings": dict.fromkeys(names, 1 / 9)}), dpi=30)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import textwrap
 from collections.abc import Sequence
 from typing import Any, TypeAlias, cast
 from weakref import WeakSet
@@ -32,6 +33,7 @@ __all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "
 __all__ += ["label_axes", "legend_above", "legend_below", "new_figure", "plain_numbers", "png", "stack_of_axes", "svg"]
 
 _LETTERS_PER_IN = 16.2  # letters per inch of a legend, about
+_LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
 _AXES = "axes of matplotlib: figure.add_subplot(), figure.subplots(), or None for a figure of its own"
 _LEAST_IN_FULL = 1e-5  # of an axis' length: shorter ones have labels with a power of ten
 
@@ -145,11 +147,15 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
 
 
 def legend_above(ax: Axes, *, title: str = "") -> None:
-    """Place the legend above the axes, in as many columns as fit, so that it never covers data."""
+    """Place the legend above the axes, in as many columns as fit, so that it never covers data.
+
+    A label that is wider than the axes is broken into lines: otherwise the layout would leave no room for the axes.
+    """
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
         return
     room = _LETTERS_PER_IN * ax.get_position().width * cast(Figure, ax.figure).get_figwidth()
+    labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
     n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width(labels, n) < room), 1)
     ax.legend(
         handles,
@@ -168,8 +174,9 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
 
 
 def _legend_width(labels: Sequence[str], n_columns: int) -> int:
-    """Estimate a legend's width in letters: matplotlib fills its first columns first; a line sample counts as five."""
-    return sum(max(map(len, column)) + 6 for column in np.array_split(np.array(labels, dtype=np.object_), n_columns))
+    """Estimate a legend's width in letters: matplotlib fills its first columns first."""
+    columns = np.array_split(np.array(labels, dtype=np.object_), n_columns)
+    return sum(max(map(len, "\n".join(column).split("\n"))) + _LINE_SAMPLE for column in columns)
 
 
 def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -12,6 +13,7 @@ from probewise.report.plots.canvas import BLUE, CYCLE, GREY, SMALL_PT, axes_or_n
 
 _SHOWN = 6  # hypotheses with a colour of their own
 _VISIBLE = 0.02  # probability from which a hypothesis has one
+_LETTERS_A_LINE = 70  # of the legend above the bars, about
 
 
 def hypothesis_probabilities(
@@ -66,8 +68,9 @@ def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | N
             highest[name] = max(p, highest.get(name, 0.0))
     likely = [name for name in sorted(highest, key=lambda name: -highest[name]) if highest[name] >= _VISIBLE]
     shown = likely[:_SHOWN]
-    # Long names take a row of the legend each, above the bars.
-    ax = axes_or_new(ax, size_in=(6.6, 1.1 + 0.5 * len(beliefs) + 0.2 * (len(shown) + 1)))
+    # Long names take a line or more of the legend each, above the bars.
+    lines = sum(math.ceil(len(name) / _LETTERS_A_LINE) for name in shown) + 1
+    ax = axes_or_new(ax, size_in=(6.6, 1.1 + 0.5 * len(beliefs) + 0.2 * lines))
     at = -np.arange(len(beliefs), dtype=np.float64)
     left = np.zeros(len(beliefs))
     for name, colour in zip(shown, CYCLE, strict=False):

@@ -15,32 +15,32 @@ from probewise.errors import ParameterError
 SMALLEST_AND_LARGEST = (0.05, 25.0)
 """Smallest and largest sd of the mixture, in typical sizes: with a narrower range large effects are misnamed."""
 
-_N_SCALES = 9
+_N_SCALES = 9  # over that range; a wider one has as many to a decade
 
 
 @dataclass(frozen=True)
 class HeavyTailedPrior:
-    """Scale mixture of normal distributions about zero, with sds from 0.05 to 25 times a typical size.
+    """Scale mixture of normal distributions about zero, by default with sds from 0.05 to 25 times a typical size.
 
-    The weights are equal, so the density falls about as 1/abs(x) over three decades and is
-    proper. With `positive` the distribution is folded onto x >= 0. `smallest` is the smallest sd, in typical sizes.
+    The weights are equal, so the density falls about as 1/abs(x) between the smallest and the largest sd and is
+    proper. With `positive` the distribution is folded onto x >= 0. `smallest` and `largest` are the smallest and the
+    largest sd, in typical sizes.
     """
 
     typical: float
     positive: bool = False
     smallest: float = SMALLEST_AND_LARGEST[0]
+    largest: float = SMALLEST_AND_LARGEST[1]
 
     def __post_init__(self) -> None:
         if not 0 < self.typical < math.inf:
             raise ParameterError("HeavyTailedPrior(typical)", self.typical, "greater than 0, finite")
-        if not 0 < self.smallest < SMALLEST_AND_LARGEST[1]:
-            raise ParameterError(
-                "HeavyTailedPrior(smallest)", self.smallest, f"0 < smallest < {SMALLEST_AND_LARGEST[1]:g}"
-            )
+        if not 0 < self.smallest < self.largest:
+            raise ParameterError("HeavyTailedPrior(smallest)", self.smallest, f"0 < smallest < {self.largest:g}")
 
     @cached_property
     def _sds(self) -> FloatArray:
-        return self.typical * np.geomspace(self.smallest, SMALLEST_AND_LARGEST[1], _N_SCALES)
+        return self.typical * _scales(self.smallest, self.largest)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape."""
@@ -64,7 +64,7 @@ class HeavyTailedPrior:
         else:
             tail, sign = np.minimum(u, 1.0 - u), np.where(u < 0.5, -1.0, 1.0)
         goal = -np.log(2 * np.clip(tail, 1e-15, 0.5))
-        return np.asarray(sign * self.typical * _quantiles(self.smallest).at(goal))
+        return np.asarray(sign * self.typical * _quantiles(self.smallest, self.largest).at(goal))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, any shape."""
@@ -98,11 +98,17 @@ class _Quantiles:
         return np.asarray(x)
 
 
+def _scales(smallest: float, largest: float) -> FloatArray:
+    """Return the sds of the mixture, in typical sizes."""
+    decades = math.log(largest / SMALLEST_AND_LARGEST[1]) / math.log(SMALLEST_AND_LARGEST[1] / SMALLEST_AND_LARGEST[0])
+    return np.asarray(np.geomspace(smallest, largest, _N_SCALES + max(math.ceil((_N_SCALES - 1) * decades), 0)))
+
+
 @lru_cache(maxsize=16)
-def _quantiles(smallest: float) -> _Quantiles:
+def _quantiles(smallest: float, largest: float) -> _Quantiles:
     """Tabulate the quantiles once for every typical size: smooth, monotone, from 0."""
-    sds = np.geomspace(smallest, SMALLEST_AND_LARGEST[1], _N_SCALES)
-    size = np.concatenate([[0.0], np.geomspace(1e-5, 300.0, 600)])
+    sds = _scales(smallest, largest)
+    size = np.concatenate([[0.0], np.geomspace(1e-5, 12.0 * largest, 600)])
     upper = 0.5 * erfc(size[:, None] / (sds * math.sqrt(2))).mean(axis=-1)
     return _Quantiles(sds, -np.log(2 * upper), size)
 

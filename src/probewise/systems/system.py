@@ -28,6 +28,7 @@ __all__ = ["System", "SystemChain"]
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
 _MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row
+_CONVERGING = 4.0  # factor by which halving the step reduces the change at least, if the law is smooth
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +236,13 @@ class System:
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
     def with_converged_step(
-        self, table: RunTable, theta: FloatArray, effects: Sequence[NamedEffect[Any]] = (), *, tolerance: float
+        self,
+        table: RunTable,
+        theta: FloatArray,
+        effects: Sequence[NamedEffect[Any]] = (),
+        *,
+        tolerance: float,
+        or_finest: bool = False,
     ) -> System:
         """Halve the integration step until predictions change by less than a tolerance (rms).
 
@@ -250,6 +257,8 @@ class System:
             Effects added to the law.
         tolerance
             Tolerance, in the unit of a reading.
+        or_finest
+            Return the finest step within reach, instead of an error, if predictions converge but still change by more.
 
         Raises
         ------
@@ -259,7 +268,7 @@ class System:
         if self.simulator.law is None:
             return self
         places, now = RowsInRuns(table), self
-        coarse = now.chain(table, effects).predict(theta, table)
+        coarse, before = now.chain(table, effects).predict(theta, table), np.inf
         while True:
             finer = replace(now, max_step=now.max_step / 2)
             fine = finer.chain(table, effects).predict(theta, table)
@@ -267,13 +276,18 @@ class System:
             moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2))) if there.any() else np.inf
             if moved <= tolerance:
                 return now
-            now, coarse = finer, fine
-            if places.n_steps(now.max_step).sum() > _MOST_STEPS + len(places.row_at_place):
+            if or_finest and moved < before / _CONVERGING and not finer._is_within_reach(places):
+                return now
+            now, coarse, before = finer, fine, moved
+            if not now._is_within_reach(places):
                 raise ParameterError(
                     "rates",
                     f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
                     "a law that some thousand steps integrate: set max_step_s, or bring simulate with an integrator",
                 )
+
+    def _is_within_reach(self, places: RowsInRuns) -> bool:
+        return bool(places.n_steps(self.max_step).sum() <= _MOST_STEPS + len(places.row_at_place))
 
 
 def given_columns(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:

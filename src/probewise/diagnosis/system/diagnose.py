@@ -90,7 +90,7 @@ def diagnose_system(
 
 
 def _step_of_the_repair(diagnosis: Diagnosis) -> float | None:
-    """Return the integration step that the repaired law needs; None if it is that of the diagnosis, or out of reach.
+    """Return the integration step that the repaired law needs, or the finest within reach; None if it was used already.
 
     The step was chosen for the residuals of the law without effects. The repair may leave residuals so small that the
     integration error would dominate them.
@@ -102,7 +102,8 @@ def _step_of_the_repair(diagnosis: Diagnosis) -> float | None:
         return None
     tolerance = _STANDS_STILL * float(np.median(model.noise_sd))
     try:
-        still = system.with_converged_step(table, model.theta[:_N_HALVED], effects, tolerance=tolerance)
+        theta = model.theta[:_N_HALVED]
+        still = system.with_converged_step(table, theta, effects, tolerance=tolerance, or_finest=True)
     except ParameterError:  # a friction or a bound that no step meets exactly
         return None
     return still.max_step if still.max_step < system.max_step else None
@@ -125,7 +126,7 @@ def prepare_system(
     told = _with_call_count(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
-    apparatus = SimulatorApparatus(About(system, table, found.z, sd), stop)
+    apparatus = SimulatorApparatus(About(system, table, found.z, sd, misfit=float(np.std(found.residuals)) / sd), stop)
     begun = replace(system, first=found.z)
     told("building the effects")
     effects = apparatus.effects(recording, begun) if bound else {}

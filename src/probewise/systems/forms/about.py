@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, Form
@@ -30,12 +31,14 @@ class About:
     """The reference fit about which forms are bound: coordinates z (n_params,), and the sd of a reading.
 
     The typical size of a form changes the readings here by one sd, so that no quantity needs a declared range.
+    `misfit` is the rms of the fit's residuals, in sds: what is left out may be larger by it.
     """
 
     system: System
     table: RunTable
     z: FloatArray
     sd: float
+    misfit: float = field(default=1.0, kw_only=True)
 
     @cached_property
     def theta(self) -> FloatArray:
@@ -132,10 +135,15 @@ class About:
             return None
         return _TYPICAL * guess / float(np.median(rms[rms > _UNSEEN]))
 
+    def amplitude(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
+        """Return the prior of an amplitude of this typical size: as large as the misfit may need."""
+        plain = HeavyTailedPrior(typical, positive=positive)
+        return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
+
     def sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
         """Find the range of sizes (n_tried,) that change the readings by a plausible amount; None if there is none."""
         rms = self.rms(stage, act, tried[:, None])
-        there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST))
+        there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST * max(self.misfit, 1.0)))
         if not there.size:
             return None
         low, high = int(there.min()), int(there.max())

@@ -8,7 +8,6 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -110,7 +109,7 @@ def _linear(about: About, name: str, act: Act, guess: float, unit: str, says: Sa
         yield Form(
             name,
             Stage.INPUT,
-            {"a": HeavyTailedPrior(typical)},
+            {"a": about.amplitude(typical)},
             (unit,),
             covariates,
             act,
@@ -177,7 +176,7 @@ def _wave(about: About, name: str) -> Iterator[Form]:
     if typical is None:
         return
     marginals = {
-        "a": HeavyTailedPrior(typical, positive=True),
+        "a": about.amplitude(typical, positive=True),
         "period": LogUniform(float(1 / waves[-1]) * 0.98, float(2 / waves[0])),
         "phase": Uniform(-2 * np.pi, 2 * np.pi),
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,11 +34,11 @@ _PHASE = Uniform(-2 * np.pi, 2 * np.pi)  # two turns, so that one of a phase's e
 class Modulation:
     """A function of the rows: `over(theta, table)` (n_samples, n_points), 0 where the amplitude is 0.
 
-    `marginals` is a function of the typical amplitude; `units` and `says` of the unit of the varying quantity.
+    `marginals` is a function of the amplitude's prior; `units` and `says` of the unit of the varying quantity.
     """
 
     over: Callable[[FloatArray, RunTable], FloatArray]
-    marginals: Callable[[float], Mapping[str, Any]]
+    marginals: Callable[[HeavyTailedPrior], Mapping[str, Any]]
     entries: Callable[[float], FloatArray]
     units: Callable[[str], tuple[str, ...]]
     says: Callable[[str, str, FloatArray, FloatArray], str]
@@ -56,7 +56,7 @@ def drift(table: RunTable, time_unit: str) -> Modulation:
     """Linear drift in time as recorded: a t."""
     return Modulation(
         over=lambda theta, rows: theta[:, :1] * rows.time_s,
-        marginals=lambda size: {"a": HeavyTailedPrior(size)},
+        marginals=lambda a: {"a": a},
         entries=_one,
         units=lambda unit: (f"{unit}/{time_unit}",),
         says=lambda what, unit, mean, sd: f"{what} drifts by {with_unit(mean[0], sd[0], unit)} per {time_unit}",
@@ -74,7 +74,7 @@ def column(name: str, table: RunTable) -> Modulation:
 
     return Modulation(
         over=over,
-        marginals=lambda size: {"a": HeavyTailedPrior(size)},
+        marginals=lambda a: {"a": a},
         entries=_one,
         units=lambda unit: (f"{unit} per {name}",),
         says=lambda what, unit, mean, sd: f"{what} changes by {with_unit(mean[0], sd[0], unit)} per unit of {name}",
@@ -99,7 +99,7 @@ def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
 
     return Modulation(
         over=over,
-        marginals=lambda size: {"a": HeavyTailedPrior(size), name: Uniform(at[0], at[-1])},
+        marginals=lambda a: {"a": a, name: Uniform(at[0], at[-1])},
         entries=lambda size: np.array([[[size, 0.5 * (at[0] + at[-1])]]]),
         units=lambda unit: (unit, "row" if by_row else time_unit),
         says=says,
@@ -124,7 +124,7 @@ def per_run(table: RunTable) -> Modulation:
 
     return Modulation(
         over=over,
-        marginals=lambda size: {f"values[{name}]": HeavyTailedPrior(size) for name in names},
+        marginals=lambda a: {f"values[{name}]": a for name in names},
         entries=lambda size: size * np.eye(len(names))[None, :, :],
         units=lambda unit: (unit,) * len(names),
         says=says,
@@ -166,8 +166,8 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
 
     return Modulation(
         over=over,
-        marginals=lambda size: {
-            "a": HeavyTailedPrior(size, positive=True),
+        marginals=lambda a: {
+            "a": replace(a, positive=True),
             "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
             "phase": _PHASE,
         },

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -149,7 +148,7 @@ def _switch(about: About, name: str) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {"a": HeavyTailedPrior(typical), "at": Uniform(at[0], at[-1])},
+        {"a": about.amplitude(typical), "at": Uniform(at[0], at[-1])},
         (own.unit, name),
         (name,),
         act,
@@ -186,7 +185,7 @@ def _square_wave(about: About) -> Iterator[Form]:
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
         {
-            "a": HeavyTailedPrior(typical),
+            "a": about.amplitude(typical),
             "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
             "phase": Uniform(-1.0, 1.0),
             "share": Uniform(0.03, 0.97),
@@ -254,7 +253,7 @@ def _proposal(
     yield Form(
         f"formula:{side}:{target}:{term.text}",
         stage,
-        {"a": HeavyTailedPrior(typical)},
+        {"a": about.amplitude(typical)},
         ("",),
         where,
         act,

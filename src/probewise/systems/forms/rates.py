@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -79,7 +78,7 @@ def _term(
     yield Form(
         name,
         Stage.RATE,
-        {"a": HeavyTailedPrior(typical)},
+        {"a": about.amplitude(typical)},
         (unit,),
         (f"state:{other}", "time"),
         act,
@@ -93,7 +92,8 @@ def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
     def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
         return value.with_friction(state, theta[:, :1])
 
-    prior = about.log_uniform(Stage.RATE, act, _rate_scale(about, state) * np.geomspace(1e-6, 1.0, 25))
+    # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
+    prior = about.log_uniform(Stage.RATE, act, _rate_scale(about, state) * np.geomspace(1e-6, 30.0, 31))
     if prior is not None:
         entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
         yield Form(
@@ -132,7 +132,7 @@ def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
     if typical is None:
         return
     marginals = {
-        "a": HeavyTailedPrior(typical, positive=True),
+        "a": about.amplitude(typical, positive=True),
         "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
         "phase": Uniform(-2 * np.pi, 2 * np.pi),
     }

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import HeavyTailedPrior
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
@@ -39,7 +38,7 @@ def modulated(
         yield Form(
             name,
             stage,
-            how.marginals(typical),
+            how.marginals(about.amplitude(typical)),
             how.units(unit),
             (*how.covariates, *covariates),
             act,
@@ -120,7 +119,7 @@ def _settling(about: About) -> Iterator[Form]:
     yield Form(
         "settling",
         Stage.OFFSET,
-        {"a": HeavyTailedPrior(typical), "tau_s": LogUniform(shortest, 2 * longest)},
+        {"a": about.amplitude(typical), "tau_s": LogUniform(shortest, 2 * longest)},
         (unit, time_unit),
         ("time", "run"),
         act,
@@ -234,7 +233,7 @@ def _hysteresis(about: About) -> Iterator[Form]:
     yield Form(
         "hysteresis",
         Stage.OFFSET,
-        {"a": HeavyTailedPrior(about.sd)},
+        {"a": about.amplitude(about.sd)},
         (unit,),
         ("previous",),
         act,
@@ -269,7 +268,7 @@ def _bend(about: About) -> Iterator[Form]:
     yield Form(
         "nonlinearity",
         Stage.BEND,
-        {"a": HeavyTailedPrior(typical), "power": LogUniform(0.4, 5.0)},
+        {"a": about.amplitude(typical), "power": LogUniform(0.4, 5.0)},
         ("1", "1"),
         ("level",),
         act,

@@ -172,6 +172,17 @@ def test_a_heavy_tail_is_exact_at_both_ends():
     assert LogHeavyTailedPrior(0.1).from_unit(np.array([0.5]))[0] == pytest.approx(1.0)
 
 
+def test_a_wider_heavy_tailed_prior_reaches_farther_and_loses_little_density_near_zero():
+    plain, wide = HeavyTailedPrior(0.5), HeavyTailedPrior(0.5, largest=25_000.0)
+    u = np.array([0.01, 0.3, 0.5, 0.9, 0.9999])
+    np.testing.assert_allclose(wide.to_unit(wide.from_unit(u)), u, atol=1e-8)
+    z = np.concatenate([[0.0], np.geomspace(1e-6, 1e6, 4001)])
+    assert 2 * np.trapezoid(np.exp(wide.log_prob(z)), z) == pytest.approx(1.0, abs=1e-3)
+    assert wide.from_unit(np.array([1 - 1e-6]))[0] > 500 * plain.from_unit(np.array([1 - 1e-6]))[0]
+    lost = plain.log_prob(np.array([0.5])) - wide.log_prob(np.array([0.5]))
+    assert 0.0 < lost[0] < 1.0
+
+
 def test_a_heavy_tail_of_sizes_that_show_gives_little_to_those_that_do_not():
     """Sds from one typical size: an eighth lies below half of that, where the wide mixture has nearly a half."""
     wide, shown = HeavyTailedPrior(0.5, positive=True), HeavyTailedPrior(0.5, positive=True, smallest=1.0)

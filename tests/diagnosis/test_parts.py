@@ -33,7 +33,7 @@ from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.judgement.judged import Hypothesis, credible_set, decide
 from probewise.diagnosis.light_sensor.covariates import covariate_of
-from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, steps_within_scans, white
+from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, steps_within_scans, white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places, places_of_effect, windows
@@ -217,7 +217,7 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     basis, _ = np.linalg.qr(np.concatenate([slopes, np.eye(p)]))
     augmented = np.concatenate([r, np.zeros(p)])
     residual = augmented - basis @ (basis.T @ augmented)
-    problem = Linearised(basis, residual, white(n), 1.0, n)
+    problem = Linearised(basis, residual, white_noise(n), 1.0, n)
     blocks = Blocks.of(problem, [template], ["t"])
     found = block_log_bayes_factors(blocks, residual[:, None], n)[0, 0]
 
@@ -272,7 +272,7 @@ def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
     slopes = rng.normal(size=(n, p))
     templates = [slopes[:, :1] + 0.1 * rng.normal(size=(n, 1)), rng.normal(size=(n, 2)), 3.0 * slopes[:, 1:2]]
     basis, _ = np.linalg.qr(np.concatenate([slopes, np.zeros((p, p))]))
-    problem = Linearised(basis, np.zeros(n + p), white(n), 1.0, n)
+    problem = Linearised(basis, np.zeros(n + p), white_noise(n), 1.0, n)
     wanted = []
     for columns in templates:
         unit = columns / np.linalg.norm(columns, axis=0)
@@ -284,7 +284,7 @@ def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
 def test_null_draws_have_nothing_in_the_span_of_the_fit():
     rng = np.random.default_rng(1)
     basis, _ = np.linalg.qr(rng.normal(size=(40, 3)))
-    problem = Linearised(basis, np.zeros(40), white(37), 1.0, 37)
+    problem = Linearised(basis, np.zeros(40), white_noise(37), 1.0, 37)
     draws = problem.draws(200, rng=rng)
     np.testing.assert_allclose(basis.T @ draws, 0.0, atol=1e-12)
     assert np.mean(np.sum(draws**2, axis=0)) == pytest.approx(37, rel=0.05)
@@ -294,7 +294,7 @@ def test_templates_in_one_direction_have_cosine_one_and_absorbed_ones_none():
     rng = np.random.default_rng(5)
     slopes = rng.normal(size=(50, 2)) * 1e5
     basis, _ = np.linalg.qr(np.concatenate([slopes, np.eye(2)]))
-    problem = Linearised(basis, np.zeros(52), white(50), 1.0, 50)
+    problem = Linearised(basis, np.zeros(52), white_noise(50), 1.0, 50)
     first = rng.normal(size=(50, 1))
     second = 3 * first + slopes @ np.array([[1e-5], [2e-5]])
     assert projected_cosine(problem, first, second) == pytest.approx(1.0, abs=1e-6)
@@ -315,7 +315,7 @@ def test_a_bump_is_found_where_it_is():
     r = rng.normal(size=n) + 2.0 * ((time >= 60) & (time < 75))
     basis, _ = np.linalg.qr(np.concatenate([np.ones((n, 1)) * 100, np.eye(1)]))
     augmented = np.concatenate([r, [0.0]])
-    problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white(n), 1.0, n)
+    problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white_noise(n), 1.0, n)
     covariates = [Covariate("time", time, np.arange(n)), Covariate("level", rng.normal(size=n), np.arange(n))]
     found = places(problem, covariates, ("s",), r, problem.draws(400, rng=rng))
     assert found[0].covariate == "time"
@@ -394,7 +394,7 @@ def test_noise_statistics_see_memory_tails_and_level():
 
 def test_white_noise_is_left_as_it_is():
     r = np.arange(5.0)
-    np.testing.assert_array_equal(white(5)(r), r)
+    np.testing.assert_array_equal(white_noise(5)(r), r)
     twice = NoiseLaw(np.full(5, 2.0), np.zeros(5), np.zeros(5, dtype=np.bool_))
     assert twice.log_det() == pytest.approx(5 * math.log(2))
 

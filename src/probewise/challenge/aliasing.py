@@ -12,7 +12,7 @@ from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
 from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.fitting.fit import Fit, fit
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Recording
 from probewise.sensor import Stage
@@ -48,7 +48,7 @@ def cosines(
     """
     found = refit.refit(clean, changed)
     usable = np.flatnonzero(clean.usable)
-    problem = Linearised.of(found, white(len(usable)))
+    problem = Linearised.of(found, white_noise(len(usable)))
     extent = Extent.of(clean)
     out: dict[str, float] = {}
     for name, kind in vocabulary.items():
@@ -88,7 +88,7 @@ def residual_with_one_named(
     """
     found, adjusted = refit.refit(clean, both), refit.without_null_residuals(clean, both)
     usable = np.flatnonzero(clean.usable)
-    problem = Linearised.of(found, white(len(usable)))
+    problem = Linearised.of(found, white_noise(len(usable)))
     out = {}
     for name in names:
         effect = VOCABULARY[name].for_extent(Extent.of(clean))
@@ -126,7 +126,7 @@ def _with_effect(
     rss = float(found.residuals @ found.residuals)
     # The floor of the sd is a tenth of the residual: small enough for accuracy, large enough not to force an exact fit.
     floor = 0.1 * np.sqrt(rss / len(found.residuals))
-    return fit(model, adjusted, start_z, white(len(found.residuals), least=floor), tolerance=0.02)
+    return fit(model, adjusted, start_z, white_noise(len(found.residuals), least=floor), tolerance=0.02)
 
 
 def _cosine(found: Fit, by: Fit) -> float:

@@ -10,7 +10,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.laplace import weigh
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.effects import Extent
 from probewise.recordings.plan import Recording
@@ -83,5 +83,5 @@ def _with_one_more(found: Fit, recording: Recording, extent: Extent) -> Iterator
 
 
 def _white_noise_fit(model: Model, recording: Recording, start: FloatArray) -> Fit:
-    whitener = white(int(recording.usable.sum()), least=_NOISE_SD)
+    whitener = white_noise(int(recording.usable.sum()), least=_NOISE_SD)
     return fit(model, recording, start, whitener, tolerance=0.02)

@@ -113,7 +113,7 @@ class Apparatus(Protocol):
         """Return the possible next measurements; `level` (n_points,) are the expected readings of the plan."""
         ...
 
-    def each_directly_after(self, commands: Sequence[Any], after: Plan) -> Plan:
+    def as_alternatives(self, commands: Sequence[Any], after: Plan) -> Plan:
         """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
         ...
 

@@ -14,7 +14,7 @@ from probewise.diagnosis.advice.next_scans import PredictiveNormal, Rival, mutua
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.light_sensor.commands import commands, excerpts
-from probewise.diagnosis.light_sensor.scheduling import each_directly_after, in_sequence, postponed
+from probewise.diagnosis.light_sensor.scheduling import as_alternatives, in_sequence, postponed
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
@@ -205,7 +205,7 @@ def test_a_scan_over_a_new_sheet_takes_longer():
 
 def test_a_battery_is_expected_to_stay_as_it_was():
     plan = paper_plan()
-    everywhere, rows = each_directly_after(commands(plan)[:3], plan), rows_of(commands(plan)[:3])
+    everywhere, rows = as_alternatives(commands(plan)[:3], plan), rows_of(commands(plan)[:3])
     assert [len(own) for own in rows] == [101, 101, 102]
     assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor())
@@ -213,6 +213,6 @@ def test_a_battery_is_expected_to_stay_as_it_was():
     assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
     after = replace(plan, covariates={"battery_mv": gone, "never_mv": np.full(len(plan), np.nan)})
-    everywhere = each_directly_after(commands(plan)[:3], after)
+    everywhere = as_alternatives(commands(plan)[:3], after)
     assert set(everywhere.covariates) == {"battery_mv"}
     assert (everywhere.covariates["battery_mv"] == gone[-2]).all()

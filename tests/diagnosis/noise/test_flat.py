@@ -55,7 +55,7 @@ def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
     mean = np.linspace(-9.0, 9.0, 37)[:, None]
     reading = STEP
     cell = norm.cdf((reading + STEP / 2 - mean) / SIGMA) - norm.cdf((reading - STEP / 2 - mean) / SIGMA)
-    misfit = np.array([LAW.misfit(row[None], np.array([SIGMA]), 1)[0] for row in reading - mean])
+    misfit = np.array([LAW.minus_log_likelihood(row[None], np.array([SIGMA]), 1)[0] for row in reading - mean])
     # A difference of cumulatives is exact to 1e-16 of one, and no better: far out it says nothing.
     told = cell[:, 0] > 1e-12
     wanted = -np.log(cell[told, 0] / STEP) - 0.5 * np.log(2 * np.pi)
@@ -92,8 +92,8 @@ def test_laws_of_one_kind_are_taken_together():
     laws = [NoiseLaw(one, 0 * one, one > 1, flat=flat, sigma=1 / flat) for flat in (1.0, 3.0)]
     z = np.linspace(-2, 2, 5)[:, None]
     together, sigma = forms(laws), np.array([1.0, 1 / 3])
-    apart = np.concatenate([law.misfit(z, law.scale(z)) for law in laws])
-    np.testing.assert_allclose(together.misfit(z, sigma, 5), apart)
+    apart = np.concatenate([law.minus_log_likelihood(z, law.scale(z)) for law in laws])
+    np.testing.assert_allclose(together.minus_log_likelihood(z, sigma, 5), apart)
     np.testing.assert_allclose(together.scale(z, 5), sigma)
 
 
@@ -162,7 +162,7 @@ def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
     recording = Recording(plan, STEP * np.round((mean + noise_sd * rng.standard_normal(len(plan))) / STEP)).unlimited()
     nodes = NoiseModel((), recording, rounding=STEP).laws(mean)
     off = (recording.readings - mean)[:, None]
-    each = np.array([-law.misfit(off, law.scale(off))[0] for law in nodes.laws])
+    each = np.array([-law.minus_log_likelihood(off, law.scale(off))[0] for law in nodes.laws])
 
     log_sigma = np.linspace(np.log(STEP / 30), np.log(30 * STEP), 4001)
     near = -np.abs(off)  # where a difference of cumulatives is exact

@@ -15,7 +15,7 @@ from scipy.stats import norm
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.evidence.laplace import weigh
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.noise.law import NoiseLaw, Tail, white
+from probewise.diagnosis.noise.law import NoiseLaw, Tail, white_noise
 from probewise.diagnosis.noise.models import NoiseModel, log_lost_value, rough_sd
 from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Extent, Outliers, SignalDependentNoise
 from probewise.recordings import Recording, paper_plan, two_way_plan
@@ -47,7 +47,7 @@ def log_mixture(z: np.ndarray, share: float, times: float) -> np.ndarray:
 def test_the_misfit_is_minus_the_log_density(share, times):
     z = np.random.default_rng(0).normal(size=(50, 3)) * [1.0, 2.0, 5.0]
     sigma = np.array([1.0, 1.5, 2.0])
-    found = heavy(share, times).misfit(z, sigma) + 25 * math.log(2 * math.pi)
+    found = heavy(share, times).minus_log_likelihood(z, sigma) + 25 * math.log(2 * math.pi)
     wanted = -np.sum(log_mixture(z / sigma, share, times) - np.log(sigma), axis=0)
     np.testing.assert_allclose(found, wanted)
 
@@ -58,18 +58,20 @@ def test_the_scale_is_where_the_misfit_is_least():
     law = heavy(0.05, 8.0)
     sigma = law.scale(z)
     trial = sigma * np.linspace(0.8, 1.25, 451)
-    misfits = np.array([float(law.misfit(z, np.array([s]))[0]) for s in trial])
+    misfits = np.array([float(law.minus_log_likelihood(z, np.array([s]))[0]) for s in trial])
     assert trial[misfits.argmin()] == pytest.approx(float(sigma[0]), rel=1e-2)
 
 
 def test_a_tail_that_is_not_there_is_none():
     """With the floor of the scale too: white and nearly white noise are to have the same evidence."""
     z = np.random.default_rng(2).normal(size=(50, 2))
-    thin, none = heavy(1e-12, 3.0), white(50)
+    thin, none = heavy(1e-12, 3.0), white_noise(50)
     for floor in (0.0, 3.0):
         bounded, sigma = thin.at_least(floor), none.at_least(floor).scale(z)
         np.testing.assert_allclose(bounded.scale(z), sigma, rtol=1e-6)
-        np.testing.assert_allclose(bounded.misfit(z, sigma), none.misfit(z, sigma), rtol=1e-6)
+        np.testing.assert_allclose(
+            bounded.minus_log_likelihood(z, sigma), none.minus_log_likelihood(z, sigma), rtol=1e-6
+        )
 
 
 @pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])

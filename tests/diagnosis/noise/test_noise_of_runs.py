@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import gammaln, logsumexp
 
-from probewise.diagnosis.noise.law import NoiseLaw, white
+from probewise.diagnosis.noise.law import NoiseLaw, white_noise
 from probewise.effects import NoisePerRun, NoiseRows, RandomWalk, draw_readings, variance
 from probewise.sensor import NoiseLevel
 
@@ -60,9 +60,11 @@ def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
     nodes, log_weights = effect.weighed_nodes(residuals, NoiseRows(0 * residuals, 1.0, run))
 
     def log_z(values):
-        law = replace(white(90), sd=values[run])
+        law = replace(white_noise(90), sd=values[run])
         whitened = law(residuals)[:, None]
-        return -law.misfit(whitened, law.scale(whitened))[0] - law.log_det() + 0.5 * math.log(math.pi / 90)
+        return (
+            -law.minus_log_likelihood(whitened, law.scale(whitened))[0] - law.log_det() + 0.5 * math.log(math.pi / 90)
+        )
 
     laplace = logsumexp([log_z(values) + weight for values, weight in zip(nodes, log_weights, strict=True)])
     squares, brute = np.bincount(run, residuals**2), []

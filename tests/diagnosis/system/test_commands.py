@@ -5,7 +5,7 @@ from typing import cast
 import numpy as np
 from heater import runs
 
-from probewise.diagnosis.system.commands import each_directly_after, in_sequence, run_commands
+from probewise.diagnosis.system.commands import as_alternatives, in_sequence, run_commands
 from probewise.systems import RunTable
 
 TABLE = runs()
@@ -51,7 +51,7 @@ def test_time_that_goes_on_is_later_than_all_that_was_recorded():
 
 
 def test_commands_set_behind_each_other_are_runs_of_their_own():
-    together = cast(RunTable, each_directly_after(list(offered().values())[:3], TABLE))
+    together = cast(RunTable, as_alternatives(list(offered().values())[:3], TABLE))
     assert len(together.scan_names) == 3
     assert set(together.like.values()) <= set(TABLE.scan_names)
 

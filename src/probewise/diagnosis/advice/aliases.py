@@ -115,7 +115,7 @@ def with_separating_plans(
     scans = apparatus.commands(found.model.plan, level=null)
     if not (best and scans):
         return list(pairs)
-    everywhere = apparatus.each_directly_after(scans, found.model.plan)
+    everywhere = apparatus.as_alternatives(scans, found.model.plan)
     null = replace(found.model, plan=everywhere).predict(found.z[None, :])[0]
     there = {
         name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale

@@ -105,7 +105,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
     offered = [offered[k] for k in _shortlisted(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
-    everywhere, rows = apparatus.each_directly_after(offered, plan), rows_of(offered)
+    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_of(offered)
     predictives = [rival.predictive(everywhere, sd) for rival in rivals]
 
     chosen: list[int] = []
@@ -161,7 +161,7 @@ def _shortlisted(
     """Keep, for each pair of rivals, the few scans in which their predictions differ most per minute."""
     if not offered:
         return []
-    everywhere, rows = apparatus.each_directly_after(offered, plan), rows_of(offered)
+    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_of(offered)
     means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
     minutes = np.array([option.minutes for option in offered])
     kept: dict[int, None] = {}

@@ -43,7 +43,7 @@ __all__ = [
     "PlanAudit",
     "audit_plan",
     "audit_recorded",
-    "audits_of",
+    "audits_and_cosines",
 ]
 
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
@@ -267,14 +267,14 @@ def audit_plan(
     expected, said = _expected_sensor(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
     progress("judging the plan")
-    before, cosines = audits_of(PlanTemplates.of(expected, plan, effects), effects, unit)
+    before, cosines = audits_and_cosines(PlanTemplates.of(expected, plan, effects), effects, unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
     chosen = cures_of(plan, expected, effects, ailing, progress)
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
         current = append_plans(current, [command.plan])
-        steps.append(audits_of(PlanTemplates.of(expected, current, effects), effects, unit)[0])
+        steps.append(audits_and_cosines(PlanTemplates.of(expected, current, effects), effects, unit)[0])
     cured = _cured_at(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
@@ -331,7 +331,7 @@ def audit_recorded(
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
     expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
-    effects_seen, cosines = audits_of(
+    effects_seen, cosines = audits_and_cosines(
         PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
     )
     return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
@@ -360,7 +360,7 @@ def _expected_sensor(plan: Plan, sensor: SensorPrior | None, noise_sd: float | N
     ), f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
 
 
-def audits_of(
+def audits_and_cosines(
     laid: PlanTemplates, effects: Mapping[str, type[NamedEffect[Any]]], unit: str
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Return the audit of every effect, and the matrix of cosines (row imitated by column)."""

@@ -26,6 +26,8 @@ __all__ = ["Folded", "folded"]
 class FoldedNormal(StandardNormal):
     """A standard normal prior, folded onto the order of a sensor's Gaussians that is nearest to a point.
 
+    The density of a point is the sum of the normal's densities over all orders.
+
     Parameters
     ----------
     n_params

@@ -110,5 +110,5 @@ def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray) -> FloatArra
     n_points = law.n_points
     sigma = law.scale(whitened)
     curvature = law.density.scale_curvature(whitened, sigma, n_points) if not law.density.is_normal else 2.0 * n_points
-    peak = -law.misfit(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
+    peak = -law.minus_log_likelihood(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
     return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.log_det() + law.log_extra)

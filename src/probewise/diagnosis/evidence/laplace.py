@@ -164,7 +164,7 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> Float
     sigma = tail.scale(left, n_points, floor=least, start=sigma)
     fit_and_prior = _peak((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
     scale = 0.5 * np.log(2 * math.pi / tail.scale_curvature(left, sigma, n_points))
-    return np.asarray(fit_and_prior - tail.misfit(left, sigma, n_points) + scale)
+    return np.asarray(fit_and_prior - tail.minus_log_likelihood(left, sigma, n_points) + scale)
 
 
 def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:

@@ -212,7 +212,7 @@ def _walk(
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
         whitened = law((readings - predicted).T)
         sigma = law.scale(whitened)
-        return np.asarray(law.misfit(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
+        return np.asarray(law.minus_log_likelihood(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
     def jacobian(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         points, steps = _points_about(z)

@@ -84,7 +84,7 @@ class OwnModel(Null):
         return self.prior.from_unit_cube(ndtr(z))
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> _OwnChain:
-        """Add effects; `n_nodes` is not used.
+        """Return the model with effects; `n_nodes` is not used.
 
         Raises
         ------
@@ -123,7 +123,7 @@ class _OwnChain:
             If the simulator's readings have another shape than (n_samples, n_points).
         """
         parameters: Parameters = {name: theta[:, k : k + 1] for k, name in enumerate(self.model.prior.names)}
-        for effect, columns in self._columns:
+        for effect, columns in self._theta_columns:
             if effect.stage is Stage.SCENE:
                 parameters = effect.apply(parameters, theta[:, columns], plan)
         readings = np.asarray(self.model.simulate(parameters, plan), dtype=np.float64)
@@ -133,13 +133,14 @@ class _OwnChain:
 
     def read(self, view: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""
-        for effect, columns in self._columns:
+        for effect, columns in self._theta_columns:
             if Stage.OFFSET <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
 
     @cached_property
-    def _columns(self) -> list[tuple[AnyEffect, slice]]:
+    def _theta_columns(self) -> list[tuple[AnyEffect, slice]]:
+        """Columns of theta that belong to each effect."""
         end, pairs = self.model.n_params, []
         for effect in self.effects:
             start, end = end, end + len(effect.prior.names)

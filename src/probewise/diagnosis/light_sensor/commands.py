@@ -152,7 +152,10 @@ def _commanded(plan: Plan, name: str, value: float) -> Plan:
 
 
 def distinct_scans(plan: Plan) -> list[IntArray]:
-    """Return the row numbers of the first moving scans that differ in pattern, orientation or ends."""
+    """Return the rows of the first few moving scans; a scan that repeats or reverses an earlier one is left out.
+
+    Scans with few rows are left out too.
+    """
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in plan.rows_by_scan():
         if rows.size < _LEAST_ROWS or not plan.direction[rows].any():

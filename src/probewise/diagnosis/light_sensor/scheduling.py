@@ -15,7 +15,7 @@ from probewise.sensor import COMMANDED
 __all__ = [
     "Scan",
     "append_plans",
-    "each_directly_after",
+    "as_alternatives",
     "in_sequence",
     "minutes_of",
     "postponed",
@@ -80,8 +80,8 @@ def minutes_of(plan: Plan) -> float:
     return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
 
 
-def each_directly_after(scans: Sequence[Scan], after: Plan) -> Plan:
-    """Concatenate scans, each timed as if directly after a plan, for one joint prediction.
+def as_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
+    """Concatenate alternative scans, each timed as if directly after a plan, to predict all of them at once.
 
     Covariates that they lack, such as battery voltage, keep their last value of that plan.
     """
@@ -91,7 +91,7 @@ def each_directly_after(scans: Sequence[Scan], after: Plan) -> Plan:
 def in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
 
-    Covariates that they lack are filled as in `each_directly_after`, to be replaced by measured values.
+    Covariates that they lack are filled as in `as_alternatives`, to be replaced by measured values.
     """
     out: list[Scan] = []
     for scan in scans:

@@ -17,7 +17,7 @@ from probewise.diagnosis.light_sensor.commands import commands, rows_that_need_n
 from probewise.diagnosis.light_sensor.covariates import covariate_of, covariates_of, slope_along_the_move
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
-from probewise.diagnosis.light_sensor.scheduling import Scan, each_directly_after, in_sequence
+from probewise.diagnosis.light_sensor.scheduling import Scan, as_alternatives, in_sequence
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -83,7 +83,7 @@ class LightSensor:
     prior_odds = staticmethod(PriorOdds.over)
     covariate_of = staticmethod(covariate_of)
     held_out_parts = staticmethod(held_out_parts)
-    each_directly_after = staticmethod(each_directly_after)
+    as_alternatives = staticmethod(as_alternatives)
     in_sequence = staticmethod(in_sequence)
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:

@@ -39,13 +39,13 @@ def target_swaps(plan: Plan) -> list[Scan]:
     first = scans[0]
     out = []
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
-        flat = _scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
+        flat = _repeated_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
         out.append(
             Scan("lay", f"scan a plain {colour} surface", _with_pattern(flat, f"plain_{colour}", Uniform(albedo)))
         )
     name = plan.scan_names[int(plan.scan[first[0]])]
     for part in excerpts(first, strides=(_STRIDE // 2, _STRIDE)):
-        across = _rotated_scan(_scan(plan, part.rows, f"across{part.suffix}"))
+        across = _rotated_scan(_repeated_scan(plan, part.rows, f"across{part.suffix}"))
         out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
     edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
     laid = (_laid_otherwise(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
@@ -59,7 +59,7 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     length = float(np.ptp(beyond))
     if length < _LEAST_CROSSED * math.hypot(np.ptp(plan.x_mm[scan]), np.ptp(plan.y_mm[scan])):
         return []
-    once = _scan(plan, scan, name)
+    once = _repeated_scan(plan, scan, name)
     half_round = replace(edge, normal_rad=edge.normal_rad + math.pi, offset_mm=-edge.offset_mm)
     laid = [
         (f"{name}_half_round", f"turn pattern {name} by 180 degrees about its edge and scan it", once, half_round),
@@ -83,14 +83,14 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
         rows = np.arange(len(whole))
         seen = ndtr(_distance_inside(whole, rows, pattern) / (_FOOTPRINT * length))
         for part in excerpts(rows, strides=(_STRIDE,), level=seen):
-            taken = _with_pattern(_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
+            taken = _with_pattern(_repeated_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
         for part in excerpts(scan, strides=(_STRIDE // 2, _STRIDE)):
-            taken = _with_pattern(_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
+            taken = _with_pattern(_repeated_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     return out
 
@@ -99,7 +99,8 @@ def _pattern_under(plan: Plan, scan: IntArray) -> Pattern | None:
     return plan.patterns.get(plan.pattern_names[int(plan.pattern[scan[0]])])
 
 
-def _scan(plan: Plan, rows: IntArray, name: str) -> Plan:
+def _repeated_scan(plan: Plan, rows: IntArray, name: str) -> Plan:
+    """Return these rows as a new scan after the plan."""
     return rescheduled(plan, rows, start_after(plan), reading_s(plan), name)
 
 

@@ -45,7 +45,7 @@ class Flat:
         k = max(whitened.shape[1], np.size(self.sigma))
         return np.broadcast_to(np.asarray(self.sigma, dtype=np.float64), (k,)).copy()
 
-    def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+    def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return minus the log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
         density = self._log_density(whitened / sigma) + _LOG_ROOT_2_PI
         at_zero = self._log_density(np.zeros((1, 1)))[0] + _LOG_ROOT_2_PI

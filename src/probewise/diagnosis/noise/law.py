@@ -19,7 +19,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.flat import Flat
 from probewise.recordings.plan import Recording
 
-__all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white", "white_of"]
+__all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white_noise", "white_of"]
 
 _EM_STEPS = 12
 _LEAST = 1e-150  # least scale, for readings that are exactly as predicted
@@ -196,12 +196,12 @@ class NoiseLaw:
         """Return the most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
         return self.density.scale(whitened, self.n_points, floor=self.floor)
 
-    def misfit(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+    def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return minus the log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
 
         Without n/2 log 2 pi.
         """
-        return self.density.misfit(whitened, sigma, self.n_points)
+        return self.density.minus_log_likelihood(whitened, sigma, self.n_points)
 
     def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Convert whitened residuals (n_points, k) to equally informative normal pseudo-observations."""
@@ -266,7 +266,7 @@ class Tail:
             sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + _LEAST
         return np.asarray(sigma)
 
-    def misfit(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+    def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return minus the log likelihood at sigma (k,), without n/2 log 2 pi: (k,)."""
         if self.is_normal:
             return np.asarray(n_points * np.log(sigma) + 0.5 * np.einsum("ij,ij->j", whitened, whitened) / sigma**2)
@@ -331,14 +331,14 @@ def _information(share: float, times: float) -> float:
     return float(np.sum(score**2 * (narrow + wide)) * (z[1] - z[0]) / math.sqrt(2 * math.pi))
 
 
-def white(n_points: int, *, least: float = 0.0) -> NoiseLaw:
-    """Return white noise."""
+def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:
+    """Return white noise of `n_points` readings; `least` is the smallest conditional sd, as in `NoiseLaw`."""
     return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_), least=least)
 
 
 def white_of(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
     """Return independent noise of a recording's usable readings, with its declared relative sds."""
-    return replace(white(int(recording.usable.sum()), least=least), sd=recording.relative_sd[recording.usable])
+    return replace(white_noise(int(recording.usable.sum()), least=least), sd=recording.relative_sd[recording.usable])
 
 
 def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) -> FloatArray:

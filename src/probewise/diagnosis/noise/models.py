@@ -206,7 +206,7 @@ def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> 
 
     def log_likelihood(halves: FloatArray) -> FloatArray:
         sigma = half_step / halves
-        return -Flat(halves, sigma).misfit(residuals[:, None], sigma, n_points)
+        return -Flat(halves, sigma).minus_log_likelihood(residuals[:, None], sigma, n_points)
 
     rms = math.sqrt(float(residuals @ residuals) / n_points)
     widest = math.floor(math.log(half_step / (2 * rms)) / _APART) if rms > 0 else _NARROWEST

@@ -89,7 +89,7 @@ class Profiled:
             predicted = found.model.predict(near.reshape(-1, z.shape[1]))[:, usable]
             whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
             sigma = law.scale(whitened[:, 0].T)
-            height = -law.misfit(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
+            height = -law.minus_log_likelihood(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
             normal = law.as_normal(whitened[:, 0].T, sigma).T
             joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
             return np.where(np.isfinite(height), height, -np.inf), joined

@@ -13,10 +13,10 @@ __all__ = ["eliminate_backward"]
 
 
 def eliminate_backward(state: SearchState) -> None:
-    """Refit the leading combinations less one effect, and select forward from there.
+    """Refit the leading combinations without each of their effects in turn, and select forward from there.
 
-    An effect selected first may be superfluous, or may have stood in for another one; its scans or place were then
-    chosen for both.
+    An effect selected first may be superfluous. Or it stood in for another one as well, and its variant (scans or
+    place) suits neither.
     """
     several = sorted((c for c in state.candidates.values() if len(c.names) > 1), key=lambda c: -state.odds(c))
     named = [c for c in several if not out_of_vocabulary(c.names)]

@@ -93,6 +93,8 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
 def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
     """Screen every effect that a fit does not hold yet, by its templates about the null of the same SSF.
 
+    The state keeps the log evidence of each combination.
+
     Returns
     -------
     The best proposal, new or given, for each resulting combination.

@@ -94,7 +94,7 @@ class Refits:
         found, law = candidate.found, candidate.law
         readings = found.predicted + found.residuals
         whitened = law(readings - found.model.predict(z[None, :])[0, self.templates.usable])[:, None]
-        there = float(law.misfit(whitened, law.scale(whitened))[0]) + 0.5 * float(z @ z)
+        there = float(law.minus_log_likelihood(whitened, law.scale(whitened))[0]) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 
     def under_plain_noise(self, null: WeighedFit) -> WeighedFit | None:
@@ -131,7 +131,7 @@ class Refits:
         for (held, other, less), (candidate, scores) in list(self.known.items()):
             if held is parent and less == against and are_proportional(own, self.templates.of(held.found, other)):
                 swap = Swap(other.name, self.templates.of(held.found, other), effect.name, own)
-                twin = swap.of(candidate, self.templates.usable)
+                twin = swap.exchanged(candidate, self.templates.usable)
                 if twin is not None:
                     self.twins[twin] = candidate, swap
                     return twin, scores
@@ -143,7 +143,7 @@ class Refits:
         known = None if first is None else self.known.get((first, effect, against))
         if known is None or swap is None:
             return None
-        twin = swap.of(known[0], self.templates.usable)
+        twin = swap.exchanged(known[0], self.templates.usable)
         return None if twin is None else (twin, known[1])
 
     def _extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
@@ -263,7 +263,7 @@ def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
 def _gains(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
     def misfit(fitted: Fit) -> float:
         whitened = law(fitted.residuals)[:, None]
-        return float(law.misfit(whitened, law.scale(whitened))[0])
+        return float(law.minus_log_likelihood(whitened, law.scale(whitened))[0])
 
     return 2 * (misfit(beyond) - misfit(found)) > 3.0
 

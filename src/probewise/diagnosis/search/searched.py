@@ -44,7 +44,7 @@ class Evidences:
     unknown
         Unknown effects beside fits: (SSF order, mean, noise) -> log evidence.
     unknown_shares
-        Share of each family of bases in it.
+        Share of each family of bases in the evidence of the unknown effect.
     """
 
     fits: Mapping[tuple[int, Names], WeighedFit]
@@ -226,7 +226,7 @@ class Searched:
         return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
 
     def best(self, names: Names, noise: Names) -> WeighedFit | None:
-        """Return the refitted combination of these effects with the most evidence over SSF orders."""
+        """Return the refit of these effects with the most evidence under this noise, at any SSF order, if there is one."""
         options = [fit for (_, key), fit in self.evidences.fits.items() if key == names]
         return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
 

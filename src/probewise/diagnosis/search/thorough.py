@@ -147,14 +147,14 @@ def _weigh(
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # warnings of the last run are reported
         explored = run(once)
 
-        def about(theta: FloatArray) -> Weighing:
+        def weigh_near(theta: FloatArray) -> Weighing:
             found = _evidence_near_posterior(theta, once, run, rng)
             log_z = found.log_z + candidate.log_factor
             return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
 
-        told = about(explored.samples(_N_SAMPLES, rng=rng))
+        told = weigh_near(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
-            told = max(told, about(_of_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
+            told = max(told, weigh_near(_of_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
     more = explored.log_z + candidate.log_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:

@@ -38,8 +38,8 @@ class Swap:
     twin: str
     of_twin: EffectTemplates
 
-    def of(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
-        """Return a candidate with the twin in place of the effect; None if it predicts or differentiates otherwise.
+    def exchanged(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
+        """Return a candidate with the twin in place of the effect; None if its readings or their slopes change.
 
         `usable` are the rows with usable readings, (n_usable,).
         """

@@ -90,7 +90,10 @@ class Unknown:
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
 
     def _explained(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
-        """Return whether a candidate explains as much as an unknown effect beside `known`."""
+        """Return whether a candidate makes an unknown effect beside `known` superfluous.
+
+        Its evidence is then at most ALIASED_NATS lower, and an unknown effect beside it adds less than that.
+        """
         most = max((self._log_evidence_over_noises(c) for c in candidates if c.names == known), default=-np.inf)
         believed = {c: self._log_evidence_with_prior(c, len(known)) for c in rivals}
         for candidate in sorted(believed, key=lambda c: -believed[c]):

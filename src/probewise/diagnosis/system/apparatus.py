@@ -15,7 +15,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.system.commands import RunCommand, each_directly_after, in_sequence, run_commands
+from probewise.diagnosis.system.commands import RunCommand, as_alternatives, in_sequence, run_commands
 from probewise.effects import (
     CorrelatedNoise,
     DriftingNoise,
@@ -193,7 +193,7 @@ class SimulatorApparatus:
         own = self.system.simulator
         return run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
-    each_directly_after = staticmethod(each_directly_after)
+    as_alternatives = staticmethod(as_alternatives)
     in_sequence = staticmethod(in_sequence)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
-from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, audits_of
+from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, audits_and_cosines
 from probewise.diagnosis.system.apparatus import ON_NOISE, SimulatorApparatus
 from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, first_of
 from probewise.errors import ParameterError
@@ -66,7 +66,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     stride = -(-len(own) // _MOST_ROWS)
     laid = PlanTemplates.of_built(expected, cast(Plan, own), built, most=_SETTINGS)
     laid = replace(laid, slopes=laid.slopes[::stride], columns=laid.columns[::stride])
-    found, cosines = audits_of(laid, cast(Any, names), simulator.unit)
+    found, cosines = audits_and_cosines(laid, cast(Any, names), simulator.unit)
     effects = tuple(_with_rows(effect, reasons) for effect in found)
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words

@@ -15,7 +15,7 @@ from probewise.recordings.plan import Plan
 from probewise.systems import RunTable
 from probewise.systems.joining import append_tables, unused_name
 
-__all__ = ["RunCommand", "each_directly_after", "in_sequence", "run_commands"]
+__all__ = ["RunCommand", "as_alternatives", "in_sequence", "run_commands"]
 
 _LEAST_ROWS = 4
 _MOST_RUNS = 4  # recorded runs to start from
@@ -139,14 +139,14 @@ def _next_start(table: RunTable) -> float:
     return float(table.time_s.max()) + (float(np.median(apart)) if apart else 10 * gap)
 
 
-def each_directly_after(commands: Sequence[RunCommand], after: Plan) -> Plan:
-    """Concatenate runs, each as if it came next, for one joint prediction."""
+def as_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
+    """Concatenate alternative runs, each as if it came next, to predict all of them at once."""
     first, *more = (command.table for command in commands)
     return cast(Plan, append_tables(first, more))
 
 
 def in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
-    """Concatenate runs in turn: unless time restarts with each run, each begins after the one before."""
+    """Concatenate runs into a sequence: unless time restarts with each run, each begins after the one before."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []
     for command in commands:

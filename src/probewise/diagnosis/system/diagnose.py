@@ -134,7 +134,7 @@ def prepare_system(
 
 
 def _with_call_count(progress: Progress, system: System) -> Progress:
-    """Add the number of calls of `simulate`, if there is one, to the progress."""
+    """Let the progress show the number of calls of `simulate`, if the system has this function."""
     return progress if system.caller is None else CountedCalls(progress, system.caller)
 
 
@@ -188,7 +188,7 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
         return ()
     caller, tally = apparatus.system.caller, apparatus.system.tally
     if caller is None:
-        return tuple(_notes_on_law(tally))
+        return tuple(_notes_on_integration(tally))
     out = []
     if caller.cut_short:
         out.append(
@@ -203,7 +203,7 @@ def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
     return tuple(out)
 
 
-def _notes_on_law(tally: IntegrationTally) -> Iterator[str]:
+def _notes_on_integration(tally: IntegrationTally) -> Iterator[str]:
     if tally.cut_short:
         yield (
             f"integrating the law takes long: in {STEPS_OF_A_SEARCH:,} steps not every combination of effects that "

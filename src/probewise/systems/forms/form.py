@@ -129,7 +129,7 @@ class Form:
         return self.says(mean, sd)
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Convert a bank entry and the fitted amounts of its columns to a setting."""
+        """Return the starting point of a refit, (n_params,), from a bank entry and its columns' fitted amounts."""
         if self.joined is not None:
             return self.joined(entry, amounts)
         setting = entry[0].copy()

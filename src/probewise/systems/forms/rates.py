@@ -40,7 +40,7 @@ def forms_on_rates(about: About) -> Iterator[Form]:
             about, f"forcing:{state}", state, state, lambda r: 1.0 + 0.0 * r, 1.0, "a constant term a", unit=own
         )
         yield from _friction(about, state, own)
-        yield from _wave(about, state, own)
+        yield from _periodic_forcing(about, state, own)
         yield from _limit(about, state, values)
         for other, there in about.states.items():
             scale = float(np.nanmax(np.abs(there))) or 1.0
@@ -113,7 +113,7 @@ def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
         )
 
 
-def _wave(about: About, state: str, unit: str) -> Iterator[Form]:
+def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
     table = about.table
     time, waves = table.time, wave_numbers(table.time_s, table.rows_by_scan(), _MOST_WAVES)
 

@@ -203,7 +203,7 @@ def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
     return np.asarray(low + share * (high - low))
 
 
-def way(values: FloatArray, table: RunTable) -> FloatArray:
+def direction_of_change(values: FloatArray, table: RunTable) -> FloatArray:
     """Return the sign of change, (n_samples, n_points), from the previous row of the run.
 
     Where values do not change it is the sign before; at the start of a run, the first that is not 0.
@@ -225,9 +225,9 @@ def way(values: FloatArray, table: RunTable) -> FloatArray:
 
 def _hysteresis(about: About) -> Iterator[Form]:
     def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * way(value, table))
+        return np.asarray(value + theta[:, :1] * direction_of_change(value, table))
 
-    if np.ptp(way(about.predicted[None, :], about.table)) == 0:
+    if np.ptp(direction_of_change(about.predicted[None, :], about.table)) == 0:
         return
     unit, reading = about.unit, about.system.simulator.reading
     yield Form(

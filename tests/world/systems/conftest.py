@@ -20,7 +20,7 @@ def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
         text="",
         priors={"k": Prior("uniform", 0, 1)},
         draw=lambda rng: {"k": k},
-        lay=lambda rng, n, regime: (T, {}),
+        design=lambda rng, n, regime: (T, {}),
         decimals={},
         drives=("u",),
         sd=0.01,

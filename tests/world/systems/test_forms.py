@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.world.systems.forms.inputs import play
-from probewise.world.systems.forms.readings import earlier, way_of
+from probewise.world.systems.forms.readings import delayed, direction_of_change
 from probewise.world.systems.rows import SystemRows
 
 
@@ -69,13 +69,13 @@ def test_a_lag_mixes_each_reading_with_the_one_before_within_a_run(solve):
 def test_what_comes_late_is_read_on_the_straight_line_and_begins_as_it_is():
     rows = _rows([0, 1, 2, 4])
     np.testing.assert_allclose(
-        earlier(np.array([[0.0, 10.0, 20.0, 20.0]]), rows, np.array([[0.5], [3.0]])), [[0, 5, 15, 20], [0, 0, 0, 10]]
+        delayed(np.array([[0.0, 10.0, 20.0, 20.0]]), rows, np.array([[0.5], [3.0]])), [[0, 5, 15, 20], [0, 0, 0, 10]]
     )
 
 
 def test_the_way_is_kept_at_rest_and_known_at_the_first_row():
     rows = _rows(range(6))
-    np.testing.assert_array_equal(way_of(np.array([[0.0, 0, 1, 1, 0, 0]]), rows), [[1, 1, 1, 1, -1, -1]])
+    np.testing.assert_array_equal(direction_of_change(np.array([[0.0, 0, 1, 1, 0, 0]]), rows), [[1, 1, 1, 1, -1, -1]])
 
 
 def test_play_moves_nothing_until_it_is_taken_up():

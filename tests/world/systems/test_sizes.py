@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import curve_fit
 
 from probewise.world.systems import KINDS, cases, draw_system, draw_system_case, system_stratum_of, truth_of
-from probewise.world.systems.cases import _sized
+from probewise.world.systems.cases import _of_size
 from probewise.world.systems.rivals import rivals_of
 from probewise.world.systems.strata import SYSTEMS_WHEEL
 from probewise.world.systems.vocabulary import forms_of
@@ -26,9 +26,9 @@ def _form(drawn, name):
 def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
     """zero + k q^2 is linear in its parameters: a projection tells what is left."""
     drawn = _drawn("orifice flow meter")
-    effect = _sized(_form(drawn, name), wanted, drawn, np.random.default_rng(1))
-    with_effect = drawn.changed([effect.placed])
-    q = drawn.seen.columns["flow_lpm"]
+    effect = _of_size(_form(drawn, name), wanted, drawn, np.random.default_rng(1))
+    with_effect = drawn.diagnosed_readings([effect.placed])
+    q = drawn.diagnosed.columns["flow_lpm"]
     basis = np.stack([np.ones_like(q), q**2], axis=1)
     left = with_effect - basis @ np.linalg.lstsq(basis, with_effect, rcond=None)[0]
     assert np.linalg.norm(left) / drawn.kind.sd == pytest.approx(wanted, rel=0.01)
@@ -37,8 +37,8 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
 
 def test_what_a_bent_model_leaves_is_as_large_as_asked():
     drawn = _drawn("photodiode against distance")
-    effect = _sized(_form(drawn, "sensitivity:board_c"), 12.0, drawn, np.random.default_rng(1))
-    d, y = drawn.seen.columns["dist_mm"], drawn.changed([effect.placed])
+    effect = _of_size(_form(drawn, "sensitivity:board_c"), 12.0, drawn, np.random.default_rng(1))
+    d, y = drawn.diagnosed.columns["dist_mm"], drawn.diagnosed_readings([effect.placed])
 
     def law(d, dark, power, behind):
         return dark + 1e5 * power / (d + behind) ** 2
@@ -50,9 +50,9 @@ def test_what_a_bent_model_leaves_is_as_large_as_asked():
 def test_an_offset_that_depends_on_a_column_is_a_sensitivity_by_another_name():
     drawn = _drawn("orifice flow meter")
     forms = forms_of(drawn.true_system)
-    effect = _sized(_form(drawn, "sensitivity:water_c"), 12.0, drawn, np.random.default_rng(1))
-    target = drawn.changed([effect.placed])
-    fitted = drawn.nominal.fit(target, drawn.at)
+    effect = _of_size(_form(drawn, "sensitivity:water_c"), 12.0, drawn, np.random.default_rng(1))
+    target = drawn.diagnosed_readings([effect.placed])
+    fitted = drawn.nominal.fit(target, drawn.true_coordinates)
     rivals = rivals_of(drawn.true_system, forms, target, fitted, drawn.nominal, frozenset({effect.name}))
     assert rivals["depends:zero_kpa:water_c"] < 0.01
     assert "sensitivity:baro_hpa" not in rivals

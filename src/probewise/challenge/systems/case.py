@@ -67,7 +67,7 @@ def _truth(case: SystemCase) -> dict[str, Any]:
         "law": kind.law is not None,
         "noise_model": case.noise.name,
         "noise_text": case.noise_text,
-        "readings": len(case.drawn.kept),
+        "readings": len(case.drawn.kept_rows),
         "truth": ["unknown"] if strange else sorted([*names, *of_noise]),
         "hidden": [_effect(effect) for effect in case.effects],
         "alias": None,

@@ -15,19 +15,19 @@ from probewise.errors import NotConvergedError
 from probewise.world.challenge.sizing import amplitude_of_size
 from probewise.world.challenge.strata import Stratum
 from probewise.world.systems.chain import simulate
-from probewise.world.systems.fit import Beside, Fitted, Model, left_over, numbers_of
+from probewise.world.systems.designs import design_runs
+from probewise.world.systems.fit import AddedForm, Fitted, Model, numbers_of, project_out
 from probewise.world.systems.forms.form import Form, Placed
-from probewise.world.systems.forms.strange import STRANGE, strangers
+from probewise.world.systems.forms.out_of_vocabulary import OUT_OF_VOCABULARY, forms_out_of_vocabulary
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.formulas import FORMULAS
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
-from probewise.world.systems.laying import lay_out
 from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of
 from probewise.world.systems.rivals import rivals_of, short_name
 from probewise.world.systems.rows import SystemRows
-from probewise.world.systems.shows import covariates_of
 from probewise.world.systems.strata import system_stratum_of
+from probewise.world.systems.visible_covariates import covariates_of
 from probewise.world.systems.vocabulary import FAMILIES, forms_of
 
 __all__ = ["KINDS", "Drawn", "SystemCase", "SystemEffect", "draw_system", "draw_system_case"]
@@ -59,53 +59,53 @@ class Drawn:
     by_run: Mapping[str, FloatArray]
 
     @cached_property
-    def kept(self) -> IntArray:
-        """Rows that are not held out."""
+    def kept_rows(self) -> IntArray:
+        """Numbers of the rows that are not held out."""
         return np.flatnonzero(self.rows.run < self.rows.n_runs - 2)
 
     @cached_property
-    def seen(self) -> SystemRows:
+    def diagnosed(self) -> SystemRows:
         """The rows given to the diagnosis."""
-        return self.rows.take(self.kept)
+        return self.rows.take(self.kept_rows)
 
     @cached_property
     def nominal(self) -> Model:
         """The nominal model of those rows."""
-        return Model(self.kind, self.seen)
+        return Model(self.kind, self.diagnosed)
 
     @cached_property
-    def at(self) -> FloatArray:
+    def true_coordinates(self) -> FloatArray:
         """Coordinates of the true parameters."""
         return self.nominal.coordinates(self.shared, self.by_run)
 
     @cached_property
-    def bare(self) -> Fitted:
+    def without_effects(self) -> Fitted:
         """The noise-free readings without any effect, as a fit of the nominal model, with its slopes."""
-        readings, slopes = self.nominal.with_slopes(self.at)
-        return Fitted(self.at, readings, slopes, 0.0)
+        readings, slopes = self.nominal.with_slopes(self.true_coordinates)
+        return Fitted(self.true_coordinates, readings, slopes, 0.0)
 
     @cached_property
     def true_system(self) -> TrueSystem:
         """The system at its true parameters, about which effects are built."""
-        parameters = self.nominal.parameters(self.at[None, :])
-        trace = simulate(self.kind, self.seen, parameters)
+        parameters = self.nominal.parameters(self.true_coordinates[None, :])
+        trace = simulate(self.kind, self.diagnosed, parameters)
         return TrueSystem(
-            self.kind, self.seen, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()}
+            self.kind, self.diagnosed, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()}
         )
 
-    def everywhere(self, effects: Sequence[Placed]) -> FloatArray:
-        """Noise-free readings at all rows, (n_points,)."""
+    def readings_at_all_rows(self, effects: Sequence[Placed]) -> FloatArray:
+        """Return noise-free readings with these effects at all rows, (n_points,)."""
         whole = Model(self.kind, self.rows)
         with np.errstate(all="ignore"):
             at = whole.coordinates(self.shared, self.by_run)
             trace = simulate(self.kind, self.rows, whole.parameters(at[None, :]), effects)
         return np.asarray(trace.readings[0])
 
-    def changed(self, effects: Sequence[Placed]) -> FloatArray:
-        """Return noise-free readings at the rows given to the diagnosis, (n_points,)."""
+    def diagnosed_readings(self, effects: Sequence[Placed]) -> FloatArray:
+        """Return noise-free readings with these effects at the rows given to the diagnosis, (n_points,)."""
         with np.errstate(all="ignore"):
             readings: FloatArray = simulate(
-                self.kind, self.seen, self.nominal.parameters(self.at[None, :]), effects
+                self.kind, self.diagnosed, self.nominal.parameters(self.true_coordinates[None, :]), effects
             ).readings[0]
         if not np.isfinite(readings).all():
             raise NotConvergedError(f"the {self.kind.name} runs away")
@@ -113,7 +113,7 @@ class Drawn:
 
     def size(self, effects: Sequence[Placed]) -> float:
         """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
-        return math.sqrt(self.nominal.fit(self.changed(effects), self.at).squares)
+        return math.sqrt(self.nominal.fit(self.diagnosed_readings(effects), self.true_coordinates).chi_square)
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +146,7 @@ class SystemEffect:
         """Parameters as in the vocabulary; `values` of all runs, with the held-out ones last."""
         values = [v for name, v in self.values.items() if name.startswith("values[")]
         own = {name: v for name, v in self.values.items() if not name.startswith("values[")}
-        return {**own, **({"values": values} if values else {}), **self.form.beside}
+        return {**own, **({"values": values} if values else {}), **self.form.also_in_truth}
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +188,7 @@ class SystemCase:
 
 def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> Drawn:
     """Draw rows and true parameters of a kind."""
-    rows = lay_out(kind, rng=rng)
+    rows = design_runs(kind, rng=rng)
     each = [kind.draw_run(rng) for _ in range(rows.n_runs)]
     return Drawn(kind, rows, kind.draw(rng), {name: np.array([own[name] for own in each]) for name in kind.per_run})
 
@@ -201,24 +201,24 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
     NotConvergedError
         If no drawn effect can have the requested size.
     """
-    stratum, before = system_stratum_of(number)
+    stratum, n_earlier = system_stratum_of(number)
     drawing, noise = (
         np.random.default_rng(child) for child in np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
     )
     shuffled = np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES)
     failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):
-        family = str(shuffled[(before + (attempt // 8)) % len(shuffled)])
+        family = str(shuffled[(n_earlier + (attempt // 8)) % len(shuffled)])
         drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
         try:
-            effects, cosine = _conceal(stratum, before, family, drawn, drawing)
-            everywhere = drawn.everywhere([effect.placed for effect in effects])
-            if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.bare.readings).max():
-                raise NotConvergedError("what is kept back runs away")
+            effects, cosine = _draw_effects(stratum, n_earlier, family, drawn, drawing)
+            everywhere = drawn.readings_at_all_rows([effect.placed for effect in effects])
+            if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.without_effects.readings).max():
+                raise NotConvergedError("the held-out runs diverge")
         except NotConvergedError as error:
             failure = error
             continue
-        return _recorded(seed, number, stratum, before, drawn, effects, cosine, everywhere, noise)
+        return _recorded(seed, number, stratum, n_earlier, drawn, effects, cosine, everywhere, noise)
     raise failure
 
 
@@ -226,7 +226,7 @@ def _recorded(
     seed: int,
     number: int,
     stratum: Stratum,
-    before: int,
+    n_earlier: int,
     drawn: Drawn,
     effects: tuple[SystemEffect, ...],
     cosine: float | None,
@@ -235,10 +235,10 @@ def _recorded(
 ) -> SystemCase:
     """Add noise, round as printed, and choose what the owner's file states of it."""
     kind = drawn.kind
-    name = OTHER_NOISE[before % len(OTHER_NOISE)] if stratum.other_noise else "white"
+    name = OTHER_NOISE[n_earlier % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
         name = "correlated_noise"  # the table has no column of runs
-    noise = noise_of(name, 12.0, noise_free[drawn.kept], drawn.seen, kind.sd, rng=rng)
+    noise = noise_of(name, 12.0, noise_free[drawn.kept_rows], drawn.diagnosed, kind.sd, rng=rng)
     readings = noise.draw(noise_free, drawn.rows, rng)
     knows = str(rng.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
     step = noise.step
@@ -269,47 +269,51 @@ def _recorded(
     )
 
 
-def _conceal(
-    stratum: Stratum, before: int, family: str, drawn: Drawn, rng: np.random.Generator
+def _draw_effects(
+    stratum: Stratum, n_earlier: int, family: str, drawn: Drawn, rng: np.random.Generator
 ) -> tuple[tuple[SystemEffect, ...], float | None]:
     """Draw the effects of a stratum once."""
     if stratum.kind == "clean":
         return (), None
     forms = forms_of(drawn.true_system)
     if stratum.kind == "outside":
-        wanted = STRANGE[before % len(STRANGE)]
-        own = [f for f in strangers(drawn.true_system, rng) if f.name.removeprefix("strange_").split(":")[0] == wanted]
-        one = _sized(_any_of(own, wanted, rng), stratum.size, drawn, rng)
+        wanted = OUT_OF_VOCABULARY[n_earlier % len(OUT_OF_VOCABULARY)]
+        own = [
+            f
+            for f in forms_out_of_vocabulary(drawn.true_system, rng)
+            if f.name.removeprefix("strange_").split(":")[0] == wanted
+        ]
+        one = _of_size(_random_one(own, wanted, rng), stratum.size, drawn, rng)
         return (_with_rivals(one, forms, drawn, ()),), None
     if stratum.kind == "single":
         own = [f for f in forms if short_name(f).split(":")[0] == family]
-        one = _sized(_any_of(own, family, rng), stratum.size, drawn, rng)
+        one = _of_size(_random_one(own, family, rng), stratum.size, drawn, rng)
         return (_with_rivals(one, forms, drawn, ()),), None
     names = rng.choice(FAMILIES, 2, replace=False)
-    both = [_any_of([f for f in forms if short_name(f).split(":")[0] == name], str(name), rng) for name in names]
-    first, second = (_sized(form, stratum.size, drawn, rng) for form in both)
+    both = [_random_one([f for f in forms if short_name(f).split(":")[0] == name], str(name), rng) for name in names]
+    first, second = (_of_size(form, stratum.size, drawn, rng) for form in both)
     cosine = _cosine(drawn, first, second)
     if abs(cosine) >= _APART:
         raise NotConvergedError(f"{first.name} and {second.name} are alike: cosine {cosine:.2f}")
     return (_with_rivals(first, forms, drawn, (second,)), _with_rivals(second, forms, drawn, (first,))), cosine
 
 
-def _any_of(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
+def _random_one(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
     if not forms:
         raise NotConvergedError(f"this system has no target for {name}")
     return forms[int(rng.integers(len(forms)))]
 
 
-def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) -> SystemEffect:
+def _of_size(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) -> SystemEffect:
     """Choose the amplitude at which a form has the requested size."""
     more = form.draw(rng)
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
     def placed(amplitude: float) -> list[Placed]:
-        return [(form, numbers_of(form.sized(sign * amplitude, more)))]
+        return [(form, numbers_of(form.of_amplitude(sign * amplitude, more)))]
 
-    change = (drawn.changed(placed(form.first)) - drawn.bare.readings) / drawn.kind.sd
-    seen = float(np.linalg.norm(left_over(change, drawn.bare.slopes)))
+    change = (drawn.diagnosed_readings(placed(form.first)) - drawn.without_effects.readings) / drawn.kind.sd
+    seen = float(np.linalg.norm(project_out(change, drawn.without_effects.slopes)))
     if not seen > 1e-6:
         raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
     first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
@@ -322,17 +326,20 @@ def _sized(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) ->
         acceptable=0.01,
         max_calls=14,
     )
-    return SystemEffect(form, form.sized(sign * amplitude, more), drawn.size(placed(amplitude)), {}, ())
+    return SystemEffect(form, form.of_amplitude(sign * amplitude, more), drawn.size(placed(amplitude)), {}, ())
 
 
-def _at_its_moment(form: Form, values: Mapping[str, float]) -> Form:
+def _with_true_time(form: Form, values: Mapping[str, float]) -> Form:
     """Set a step form's time to the effect's, since other times between the same rows are equivalent."""
     at = next((name for name in ("at_s", "at_row") if name in values and name in form.bank[0][0]), None)
     return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
 
 
 def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
-    a, b = (left_over(drawn.changed([e.placed]) - drawn.bare.readings, drawn.bare.slopes) for e in (one, other))
+    a, b = (
+        project_out(drawn.diagnosed_readings([e.placed]) - drawn.without_effects.readings, drawn.without_effects.slopes)
+        for e in (one, other)
+    )
     return float(a @ b / np.sqrt((a @ a) * (b @ b)))
 
 
@@ -340,14 +347,14 @@ def _with_rivals(
     effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]
 ) -> SystemEffect:
     """Find the aliases of an effect, given the other effects."""
-    target = drawn.changed([e.placed for e in (effect, *others)])
-    beside = [Beside(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
-    model = Model(drawn.kind, drawn.seen, beside)
+    target = drawn.diagnosed_readings([e.placed for e in (effect, *others)])
+    beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
+    model = Model(drawn.kind, drawn.diagnosed, beside)
     start = model.coordinates(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
     rivals = rivals_of(
         drawn.true_system,
-        [_at_its_moment(form, effect.values) for form in forms],
+        [_with_true_time(form, effect.values) for form in forms],
         target,
         fitted,
         model,

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.forms.form import Now, Placed
+from probewise.world.systems.forms.form import Instants, Placed
 from probewise.world.systems.kind import SystemKind
-from probewise.world.systems.motion import travel
+from probewise.world.systems.motion import solve_law
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["Trace", "read", "simulate"]
+__all__ = ["Trace", "simulate", "with_reading_effects"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +27,7 @@ class Trace:
 def simulate(
     kind: SystemKind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()
 ) -> Trace:
-    """Simulate a system.
+    """Simulate a system without noise: its readings and states.
 
     Parameters
     ----------
@@ -36,9 +36,9 @@ def simulate(
     rows
         The rows to simulate.
     parameters
-        (n_samples or 1, 1 or n_points) each.
+        By name, (n_samples or 1, 1 or n_points) each.
     effects
-        Forms with numbers (n_samples or 1, 1).
+        Forms, each with its parameters by name, (n_samples or 1, 1).
     """
     placed = [(form, {name: np.atleast_2d(v) for name, v in numbers.items()}) for form, numbers in effects]
     columns = {name: values[None, :] for name, values in rows.columns.items()}
@@ -52,20 +52,20 @@ def simulate(
         len(v) for v in (*parameters.values(), *columns.values(), *(v for _, n in placed for v in n.values()))
     )
     if kind.law is not None:
-        states = travel(kind, rows, parameters, columns, inner)
+        states = solve_law(kind, rows, parameters, columns, inner)
         readings = np.asarray(kind.law.read(states, parameters, columns))
     else:
         assert kind.formula is not None
         states, p = {}, dict(parameters)
-        now = Now.at_rows(rows)
+        now = Instants.at_rows(rows)
         for form, numbers in inner:
             p[form.target] = p[form.target] + form.act(now, numbers)
         readings = np.asarray(kind.formula(p, columns))
     readings = np.array(np.broadcast_to(readings, (n_samples, len(rows))))
-    return Trace(read(readings, rows, placed), states)
+    return Trace(with_reading_effects(readings, rows, placed), states)
 
 
-def read(readings: FloatArray, rows: SystemRows, effects: Sequence[Placed]) -> FloatArray:
+def with_reading_effects(readings: FloatArray, rows: SystemRows, effects: Sequence[Placed]) -> FloatArray:
     """Apply the effects on the readings, in order."""
     for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
         readings = form.act(readings, rows, numbers)

@@ -16,7 +16,7 @@ from probewise.world.systems.forms.form import Form, Numbers, Placed
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["Beside", "Fitted", "Model", "free_numbers", "left_over", "numbers_of"]
+__all__ = ["AddedForm", "Fitted", "Model", "free_numbers", "numbers_of", "project_out"]
 
 _STEP = 1e-4  # step of a coordinate for derivatives
 _FORM_STEP = 0.1  # of the form's own step
@@ -29,7 +29,7 @@ def free_numbers(form: Form) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Beside:
+class AddedForm:
     """A form in a model: starting values, and names of the fitted parameters."""
 
     form: Form
@@ -41,10 +41,10 @@ class Beside:
 class Fitted:
     """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), chi-square."""
 
-    at: FloatArray
+    coordinates: FloatArray
     readings: FloatArray
     slopes: FloatArray
-    squares: float
+    chi_square: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class Model:
 
     kind: SystemKind
     rows: SystemRows
-    beside: Sequence[Beside] = field(default=())
+    added: Sequence[AddedForm] = field(default=())
 
     @cached_property
     def _runs(self) -> list[int]:
@@ -72,7 +72,7 @@ class Model:
         """Return coordinates of true parameters (n_runs of the case,), with forms at their starting values."""
         own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared]
         each = [self.kind.priors[name].coordinate(by_run[name][self._runs]) for name in self.kind.per_run]
-        numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.beside for name in b.free]
+        numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.added for name in b.free]
         return np.concatenate([np.ravel(own), *each, numbers])
 
     def parameters(self, x: FloatArray) -> dict[str, FloatArray]:
@@ -90,7 +90,7 @@ class Model:
         """Return forms with their parameters at coordinates."""
         out: list[Placed] = []
         n = self.n_nominal
-        for b in self.beside:
+        for b in self.added:
             numbers: dict[str, FloatArray] = {name: np.full((len(x), 1), value) for name, value in b.start.items()}
             for name in b.free:
                 numbers[name] = x[:, n : n + 1] * b.form.steps[name] * _FORM_STEP
@@ -128,7 +128,7 @@ class Model:
                     out[here, column] = slope[here]
         return found[0], out
 
-    def _or_far(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _with_slopes_or_far(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings with their slopes; if a law diverges, values so large that the fit steps back."""
         try:
             readings, slopes = self.with_slopes(x)
@@ -149,23 +149,23 @@ class Model:
         last: dict[bytes, tuple[FloatArray, FloatArray]] = {}
         sd = self.kind.sd
 
-        def both(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        def readings_and_slopes(x: FloatArray) -> tuple[FloatArray, FloatArray]:
             key = x.tobytes()
             if key not in last:
                 last.clear()
-                last[key] = self._or_far(x)
+                last[key] = self._with_slopes_or_far(x)
             return last[key]
 
-        def off(x: FloatArray) -> FloatArray:
-            return np.asarray((both(x)[0] - readings) / sd)
+        def standardised_residuals(x: FloatArray) -> FloatArray:
+            return np.asarray((readings_and_slopes(x)[0] - readings) / sd)
 
         def slopes_of(x: FloatArray) -> FloatArray:
-            return np.asarray(both(x)[1] / sd)
+            return np.asarray(readings_and_slopes(x)[1] / sd)
 
         try:
             with np.errstate(all="ignore"):
                 found = least_squares(
-                    off,
+                    standardised_residuals,
                     start,
                     jac=slopes_of,
                     x_scale="jac",
@@ -174,14 +174,14 @@ class Model:
                     gtol=1e-7,
                     max_nfev=max_calls,
                 )
-                f, slopes = both(np.asarray(found.x))
+                f, slopes = readings_and_slopes(np.asarray(found.x))
         except (ValueError, np.linalg.LinAlgError) as error:
             raise NotConvergedError(f"a fit of the {self.kind.name} left the finite numbers") from error
         return Fitted(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))
 
 
-def left_over(change: FloatArray, slopes: FloatArray) -> FloatArray:
-    """Project slopes (n_points, n) out of changes (n_points, ...)."""
+def project_out(change: FloatArray, slopes: FloatArray) -> FloatArray:
+    """Return changes (n_points, ...) without their projection on the slopes, (n_points, n)."""
     scale = np.sqrt(np.sum(slopes**2, axis=0))
     basis, values, _ = np.linalg.svd(slopes / np.where(scale > 0, scale, 1.0), full_matrices=False)
     basis = basis[:, values > 1e-8 * values.max(initial=1e-300)]

@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.world.systems.designs import held_levels, irregular_times, there_and_back
 from probewise.world.systems.kind import Columns, Logged, Prior, SystemKind
-from probewise.world.systems.laying import blocks, irregular, there_and_back
 
 __all__ = ["FORMULAS"]
 
 Rng = np.random.Generator
 
 
-def _lay_bath(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    t = irregular(rng, n, 4.0)
+def _bath_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    t = irregular_times(rng, n, 4.0)
     return t, {"bath_c": rng.uniform(35, 55) * regime + 0.2 * np.sin(t / rng.uniform(9, 20))}
 
 
@@ -40,7 +40,7 @@ def simulate(p, data):
     per_run=("start_c",),
     draw=lambda rng: {"tau_s": float(rng.uniform(18, 45)), "scale": float(rng.normal(1.0, 0.01))},
     draw_run=lambda rng: {"start_c": float(rng.normal(21, 2))},
-    lay=_lay_bath,
+    design=_bath_design,
     decimals={"t_s": 2, "bath_c": 2},
     drives=("bath_c",),
     sd=0.05,
@@ -57,8 +57,8 @@ def simulate(p, data):
 )
 
 
-def _lay_cup(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    t = irregular(rng, n, 1.3)
+def _cup_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    t = irregular_times(rng, n, 1.3)
     return t, {"room_c": rng.uniform(18, 24) * (1.25 if regime > 1 else 1.0) + 0.5 * np.sin(t / rng.uniform(10, 25))}
 
 
@@ -87,7 +87,7 @@ def simulate(p, data):
     per_run=("hot_c",),
     draw=lambda rng: {"tau_min": float(rng.uniform(25, 60))},
     draw_run=lambda rng: {"hot_c": float(rng.normal(76, 6))},
-    lay=_lay_cup,
+    design=_cup_design,
     decimals={"t_min": 2, "room_c": 2},
     drives=("room_c",),
     sd=0.12,
@@ -99,9 +99,9 @@ def simulate(p, data):
 )
 
 
-def _lay_photodiode(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+def _photodiode_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     far = 90.0 * (1.5 if regime > 1 else 1.0)
-    return irregular(rng, n, 1.0), {"dist_mm": there_and_back(rng, n, 20.0, far)}
+    return irregular_times(rng, n, 1.0), {"dist_mm": there_and_back(rng, n, 20.0, far)}
 
 
 PHOTODIODE = SystemKind(
@@ -126,7 +126,7 @@ def simulate(p, data):
         "power": float(rng.uniform(2e5, 5e5)),
         "behind_mm": float(rng.uniform(8, 20)),
     },
-    lay=_lay_photodiode,
+    design=_photodiode_design,
     decimals={"dist_mm": 2},
     drives=("dist_mm",),
     sd=0.4,
@@ -141,10 +141,10 @@ def simulate(p, data):
 )
 
 
-def _lay_flow(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+def _flow_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     most = 12.0 * regime
-    return irregular(rng, n, 6.0), {
-        "flow_lpm": blocks(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)
+    return irregular_times(rng, n, 6.0), {
+        "flow_lpm": held_levels(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)
     }
 
 
@@ -165,7 +165,7 @@ def simulate(p, data):
 """,
     priors={"zero_kpa": Prior("normal", 0, 0.5), "k": Prior("log", 0.01, 1)},
     draw=lambda rng: {"zero_kpa": float(rng.normal(0, 0.2)), "k": float(rng.uniform(0.08, 0.2))},
-    lay=_lay_flow,
+    design=_flow_design,
     decimals={"t_s": 1, "flow_lpm": 3},
     drives=("flow_lpm",),
     sd=0.03,
@@ -179,9 +179,9 @@ def simulate(p, data):
 )
 
 
-def _lay_lens(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+def _lens_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     low, high = (440, 640) if regime == 1 else (400, 700)
-    return irregular(rng, n, 9.0), {"nm": there_and_back(rng, n, low, high)}
+    return irregular_times(rng, n, 9.0), {"nm": there_and_back(rng, n, low, high)}
 
 
 LENS = SystemKind(
@@ -201,7 +201,7 @@ def simulate(p, data):
 """,
     priors={"radius_mm": Prior("normal", 100, 2), "b_um2": Prior("uniform", 0, 0.02)},
     draw=lambda rng: {"radius_mm": float(rng.normal(100, 0.5)), "b_um2": float(rng.uniform(0.003, 0.008))},
-    lay=_lay_lens,
+    design=_lens_design,
     decimals={"t_s": 1, "nm": 1},
     drives=("nm",),
     sd=0.01,
@@ -215,11 +215,11 @@ def simulate(p, data):
 )
 
 
-def _lay_ph(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+def _ph_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     levels = np.linspace(4, 9, 8) if regime == 1 else np.linspace(2.5, 11, 8)
-    t = irregular(rng, n, 15.0)
+    t = irregular_times(rng, n, 15.0)
     warm = rng.uniform(18, 32) + (12 if regime > 1 else 0) + 1.5 * np.sin(t / rng.uniform(80, 300))
-    return t, {"buffer_ph": blocks(rng, n, levels, 5) + 0.02 * rng.standard_normal(n), "probe_c": warm}
+    return t, {"buffer_ph": held_levels(rng, n, levels, 5) + 0.02 * rng.standard_normal(n), "probe_c": warm}
 
 
 PH = SystemKind(
@@ -239,7 +239,7 @@ def simulate(p, data):
 """,
     priors={"e0_mv": Prior("normal", 0, 30), "slope_mv": Prior("normal", 58, 3)},
     draw=lambda rng: {"e0_mv": float(rng.normal(0, 12)), "slope_mv": float(rng.uniform(56, 60))},
-    lay=_lay_ph,
+    design=_ph_design,
     decimals={"t_s": 1, "buffer_ph": 3, "probe_c": 2},
     drives=("buffer_ph", "probe_c"),
     sd=0.5,

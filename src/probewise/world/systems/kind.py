@@ -109,8 +109,9 @@ class SystemKind:
         Draws the true shared parameters.
     draw_run
         Draws the true parameters of a run.
-    lay
-        Designs a run: (rng, n_rows, regime) to times from 0 and columns; the regime is 1, or larger beyond the others.
+    design
+        Designs a run: draws its times from 0 and its columns, from (rng, n_rows, regime). The regime is 1, or larger
+        for a run beyond the others.
     decimals
         Decimals of the designed columns and of time.
     drives
@@ -139,7 +140,7 @@ class SystemKind:
     text: str
     priors: Mapping[str, Prior]
     draw: Callable[[np.random.Generator], dict[str, float]]
-    lay: Callable[[np.random.Generator, int, float], tuple[FloatArray, Columns]]
+    design: Callable[[np.random.Generator, int, float], tuple[FloatArray, Columns]]
     decimals: Mapping[str, int]
     drives: tuple[str, ...]
     sd: float

@@ -5,16 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.world.systems.designs import held_levels, irregular_times, random_waves
 from probewise.world.systems.kind import Columns, Law, Logged, Prior, SystemKind
-from probewise.world.systems.laying import blocks, irregular, swings
 
 __all__ = ["LAWS"]
 
 Rng = np.random.Generator
 
 
-def _lay_tank(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular(rng, n, 5.0), {"valve_v": blocks(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)}
+def _tank_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 5.0), {
+        "valve_v": held_levels(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)
+    }
 
 
 TANK = SystemKind(
@@ -47,7 +49,7 @@ def simulate(p, data):
     per_run=("start_cm",),
     draw=lambda rng: {"cm_per_v": float(rng.uniform(5, 10)), "tau_s": float(rng.uniform(35, 90))},
     draw_run=lambda rng: {"start_cm": float(rng.uniform(5, 30))},
-    lay=_lay_tank,
+    design=_tank_design,
     decimals={"t_s": 2, "valve_v": 2},
     drives=("valve_v",),
     sd=0.04,
@@ -66,8 +68,10 @@ def simulate(p, data):
 )
 
 
-def _lay_filter(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular(rng, n, 0.002), {"in_v": blocks(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)}
+def _filter_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 0.002), {
+        "in_v": held_levels(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)
+    }
 
 
 FILTER = SystemKind(
@@ -100,7 +104,7 @@ def observe(s, p, u):
         "tau1_s": float(rng.uniform(0.003, 0.006)),
         "tau2_s": float(rng.uniform(0.010, 0.018)),
     },
-    lay=_lay_filter,
+    design=_filter_design,
     decimals={"t_s": 6, "in_v": 3},
     drives=("in_v",),
     sd=0.004,
@@ -118,9 +122,9 @@ def observe(s, p, u):
 )
 
 
-def _lay_oscillator(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    t = irregular(rng, n, 0.05)
-    return t, {"force_n": swings(rng, t, 0.8 * regime, 2.5)}
+def _oscillator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    t = irregular_times(rng, n, 0.05)
+    return t, {"force_n": random_waves(rng, t, 0.8 * regime, 2.5)}
 
 
 OSCILLATOR = SystemKind(
@@ -146,7 +150,7 @@ def observe(s, p, u):
     per_run=("x0_m",),
     draw=lambda rng: {"k_n_m": float(rng.uniform(25, 70)), "c_kg_s": float(rng.uniform(0.4, 1.2))},
     draw_run=lambda rng: {"x0_m": float(rng.normal(0, 0.03))},
-    lay=_lay_oscillator,
+    design=_oscillator_design,
     decimals={"t_s": 4, "force_n": 4},
     drives=("force_n",),
     sd=0.15,
@@ -162,8 +166,10 @@ def observe(s, p, u):
 )
 
 
-def _lay_servo(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular(rng, n, 0.03), {"volts": blocks(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)}
+def _servo_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 0.03), {
+        "volts": held_levels(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)
+    }
 
 
 SERVO = SystemKind(
@@ -183,7 +189,7 @@ def rates(s, p, u):
 """,
     priors={"deg_s_v": Prior("log", 5, 500), "tau_s": Prior("log", 0.01, 1)},
     draw=lambda rng: {"deg_s_v": float(rng.uniform(30, 70)), "tau_s": float(rng.uniform(0.08, 0.2))},
-    lay=_lay_servo,
+    design=_servo_design,
     decimals={"t_s": 4, "volts": 2},
     drives=("volts",),
     sd=0.8,
@@ -202,8 +208,8 @@ def rates(s, p, u):
 )
 
 
-def _lay_reactor(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular(rng, n, 9.0 * (1.4 if regime > 1 else 1.0)), {}
+def _reactor_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 9.0 * (1.4 if regime > 1 else 1.0)), {}
 
 
 REACTOR = SystemKind(
@@ -234,7 +240,7 @@ def observe(s, p, u):
     per_run=("dose",),
     draw=lambda rng: {"k1_per_s": float(rng.uniform(0.018, 0.03)), "k2_per_s": float(rng.uniform(0.004, 0.008))},
     draw_run=lambda rng: {"dose": float(rng.uniform(0.7, 2.0))},
-    lay=_lay_reactor,
+    design=_reactor_design,
     decimals={"t_s": 1},
     drives=(),
     sd=0.003,
@@ -254,8 +260,8 @@ def observe(s, p, u):
 )
 
 
-def _lay_predator(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular(rng, n, 0.5), {"feed": blocks(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)}
+def _predator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
+    return irregular_times(rng, n, 0.5), {"feed": held_levels(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)}
 
 
 PREDATOR = SystemKind(
@@ -283,7 +289,7 @@ def rates(s, p, u):
         "eat": float(rng.uniform(0.06, 0.1)),
         "die_per_d": float(rng.uniform(0.4, 0.7)),
     },
-    lay=_lay_predator,
+    design=_predator_design,
     decimals={"t_d": 3, "feed": 2},
     drives=("feed",),
     sd=0.3,

@@ -17,21 +17,21 @@ from scipy.integrate import solve_ivp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.world.systems.forms.form import Form, Now, Placed
+from probewise.world.systems.forms.form import Form, Instants, Placed
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["travel"]
+__all__ = ["solve_law"]
 
 _RTOL, _ATOL = 1e-8, 1e-10
-_LOOKS = np.array([0.25, 0.5, 0.75, 1.0])  # shares of a gap at which events are checked
+_CHECKS = np.array([0.25, 0.5, 0.75, 1.0])  # shares of a gap at which events are checked
 _REST = 1e-9  # share of a state's scale below which it is at rest
 _MOST_CALLS = 600  # limit of evaluations between two rows; a step has twelve
 _MOST_EVENTS = 200  # limit of events between two rows
 _CLOSE = 1e-7  # share of a gap: closer events are merged
 
 
-def travel(
+def solve_law(
     kind: SystemKind,
     rows: SystemRows,
     parameters: Mapping[str, FloatArray],
@@ -53,11 +53,13 @@ def travel(
     effects
         Forms on parameters and rates, and those that delay a column.
     """
-    return _Trip(kind, rows, parameters, columns, effects).together()
+    return _Integration(kind, rows, parameters, columns, effects).solve()
 
 
 @dataclass(frozen=True, eq=False)
-class _Trip:
+class _Integration:
+    """The solution of a law for all samples and runs; parameters as of `solve_law`."""
+
     kind: SystemKind
     rows: SystemRows
     parameters: Mapping[str, FloatArray]
@@ -82,11 +84,13 @@ class _Trip:
         return {int(self.rows.run[own[0]]): own for own in self.rows.by_run}
 
     @cached_property
-    def late(self) -> dict[str, FloatArray]:
+    def delays(self) -> dict[str, FloatArray]:
+        """Delay of each column that is delayed, (n_samples or 1, 1)."""
         return {form.late: numbers["tau_s"] for form, numbers in self.effects if form.late}
 
     @cached_property
-    def needed(self) -> tuple[str, ...]:
+    def used_columns(self) -> tuple[str, ...]:
+        """Columns that the law or an effect uses."""
         uses = (column for form, _ in self.effects for column in form.uses)
         return tuple(dict.fromkeys((*self.kind.drives, *uses)))
 
@@ -103,7 +107,7 @@ class _Trip:
     def _of_run(self, values: FloatArray) -> FloatArray:
         return values if values.shape[1] == 1 else values[:, self.places[0]]
 
-    def moment(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Now]]:
+    def within_gap(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Instants]]:
         """Return a function of the share of the gap from position k to the next, giving parameters and columns."""
         here, there = self.places[k, runs], self.places[k + 1, runs]
         first = self.places[0, runs]
@@ -112,8 +116,8 @@ class _Trip:
         assert time is not None
         t, printed = self.columns[time], self.rows.t
         ends = {}
-        for name in self.needed:
-            if name in self.late:
+        for name in self.used_columns:
+            if name in self.delays:
                 continue
             values = self.columns[name]
             holds = name in self.kind.drives and not law.linear
@@ -122,13 +126,13 @@ class _Trip:
         base = {name: v if v.shape[1] == 1 else v[:, here] for name, v in self.parameters.items()}
         varying = [(form, numbers) for form, numbers in self.effects if form.side == "parameter"]
 
-        def at(share: float) -> tuple[dict[str, Any], Now]:
+        def at(share: float) -> tuple[dict[str, Any], Instants]:
             u: dict[str, Any] = {name: low + share * rise for name, (low, rise) in ends.items()}
             u[time] = t[:, here] + share * (t[:, there] - t[:, here])
             now_t = (printed[here] + share * (printed[there] - printed[here]))[None, :]
-            for name, tau in self.late.items():
-                u[name] = self._earlier(name, now_t - tau, run)
-            now = Now(now_t, now_t - printed[first], u, run, np.zeros(1))
+            for name, tau in self.delays.items():
+                u[name] = self._delayed(name, now_t - tau, run)
+            now = Instants(now_t, now_t - printed[first], u, run, np.zeros(1))
             p: dict[str, Any] = dict(base)
             for form, numbers in varying:
                 p[form.target] = p[form.target] + form.act(now, numbers)
@@ -136,7 +140,7 @@ class _Trip:
 
         return at
 
-    def _earlier(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
+    def _delayed(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
         """Interpolate a column at earlier times, (n_samples, n_runs): held or linear; constant before the start."""
         law = self.kind.law
         assert law is not None
@@ -150,7 +154,7 @@ class _Trip:
                 out[:, j] = values[np.clip(np.searchsorted(times, t[:, j] + 1e-12, side="right") - 1, 0, None)]
         return out
 
-    def rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Now) -> dict[str, Any]:
+    def rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
         law = self.kind.law
         assert law is not None
         out = law.rates(s, p, now.u)
@@ -164,8 +168,8 @@ class _Trip:
         here, there = self.places[k], self.places[k + 1]
         begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
         moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
-        if self.late:
-            for tau in self.late.values():
+        if self.delays:
+            for tau in self.delays.values():
                 moments.append((self.rows.t[:, None] + np.ravel(tau)).ravel())
         if not moments:
             return [0.0, 1.0]
@@ -174,7 +178,8 @@ class _Trip:
         inside = np.unique(np.round(shares[(shares > 1e-9) & (shares < 1 - 1e-9)], 9))
         return [0.0, *inside.tolist(), 1.0]
 
-    def together(self) -> dict[str, FloatArray]:
+    def solve(self) -> dict[str, FloatArray]:
+        """Return every state at every row, (n_samples, n_points)."""
         law = self.kind.law
         assert law is not None
         names, places = list(law.start), self.places
@@ -191,7 +196,7 @@ class _Trip:
         time = self.rows.time
         assert time is not None
         t = self.columns[time]
-        gap, at, hard = t[:, self.places[k + 1]] - t[:, self.places[k]], self.moment(k), self.hard
+        gap, at, hard = t[:, self.places[k + 1]] - t[:, self.places[k]], self.within_gap(k), self.switching
 
         def free(share: float, y: FloatArray) -> dict[str, Any]:
             p, now = at(share)
@@ -230,7 +235,7 @@ class _Trip:
                 rtol=_RTOL,
                 atol=_ATOL,
                 first_step=end - begin,
-                t_eval=np.minimum(begin + (end - begin) * _LOOKS, end) if hard else None,
+                t_eval=np.minimum(begin + (end - begin) * _CHECKS, end) if hard else None,
             )
             if not solved.success:
                 raise NotConvergedError(f"the law of the {self.kind.name} cannot be solved: {solved.message}")
@@ -241,11 +246,11 @@ class _Trip:
                     again |= _mode_ended(form, size, mode, own[names.index(form.target)], rates[form.target])
             s = solved.y[:, -1].reshape(s.shape)
         for i, j in np.argwhere(again):
-            s[:, i, j] = self._only(int(i)).one_gap(begun[:, i, j], k, int(j), names)
+            s[:, i, j] = self._of_sample(int(i)).one_gap(begun[:, i, j], k, int(j), names)
         return s
 
     @property
-    def hard(self) -> list[tuple[Any, FloatArray]]:
+    def switching(self) -> list[tuple[Any, FloatArray]]:
         """Dry friction and bounds with their sizes (n_samples, 1)."""
         return [(f, np.atleast_2d(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
 
@@ -258,12 +263,12 @@ class _Trip:
             out[name] = found
         return out
 
-    def _only(self, i: int) -> _Trip:
+    def _of_sample(self, i: int) -> _Integration:
         def one(v: Any) -> Any:
             v = np.atleast_2d(v)
             return v[i : i + 1] if len(v) > 1 else v
 
-        return _Trip(
+        return _Integration(
             self.kind,
             self.rows,
             {name: one(v) for name, v in self.parameters.items()},
@@ -273,7 +278,7 @@ class _Trip:
 
     def bounded(self, s: FloatArray, names: list[str]) -> FloatArray:
         """Clip initial states to their bounds."""
-        for form, size in self.hard:
+        for form, size in self.switching:
             if form.stops:
                 k = names.index(form.target)
                 s[k] = np.minimum(s[k], size)
@@ -285,8 +290,8 @@ class _Trip:
         assert time is not None
         t = self.columns[time]
         gap = float(t[0, self.places[k + 1, j]] - t[0, self.places[k, j]])
-        at = self.moment(k, slice(j, j + 1))
-        hard = [(form, float(size[0, 0])) for form, size in self.hard]
+        at = self.within_gap(k, slice(j, j + 1))
+        hard = [(form, float(size[0, 0])) for form, size in self.switching]
 
         def free(share: float, y: FloatArray) -> dict[str, float]:
             p, now = at(share)

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.cases import SystemCase
 from probewise.world.systems.chain import simulate
-from probewise.world.systems.fit import Beside, Model, free_numbers
+from probewise.world.systems.fit import AddedForm, Model, free_numbers
 from probewise.world.systems.forms.form import Numbers
 
 __all__ = ["right_predictions"]
@@ -29,12 +29,12 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
         If the fit diverges.
     """
     drawn, kind = case.drawn, case.drawn.kind
-    beside = [Beside(e.form, e.values, free_numbers(e.form)) for e in case.effects]
-    model = Model(kind, drawn.seen, beside)
-    fitted = model.fit(case.readings[drawn.kept], model.coordinates(drawn.shared, drawn.by_run))
+    beside = [AddedForm(e.form, e.values, free_numbers(e.form)) for e in case.effects]
+    model = Model(kind, drawn.diagnosed, beside)
+    fitted = model.fit(case.readings[drawn.kept_rows], model.coordinates(drawn.shared, drawn.by_run))
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
-    x = fitted.at + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
+    x = fitted.coordinates + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
     for k, name in enumerate(name for b in beside for name in b.free):
         if name == "tau_s" and kind.law is not None:
             x[:, model.n_nominal + k] = _to_quantiles(x[:, model.n_nominal + k])

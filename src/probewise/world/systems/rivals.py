@@ -12,8 +12,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.world.systems.chain import read, simulate
-from probewise.world.systems.fit import Beside, Fitted, Model, free_numbers, left_over
+from probewise.world.systems.chain import simulate, with_reading_effects
+from probewise.world.systems.fit import AddedForm, Fitted, Model, free_numbers, project_out
 from probewise.world.systems.forms.form import Form, Placed, as_numbers
 from probewise.world.systems.forms.true_system import TrueSystem
 
@@ -30,7 +30,7 @@ _NEUTRAL = {"level": np.inf, "period": 1.0}
 
 
 def short_name(form: Form) -> str:
-    """Return the name in the vocabulary."""
+    """Return the name in the vocabulary, where a saturation from below has no name of its own."""
     return form.name.removesuffix(" (floor)")
 
 
@@ -67,10 +67,10 @@ def rivals_of(
     -------
     Loss of log likelihood in nats by name, for those below TELLING_NATS, the best first.
     """
-    left = left_over((target - fitted.readings) / true.sd, fitted.slopes)
+    left = project_out((target - fitted.readings) / true.sd, fitted.slopes)
     near = _screened(true, [f for f in forms if short_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
-    hard = any(_is_hard(b.form) for b in model.beside)
+    hard = any(_is_hard(b.form) for b in model.added)
     for candidate in near:
         name = short_name(candidate.form)
         if hard:  # fits with dry friction or a bound take minutes: the linearised result is used
@@ -79,15 +79,15 @@ def rivals_of(
         wider = Model(
             true.kind,
             true.rows,
-            [*model.beside, Beside(candidate.form, candidate.start, free_numbers(candidate.form))],
+            [*model.added, AddedForm(candidate.form, candidate.start, free_numbers(candidate.form))],
         )
         own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free_numbers(candidate.form)]
         try:
             nats = (
                 0.5
                 * wider.fit(
-                    target, np.concatenate([fitted.at, own]), max_calls=5 if _is_hard(candidate.form) else 7
-                ).squares
+                    target, np.concatenate([fitted.coordinates, own]), max_calls=5 if _is_hard(candidate.form) else 7
+                ).chi_square
             )
         except NotConvergedError:
             continue
@@ -107,7 +107,7 @@ def _screened(
         groups = [list(group) for group in form.bank]
         at = 0
         for group in groups:
-            columns = left_over(changes[at : at + len(group)].T / true.sd, fitted.slopes)
+            columns = project_out(changes[at : at + len(group)].T / true.sd, fitted.slopes)
             at += len(group)
             good = np.isfinite(columns).all(axis=0) & (np.sqrt(np.sum(columns**2, axis=0)) > 1e-6)
             if not good.any():
@@ -125,7 +125,7 @@ def _screened(
 def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model: Model) -> dict[Form, FloatArray]:
     """Return the change of the readings by every setting of every form's bank about a fit, (n_settings, n_points)."""
     settings = {form: [each for group in form.bank for each in group] for form in forms}
-    x = fitted.at[None, :]
+    x = fitted.coordinates[None, :]
     parameters, beside = model.parameters(x), model.effects(x)
     inner = [e for e in beside if e[0].side != "reading"]
     outer = [e for e in beside if e[0].side == "reading"]
@@ -136,7 +136,9 @@ def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model:
             if form.side == "reading":
                 numbers = as_numbers(settings[form])
                 out[form] = (
-                    read(np.repeat(bare, len(settings[form]), axis=0), true.rows, [*outer, (form, numbers)])
+                    with_reading_effects(
+                        np.repeat(bare, len(settings[form]), axis=0), true.rows, [*outer, (form, numbers)]
+                    )
                     - fitted.readings
                 )
         alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or true.kind.law is None)]
@@ -145,7 +147,7 @@ def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model:
             out[form] = found - fitted.readings
         together = [f for f in forms if f.side != "reading" and f not in alone]
         for chunk in _chunks(together, settings):
-            out |= _at_once(true, chunk, settings, fitted, model)
+            out |= _simulated_together(true, chunk, settings, fitted, model)
     return out
 
 
@@ -161,12 +163,12 @@ def _chunks(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]])
     return out
 
 
-def _at_once(
+def _simulated_together(
     true: TrueSystem, forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]], fitted: Fitted, model: Model
 ) -> dict[Form, FloatArray]:
     """Simulate many forms at once, each with its null setting except in its own samples."""
     ends = np.cumsum([len(settings[form]) for form in forms])
-    total, x = int(ends[-1]), fitted.at[None, :]
+    total, x = int(ends[-1]), fitted.coordinates[None, :]
     placed = []
     for form, end in zip(forms, ends, strict=True):
         own = as_numbers(settings[form])
@@ -179,7 +181,11 @@ def _at_once(
         placed.append((replace(form, late=""), numbers))
     found = _simulated(true, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
     if len(forms) > 1 and not np.isfinite(found).all():  # one of them diverges, which stops the integration of all
-        return {form: each for own in forms for form, each in _at_once(true, [own], settings, fitted, model).items()}
+        return {
+            form: each
+            for own in forms
+            for form, each in _simulated_together(true, [own], settings, fitted, model).items()
+        }
     return {form: found[end - len(settings[form]) : end] for form, end in zip(forms, ends, strict=True)}
 
 

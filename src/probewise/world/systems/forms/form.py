@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["Bank", "Form", "Now", "Numbers", "Placed", "Side", "as_numbers"]
+__all__ = ["Bank", "Form", "Instants", "Numbers", "Placed", "Side", "as_numbers"]
 
 Side: TypeAlias = Literal["input", "parameter", "rate", "reading"]
 
@@ -23,8 +23,8 @@ Bank: TypeAlias = Sequence[Sequence[dict[str, float]]]
 
 
 @dataclass(frozen=True, eq=False)
-class Now:
-    """Times in runs, at rows or between them; arrays broadcast.
+class Instants:
+    """Instants of runs, at rows or between them; arrays broadcast.
 
     `t` is the recorded time, `since` the time since the start of the run, `u` the columns, `run` the number of the run,
     `row` the number of the row.
@@ -38,7 +38,7 @@ class Now:
 
     @classmethod
     def at_rows(cls, rows: SystemRows) -> Self:
-        """Return the times of all rows."""
+        """Return the instants of all rows."""
         return cls(rows.t[None, :], rows.since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
 
 
@@ -55,7 +55,7 @@ class Form:
     act
         Its function, by side: input (columns, rows, parameters) to columns; parameter (now, parameters) to a term to
         add; rate (states, now, parameters) to a term to add; reading (readings, rows, parameters) to readings.
-    sized
+    of_amplitude
         Converts the amplitude and the drawn values to the form's parameters.
     draw
         Draws all parameters except the amplitude and its sign.
@@ -85,12 +85,14 @@ class Form:
         Whether it is dry friction, or a bound, of the target.
     shape
         Its formula in words, if it is outside the vocabulary.
+    also_in_truth
+        Constants of its formula, by name, which the truth lists beside the parameters.
     """
 
     name: str
     side: Side
     act: Callable[..., Any]
-    sized: Callable[[float, dict[str, float]], dict[str, float]]
+    of_amplitude: Callable[[float, dict[str, float]], dict[str, float]]
     draw: Callable[[np.random.Generator], dict[str, float]]
     bank: Bank
     join: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
@@ -107,7 +109,7 @@ class Form:
     sticks: bool = False
     stops: bool = False
     shape: str = ""
-    beside: Mapping[str, Any] = field(default_factory=dict)
+    also_in_truth: Mapping[str, Any] = field(default_factory=dict)
 
 
 Placed: TypeAlias = tuple[Form, Numbers]

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
 from probewise.world.systems.forms.modulations import one_by_one, wave_bank, wave_joined
-from probewise.world.systems.forms.readings import earlier
+from probewise.world.systems.forms.readings import delayed
 from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 from probewise.world.systems.rows import SystemRows
 
@@ -138,7 +138,7 @@ def _of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         yield _sized(
             f"input_delay:{column}",
             "tau_s",
-            lambda c, rows, v: earlier(c, rows, np.maximum(v["tau_s"], 0.0)),
+            lambda c, rows, v: delayed(c, rows, np.maximum(v["tau_s"], 0.0)),
             column,
             taus,
             ("previous", column),

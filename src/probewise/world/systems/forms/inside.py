@@ -12,7 +12,7 @@ from probewise.world.systems.forms.form import Form
 from probewise.world.systems.forms.modulations import Modulation, one_by_one
 from probewise.world.systems.forms.true_system import TrueSystem
 
-__all__ = ["forms_of_parameters", "forms_of_rates", "pushing", "varying"]
+__all__ = ["forms_of_parameters", "forms_of_rates", "term_in_rate", "varying_parameter"]
 
 _N_WAVES = 20
 
@@ -29,20 +29,20 @@ def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
         if name in true.kind.per_run and true.kind.law is not None:
             own = {}  # initial values do not vary within a run
         for kind, how in own.items():
-            yield varying(true, f"{kind}:{name}", name, how)
+            yield varying_parameter(true, f"{kind}:{name}", name, how)
         if not (name in true.kind.per_run and true.kind.law is not None):
             for column in true.logged:
-                yield varying(true, f"depends:{name}:{column}", name, modulations.with_column(true, column))
+                yield varying_parameter(true, f"depends:{name}:{column}", name, modulations.with_column(true, column))
 
 
-def varying(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
+def varying_parameter(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
     """Bind a modulation to a parameter."""
     first = 0.003 * float(np.abs(true.parameters[target]).mean()) / how.reach
     return Form(
         name,
         "parameter",
         how.over,
-        how.sized,
+        how.of_amplitude,
         how.draw,
         how.bank(0.1 * first),
         how.join,
@@ -56,7 +56,7 @@ def varying(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
     )
 
 
-def pushing(
+def term_in_rate(
     true: TrueSystem,
     name: str,
     state: str,
@@ -96,22 +96,26 @@ def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
     for state, values in true.states.items():
         size = float(np.abs(values).max())
         own = (f"state:{state}", "time")
-        yield pushing(true, f"damping:{state}", state, _of(state, lambda r: -r), size, own, signed=False)
-        drags = _of(state, lambda r: -np.abs(r) * r)
-        yield pushing(true, f"drag:{state}", state, drags, size**2, own, signed=False)
-        yield pushing(true, f"forcing:{state}", state, _of(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own))
+        yield term_in_rate(true, f"damping:{state}", state, _term_of(state, lambda r: -r), size, own, signed=False)
+        drags = _term_of(state, lambda r: -np.abs(r) * r)
+        yield term_in_rate(true, f"drag:{state}", state, drags, size**2, own, signed=False)
+        yield term_in_rate(
+            true, f"forcing:{state}", state, _term_of(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
+        )
         for other, there in true.states.items():
             most = float(np.abs(there).max())
             seen = (f"state:{other}", "time")
-            yield pushing(true, f"cubic:{state}:{other}", state, _of(other, lambda r: -(r**3)), most**3, seen)
-            yield pushing(true, f"quadratic:{state}:{other}", state, _of(other, lambda r: -(r**2)), most**2, seen)
+            yield term_in_rate(true, f"cubic:{state}:{other}", state, _term_of(other, lambda r: -(r**3)), most**3, seen)
+            yield term_in_rate(
+                true, f"quadratic:{state}:{other}", state, _term_of(other, lambda r: -(r**2)), most**2, seen
+            )
             if other != state:
-                yield pushing(true, f"coupling:{state}:{other}", state, _of(other, lambda r: -r), most, seen)
+                yield term_in_rate(true, f"coupling:{state}:{other}", state, _term_of(other, lambda r: -r), most, seen)
         yield _periodic(true, state)
-        yield from _hard(true, state)
+        yield from _friction_and_bound(true, state)
 
 
-def _of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
+def _term_of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
     """Return a push from a term in one state."""
     return lambda s, now, v: term(s[state])
 
@@ -123,7 +127,7 @@ def _periodic(true: TrueSystem, state: str) -> Form:
         f"periodic_forcing:{state}",
         "rate",
         lambda s, now, v: how.over(now, v),
-        how.sized,
+        how.of_amplitude,
         how.draw,
         how.bank(0.1 * first),
         how.join,
@@ -136,7 +140,7 @@ def _periodic(true: TrueSystem, state: str) -> Form:
     )
 
 
-def _hard(true: TrueSystem, state: str) -> Iterator[Form]:
+def _friction_and_bound(true: TrueSystem, state: str) -> Iterator[Form]:
     speed, values = true.speed(state), true.states[state]
     sizes = speed * np.geomspace(1e-3, 0.3, 4)
     yield Form(

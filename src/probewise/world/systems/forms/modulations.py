@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.forms.form import Bank, Now, Numbers
+from probewise.world.systems.forms.form import Bank, Instants, Numbers
 from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 
 __all__ = [
@@ -30,8 +30,8 @@ __all__ = [
 class Modulation:
     """A variation in proportion to an amplitude; attributes as in `Form`."""
 
-    over: Callable[[Now, Numbers], Any]
-    sized: Callable[[float, dict[str, float]], dict[str, float]]
+    over: Callable[[Instants, Numbers], Any]
+    of_amplitude: Callable[[float, dict[str, float]], dict[str, float]]
     draw: Callable[[np.random.Generator], dict[str, float]]
     bank: Callable[[float], Bank]
     join: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
@@ -53,7 +53,7 @@ def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[s
 
 
 def _plain(
-    over: Callable[[Now, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
+    over: Callable[[Instants, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
 ) -> Modulation:
     return Modulation(
         over,
@@ -85,7 +85,7 @@ def step(true: TrueSystem) -> Modulation:
     at, timed = ("at_s", True) if true.rows.time is not None else ("at_row", False)
     moments = np.quantile(np.unique(true.rows.t), np.linspace(0.02, 0.98, 40))
 
-    def over(now: Now, v: Numbers) -> Any:
+    def over(now: Instants, v: Numbers) -> Any:
         return v["a"] * ((now.t if timed else now.row) > v[at])
 
     return Modulation(
@@ -107,7 +107,7 @@ def by_run(true: TrueSystem) -> Modulation:
     names = [f"values[{k}]" for k in range(n)]
     present = [int(true.rows.run[own[0]]) for own in true.rows.by_run]
 
-    def over(now: Now, v: Numbers) -> Any:
+    def over(now: Instants, v: Numbers) -> Any:
         values = np.concatenate(np.broadcast_arrays(*(np.atleast_2d(v[name]) for name in names)), axis=1)
         return values[:, now.run]
 

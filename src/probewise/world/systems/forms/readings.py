@@ -9,12 +9,12 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms import modulations
-from probewise.world.systems.forms.form import Form, Now, Numbers
+from probewise.world.systems.forms.form import Form, Instants, Numbers
 from probewise.world.systems.forms.modulations import Modulation
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["GAIN", "OFFSET", "added_to_readings", "earlier", "forms_of_readings", "way_of"]
+__all__ = ["GAIN", "OFFSET", "added_to_readings", "delayed", "direction_of_change", "forms_of_readings"]
 
 GAIN, OFFSET, _BEND, _LAG, _CEILING = range(5)
 _N_WAVES = 240
@@ -22,16 +22,16 @@ _N_WAVES = 240
 
 def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
     """Yield every form of the reading."""
-    yield from _varying(true)
-    yield from _bent(true)
-    yield from _behind(true)
+    yield from _modulated_forms(true)
+    yield from _nonlinear_forms(true)
+    yield from _lag_and_delay(true)
 
 
 def added_to_readings(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
     """Bind a modulation to the reading, as an offset or a gain about 0."""
 
     def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-        change = how.over(Now.at_rows(rows), v)
+        change = how.over(Instants.at_rows(rows), v)
         return np.asarray(y * (1 + change) if gain else y + change)
 
     typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
@@ -40,7 +40,7 @@ def added_to_readings(true: TrueSystem, name: str, how: Modulation, *, gain: boo
         name,
         "reading",
         act,
-        how.sized,
+        how.of_amplitude,
         how.draw,
         how.bank(first),
         how.join,
@@ -53,7 +53,7 @@ def added_to_readings(true: TrueSystem, name: str, how: Modulation, *, gain: boo
     )
 
 
-def _varying(true: TrueSystem) -> Iterator[Form]:
+def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
     timed = true.rows.time is not None
     both = {"step": modulations.step(true)}
     if timed:
@@ -70,7 +70,7 @@ def _varying(true: TrueSystem) -> Iterator[Form]:
         yield added_to_readings(true, "settling", modulations.settling(true))
 
 
-def way_of(y: FloatArray, rows: SystemRows) -> FloatArray:
+def direction_of_change(y: FloatArray, rows: SystemRows) -> FloatArray:
     """Return the sign of change of readings (n_samples, n_points); rests keep the last sign, the first row the next."""
     out = np.zeros_like(y)
     for own in rows.by_run:
@@ -84,12 +84,12 @@ def way_of(y: FloatArray, rows: SystemRows) -> FloatArray:
     return out
 
 
-def _bent(true: TrueSystem) -> Iterator[Form]:
+def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
     low, high, sd = float(true.readings.min()), float(true.readings.max()), true.sd
     yield Form(
         "hysteresis",
         "reading",
-        lambda y, rows, v: y + v["a"] * way_of(y, rows),
+        lambda y, rows, v: y + v["a"] * direction_of_change(y, rows),
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": sd}]],
@@ -121,7 +121,7 @@ def _bent(true: TrueSystem) -> Iterator[Form]:
         0.5,
         ("level",),
         order=_BEND,
-        beside={"lo": low, "hi": high},
+        also_in_truth={"lo": low, "hi": high},
     )
     for upper in (True, False):
         end, sign = (high, -1.0) if upper else (low, 1.0)
@@ -129,7 +129,7 @@ def _bent(true: TrueSystem) -> Iterator[Form]:
         yield Form(
             "saturation" if upper else "saturation (floor)",
             "reading",
-            _ends(upper),
+            _clipped(upper),
             _level(end, sign),
             lambda rng: {},
             [[{"level": float(level)}] for level in levels],
@@ -143,7 +143,7 @@ def _bent(true: TrueSystem) -> Iterator[Form]:
         )
 
 
-def _ends(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatArray]:
+def _clipped(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatArray]:
     """Return a function that clips at a level."""
     bound = np.minimum if upper else np.maximum
     return lambda y, rows, v: np.asarray(bound(y, v["level"]))
@@ -154,8 +154,8 @@ def _level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[
     return lambda a, drawn: {"level": end + sign * a}
 
 
-def earlier(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray:
-    """Interpolate values (n or 1, n_points) linearly at times earlier by tau (n or 1, 1), within runs."""
+def delayed(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray:
+    """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs; before the first value it holds."""
     n = max(len(values), len(tau))
     values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
     out = np.empty(values.shape)
@@ -176,11 +176,11 @@ def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
     return out
 
 
-def _behind(true: TrueSystem) -> Iterator[Form]:
+def _lag_and_delay(true: TrueSystem) -> Iterator[Form]:
     if true.rows.time is None:
         return
     gap = true.rows.gap
-    acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: earlier(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
+    acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: delayed(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
     for name, (act, least) in acts.items():
         yield Form(
             name,

@@ -8,17 +8,17 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.kind import Columns, SystemKind
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["blocks", "irregular", "lay_out", "swings", "there_and_back"]
+__all__ = ["design_runs", "held_levels", "irregular_times", "random_waves", "there_and_back"]
 
 _PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
 
-def irregular(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
+def irregular_times(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
     """Draw times from 0 whose gaps lie between 0.6 and 1.4 of `gap`, (n,)."""
     return np.concatenate([[0.0], np.cumsum(gap * rng.uniform(0.6, 1.4, n - 1))])
 
 
-def blocks(rng: np.random.Generator, n: int, levels: FloatArray, length: int) -> FloatArray:
+def held_levels(rng: np.random.Generator, n: int, levels: FloatArray, length: int) -> FloatArray:
     """Return random levels, each held for about `length` rows, without repetition, (n,)."""
     out: list[float] = []
     while len(out) < n:
@@ -27,7 +27,7 @@ def blocks(rng: np.random.Generator, n: int, levels: FloatArray, length: int) ->
     return np.array(out[:n])
 
 
-def swings(rng: np.random.Generator, t: FloatArray, size: float, fastest: float) -> FloatArray:
+def random_waves(rng: np.random.Generator, t: FloatArray, size: float, fastest: float) -> FloatArray:
     """Return the sum of four sinusoids of random frequency up to `fastest`, rms `size`, (n,)."""
     hz = fastest * rng.uniform(0.1, 1.0, 4)
     waves = np.sin(2 * np.pi * hz[:, None] * t + rng.uniform(0, 2 * np.pi, 4)[:, None])
@@ -41,7 +41,7 @@ def there_and_back(rng: np.random.Generator, n: int, low: float, high: float) ->
     return np.asarray(low + (high - low) * np.concatenate([first, second]))
 
 
-def lay_out(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
+def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
     """Design all runs of a case; the last two are held out, the last one in a new regime."""
     n_runs = kind.n_runs + 2
     each = int(np.clip(rng.integers(150, 420) // kind.n_runs, 24, 120))
@@ -51,11 +51,11 @@ def lay_out(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
     for k in range(n_runs):
         n = int(each * rng.uniform(0.8, 1.2))
         regime = 1.5 if k == n_runs - 1 else 1.0
-        t, own = kind.lay(rng, n, regime)
+        t, own = kind.design(rng, n, regime)
         if not kind.time_anew:
             t = t + clock
             clock = float(t[-1]) + _PAUSE * float(t[-1] - t[0]) * rng.uniform(0.5, 1.5) + float(t[1] - t[0])
-        whole = {**own, **_logged(kind, n, k, regime, rng)}
+        whole = {**own, **_irrelevant_columns(kind, n, k, regime, rng)}
         if kind.time is not None:
             whole[kind.time] = t
         for name, values in whole.items():
@@ -66,7 +66,7 @@ def lay_out(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
     return SystemRows(joined, np.concatenate(run).astype(np.int64), kind.time, n_runs)
 
 
-def _logged(kind: SystemKind, n: int, k: int, regime: float, rng: np.random.Generator) -> Columns:
+def _irrelevant_columns(kind: SystemKind, n: int, k: int, regime: float, rng: np.random.Generator) -> Columns:
     out = {}
     for column in kind.logged:
         walk = np.cumsum(rng.standard_normal(n)) / np.sqrt(n) + rng.standard_normal()

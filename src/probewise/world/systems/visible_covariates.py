@@ -15,33 +15,33 @@ _AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts 
 _PLAIN = 0.25  # least explained share of the sum of squares
 
 
-def covariates_of(form: Form, left: FloatArray, true: TrueSystem) -> tuple[str, ...]:
+def covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
     """Return the covariates that a right answer may rank first: the form's own, and equivalent ones.
 
     Parameters
     ----------
     form
         The concealed form.
-    left
+    residuals
         Residuals after the refit of the nominal model, (n_points,).
     true
         The system.
     """
     rows = true.rows
     pooled = {name: values for name, values in rows.columns.items() if name != rows.time}
-    pooled |= {"level": true.readings, "previous": _change(true)}
+    pooled |= {"level": true.readings, "previous": _change_of_reading(true)}
     pooled |= {f"state:{name}": values for name, values in true.states.items()}
     if rows.time is not None:
         pooled["time"] = rows.t
-    shares = {name: _share(left, _binned(values)) for name, values in pooled.items()}
+    shares = {name: _explained_share(residuals, _binned(values)) for name, values in pooled.items()}
     if len(rows.by_run) > 1:
-        shares["run"] = _share(left, rows.run)
+        shares["run"] = _explained_share(residuals, rows.run)
     best = max(shares.values())
     plain = [name for name, share in shares.items() if share >= _AS_PLAIN * best and share > _PLAIN]
     return tuple(dict.fromkeys((*form.covariates, *sorted(plain, key=lambda name: -shares[name]))))
 
 
-def _change(true: TrueSystem) -> FloatArray:
+def _change_of_reading(true: TrueSystem) -> FloatArray:
     out = np.zeros(len(true.rows))
     for own in true.rows.by_run:
         out[own[1:]] = np.diff(true.readings[own])
@@ -53,11 +53,11 @@ def _binned(values: FloatArray) -> FloatArray:
     return np.asarray(np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
 
 
-def _share(left: FloatArray, groups: FloatArray | IntArray) -> float:
-    """Return the share of the residuals' sum of squares that group means explain, less that of noise: n_groups / n."""
-    total, explained, n_groups = float(left @ left), 0.0, 0
+def _explained_share(residuals: FloatArray, groups: FloatArray | IntArray) -> float:
+    """Return the share of the sum of squares that group means explain, minus its expectation for white noise."""
+    total, explained, n_groups = float(residuals @ residuals), 0.0, 0
     for group in np.unique(groups):
-        own = left[groups == group]
+        own = residuals[groups == group]
         explained += len(own) * float(own.mean()) ** 2
         n_groups += 1
-    return explained / total - n_groups / len(left)
+    return explained / total - n_groups / len(residuals)

@@ -7,16 +7,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.forms.form import Form, Now, Numbers
-from probewise.world.systems.forms.inside import pushing
+from probewise.world.systems.forms.form import Form, Instants, Numbers
+from probewise.world.systems.forms.inside import term_in_rate
 from probewise.world.systems.forms.modulations import one_by_one
 from probewise.world.systems.forms.readings import OFFSET
 from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["STRANGE", "strangers"]
+__all__ = ["OUT_OF_VOCABULARY", "forms_out_of_vocabulary"]
 
-STRANGE = (
+OUT_OF_VOCABULARY = (
     "product",
     "square_wave",
     "switch",
@@ -31,7 +31,7 @@ STRANGE = (
 """Names of these effects, without targets."""
 
 
-def strangers(true: TrueSystem, rng: np.random.Generator) -> Iterator[Form]:
+def forms_out_of_vocabulary(true: TrueSystem, rng: np.random.Generator) -> Iterator[Form]:
     """Bind every effect outside the vocabulary to randomly drawn columns and states."""
     columns = [str(name) for name in rng.permutation(true.logged)]
     first, second = columns[0], columns[1]
@@ -163,7 +163,7 @@ def _two_settlings(true: TrueSystem) -> Form:
     longest = float(true.rows.since_start.max())
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-        since = Now.at_rows(rows).since[0]
+        since = Instants.at_rows(rows).since[0]
         return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
 
     return _added(
@@ -178,7 +178,7 @@ def _two_settlings(true: TrueSystem) -> Form:
 def _spring(true: TrueSystem, state: str) -> Form:
     at = float(np.quantile(true.states[state], 0.6))
     size = float(np.ptp(true.states[state]))
-    return pushing(
+    return term_in_rate(
         true,
         f"strange_one_sided_spring:{state}",
         state,
@@ -195,7 +195,7 @@ def _leak(true: TrueSystem, state: str) -> Form:
     def push(s: dict[str, FloatArray], now: object, v: Numbers) -> FloatArray:
         return np.asarray(-np.expm1(np.clip(s[state] / scale, -30, 12)))
 
-    return pushing(
+    return term_in_rate(
         true,
         f"strange_leak:{state}",
         state,
@@ -208,7 +208,7 @@ def _leak(true: TrueSystem, state: str) -> Form:
 
 def _driven(true: TrueSystem, state: str, column: str) -> Form:
     middle, spread, most = true.middle(column), true.spread(column), float(np.abs(true.states[state]).max())
-    return pushing(
+    return term_in_rate(
         true,
         f"strange_column_times_state:{state}:{column}",
         state,

@@ -226,7 +226,7 @@ class Searched:
         return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
 
     def best(self, names: Names, noise: Names) -> WeighedFit | None:
-        """Return the refit of these effects with the most evidence under this noise, at any SSF order, if there is one."""
+        """Return the refit of these effects with the most evidence under this noise over SSF orders; None: no refit."""
         options = [fit for (_, key), fit in self.evidences.fits.items() if key == names]
         return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
 

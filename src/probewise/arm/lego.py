@@ -169,7 +169,7 @@ class LegoArm:
         """
         goals = self._goals(x_mm, y_mm, self.geometry.travel_height_mm)
         self.rise()
-        self._arrive(BASE, goals[BASE])
+        self._turn_to(BASE, goals[BASE])
         for joint in self._link_order(goals):
             self._move_near(joint, goals[joint].counts)
 
@@ -194,10 +194,10 @@ class LegoArm:
     def _lower_to(self, x_mm: float, y_mm: float, height_mm: float) -> None:
         goals = self._goals(x_mm, y_mm, height_mm)
         self.rise()
-        self._arrive(BASE, goals[BASE])
+        self._turn_to(BASE, goals[BASE])
         self._is_down = True
         for joint in self._link_order(goals):
-            self._arrive(joint, goals[joint])
+            self._turn_to(joint, goals[joint])
 
     def rise(self) -> None:
         """Raise the sensor to about travel height, if it is lower, by the link that needs the smaller turn.
@@ -237,9 +237,9 @@ class LegoArm:
                 stopped.append(joint)
         self.rise()
         goals = [Goal(0, side) for side in self._sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))]
-        self._arrive(BASE, goals[BASE])
+        self._turn_to(BASE, goals[BASE])
         for joint in self._link_order(goals):
-            self._arrive(joint, goals[joint])
+            self._turn_to(joint, goals[joint])
         if stopped:
             self._machine.reset(stopped)
 
@@ -271,7 +271,7 @@ class LegoArm:
         """Turn one joint by an angle, subject to the limits."""
         angles = self.angles_rad
         angles[joint] += by_rad
-        self._arrive(joint, self._goals_at(angles)[joint])
+        self._turn_to(joint, self._goals_at(angles)[joint])
 
     def _pose(self) -> Pose:
         """Return the sensor's pose by the motors' counters."""
@@ -341,7 +341,7 @@ class LegoArm:
         end = sorted(mechanics.counts_at(angle) - here for angle in (mechanics.low_rad, mechanics.high_rad))
         return abs(way), joint, here + min(max(far, end[0]), end[1])
 
-    def _arrive(self, joint: int, goal: Goal) -> None:
+    def _turn_to(self, joint: int, goal: Goal) -> None:
         with_gears = self.geometry.joints[joint].gear_ratio > 0
         side: Side = 1 if (goal.side > 0) == with_gears else -1
         self._machine.move_to(joint, goal.counts, side)

@@ -141,7 +141,7 @@ class OwnInstrument:
             return held.astype(np.bool_)
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
-        """Return `reachable`; the name is part of the Bounds interface."""
+        """Return which places, (n_places, 2), are reachable, as `reachable` does: shape (n_places,)."""
         return self.reachable(places_mm)
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:

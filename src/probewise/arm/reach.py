@@ -58,9 +58,9 @@ def require_reach(workspace: Bounds, places_mm: FloatArray, of: str, *, way_out:
     places_mm
         Shape (n_places, 2).
     of
-        What a place belongs to, for messages: a noun, and words on all of them if any, as in "row of the plan".
+        What has a place, for messages; its first word gets the number: "row of the plan" becomes "row 3 of the plan".
     way_out
-        Advice besides choosing other places, if there is any.
+        Further advice, added at the end of the message.
 
     Raises
     ------

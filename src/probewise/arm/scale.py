@@ -1,4 +1,4 @@
-"""The scale of both arms' readings: LEGO units, whole numbers from 1 to 100 (paper, "Robotic Arm Test Bed")."""
+"""The scale of readings; by default LEGO units, whole numbers from 1 to 100 (paper, "Robotic Arm Test Bed")."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from probewise.errors import ParameterError
 
 @dataclass(frozen=True)
 class LegoScale:
-    """The brick's conversion: whole steps from `low` to `high`; `step` None leaves fractions."""
+    """Conversion of a value to a reading: rounded to multiples of `step` (None: not rounded), clipped to `low`, `high`.
+
+    By default the LEGO brick's.
+    """
 
     low: float = 1.0
     high: float = 100.0
@@ -23,7 +26,7 @@ class LegoScale:
             raise ParameterError("step", self.step, "greater than 0, or None")
 
     def convert(self, value: float) -> float:
-        """Round to a step, then clip to the scale; NaN, a missing reading, stays NaN."""
+        """Round a value to a step and clip it to the scale; NaN, a missing reading, stays NaN."""
         if math.isnan(value):
             return value
         value = min(max(value, self.low), self.high)

@@ -150,7 +150,7 @@ class Brick:
         """
         commands: list[Request[Done]] = [
             SetOutputState(ALL_OUTPUTS),
-            *(light.off for light in self._lights.values()),
+            *(light.off_command for light in self._lights.values()),
         ]
         failures = []
         for send in (self.link.tell, self.link.ask):

@@ -113,8 +113,8 @@ class LightSensor:
         raise AssertionError("a count has no end")  # pragma: no cover
 
     @property
-    def off(self) -> SetInputMode:
-        """Return the command that switches the LED off and unconfigures the input."""
+    def off_command(self) -> SetInputMode:
+        """The command that switches the LED off and unconfigures the input."""
         return SetInputMode(self.port, SensorType.NONE, Mode.RAW)
 
 

@@ -173,7 +173,7 @@ class Link:
             try:
                 self._await_turn()
                 if self._owed or self._stream.read(LONGEST, 0.0):
-                    self._clear()
+                    self._discard_late_answers()
                 answer = request.answer(self._exchange(request))
                 if check is not None:
                     check(answer)
@@ -223,7 +223,7 @@ class Link:
         self._free_at = max(self._free_at, self._clock.monotonic() + self._timing.turn_s)
         return reply
 
-    def _clear(self) -> None:
+    def _discard_late_answers(self) -> None:
         """Ensure that no answer to an earlier command can still arrive."""
         self._drain()
         for fence in FENCES:
@@ -266,12 +266,12 @@ class Link:
                 raise TelegramError(f"a reply to opcode {reply.opcode:02X} came, which was not asked for")
 
     def _frame(self, request: Request[A], deadline: float) -> bytes:
-        length = int.from_bytes(self._exactly(2, request, deadline), "little")
+        length = int.from_bytes(self._read_exactly(2, request, deadline), "little")
         if not 2 <= length <= LONGEST:
             raise TelegramError(f"a telegram of {length} bytes was announced; allowed: 2 to {LONGEST}")
-        return self._exactly(length, request, deadline)
+        return self._read_exactly(length, request, deadline)
 
-    def _exactly(self, size: int, request: Request[A], deadline: float) -> bytes:
+    def _read_exactly(self, size: int, request: Request[A], deadline: float) -> bytes:
         """Read exactly `size` bytes, in any number of pieces."""
         got = b""
         while len(got) < size:

@@ -88,7 +88,7 @@ class Request(Fields, Generic[A_co]):
         return type(self).__name__.upper()
 
     def answer(self, reply: Reply) -> A_co:
-        """Decode the answer to this command.
+        """Decode a reply to this command into its answer.
 
         Raises
         ------

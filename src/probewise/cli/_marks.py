@@ -49,7 +49,7 @@ def bring_to_mark(
     arm: LegoArm,
     mark_mm: tuple[float, float],
     block_mm: float,
-    eyes: Callable[[MarkQuestion], str],
+    ask: Callable[[MarkQuestion], str],
     tell: Callable[[str], None],
     *,
     named: str,
@@ -64,8 +64,8 @@ def bring_to_mark(
         The arm, entered.
     mark_mm, block_mm
         Place of the mark on the field, and height of the block.
-    eyes
-        Function that answers: "ok", "seen", "skip", or a move.
+    ask
+        Function that asks the person and returns "ok", "seen", "skip", or a move such as "x 5".
     tell
         Function that reports why a move was refused.
     named
@@ -77,7 +77,7 @@ def bring_to_mark(
     arm.go_down(*at)
     tell(_HELP)
     while True:
-        answer = eyes(MarkQuestion(f"{named} ({mark_mm[0]:g}, {mark_mm[1]:g}): ", mark_mm, block_mm)).lower()
+        answer = ask(MarkQuestion(f"{named} ({mark_mm[0]:g}, {mark_mm[1]:g}): ", mark_mm, block_mm)).lower()
         if answer == "skip":
             return None
         if answer in ("ok", "seen"):
@@ -99,7 +99,10 @@ def bring_to_mark(
 
 
 def _place_after(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
-    """Return the place after the move of an answer; None if it is not a move."""
+    """Return the sensor's place (x, y, height in mm) after the moves in an answer; None if it is not a list of moves.
+
+    An answer is pairs such as "x 5 down 2"; an empty one means one step down.
+    """
     words = answer.split() or ["down", str(STEP_MM)]
     x, y, height = at_mm
     if len(words) % 2:

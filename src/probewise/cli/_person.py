@@ -31,11 +31,11 @@ class PersonAtBench:
         The arm, entered.
     plan, origin_mm
         The plan, and the place of its origin.
-    watch
-        Checks readings against the patterns.
-    looks
+    sheet_check
+        The check of readings against the patterns.
+    check_sheets
         Whether a sheet is checked before it is scanned; a user's own instrument takes only the plan's readings.
-    typed
+    emulated
         Whether the bench is an emulator, so that requests are carried out by typing in its terminal.
     """
 

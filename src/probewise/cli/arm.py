@@ -358,7 +358,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
 
     with reporting_what_is_kept(said), instrument as arm:
         answer = questioner(arm)
-        eyes = answer if bench is None else bench.answer_at_mark
+        ask = answer if bench is None else bench.answer_at_mark
         tell = partial(say, quiet=bench is not None)
         if bench is None:
             prompter(arm)(
@@ -368,7 +368,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
         for number, mark in enumerate(marks, 1):
             if mark in done:
                 continue
-            met = bring_to_mark(arm, mark, arguments.block_mm, eyes, tell, named=f"mark {number} of {len(marks)}")
+            met = bring_to_mark(arm, mark, arguments.block_mm, ask, tell, named=f"mark {number} of {len(marks)}")
             if met is not None:
                 taken.append(met)
                 write_marks(taken, kept)

@@ -98,12 +98,12 @@ def _naming(done: list[Result]) -> list[Row]:
 def _probabilities(done: list[Result]) -> list[Row]:
     own = singles_of(done, 12.0)
 
-    def holds(r: Result) -> bool:
+    def covers_truth(r: Result) -> bool:
         return any(names_match(names_of(label), effects_to_name(r, merged=True)) for label in r["credible_set"])
 
     return [
-        Row("95 % credible set holds the truth or its alias, lambda 12", share([holds(r) for r in own]), 0.95),
-        Row("  the same, all cases", share([holds(r) for r in done])),
+        Row("95 % credible set holds the truth or its alias, lambda 12", share([covers_truth(r) for r in own]), 0.95),
+        Row("  the same, all cases", share([covers_truth(r) for r in done])),
         Row(
             "size of the credible set, the truth and its aliases as one, lambda 12",
             mean([merged_size(r) for r in own]),

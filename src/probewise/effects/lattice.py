@@ -78,7 +78,10 @@ def lattice_step(readings: FloatArray) -> float:
 
 
 def lattice_step_sd(readings: FloatArray, step: float) -> float:
-    """Estimate the sd of a lattice's step: the rounding error over the norm of the values' centred lattice numbers."""
+    """Estimate the sd of a lattice's step, as fitted to distinct readings that were printed to some digits.
+
+    It is the sd of the printing's rounding error over the norm of the readings' lattice numbers, centred.
+    """
     values = np.unique(readings[np.isfinite(readings)])
     digits = (10.0**-n for n in range(10) if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n))
     reach = float(np.linalg.norm(values - values.mean())) / step

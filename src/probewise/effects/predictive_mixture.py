@@ -21,7 +21,7 @@ class PredictiveMixture:
     readings
         Measured readings, (n_points,).
     scored
-        Whether each reading gets a log density, (n_points,).
+        Which readings get a log density, (n_points,).
     step
         The declared rounding step, if any.
     """
@@ -58,7 +58,10 @@ class PredictiveMixture:
             self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
 
     def finished(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return mean, sd and log density of each reading, (n_points,); NaN for the density of readings not scored."""
+        """Return mean and sd of a new reading at each row, and log density of the measured one: (n_points,) each.
+
+        The density is NaN where a reading is not scored.
+        """
         n = self.n_samples
         shift = self._total / n
         spread = np.maximum(self._squares / n - shift**2, 0.0)

@@ -98,7 +98,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search periods from three steps of X to twice its range; None where X does not move."""
+        """Search periods from three steps of X to twice its range; None where X takes fewer than eight positions."""
         shortest, reach = _steps_and_range(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 2 * reach) if reach > 0 else None
 

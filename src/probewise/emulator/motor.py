@@ -18,7 +18,7 @@ class MotorParameters:
     Parameters
     ----------
     full_speed_deg_s
-        Speed without load at power 100 and `rated_mv`.
+        Speed without load at power 100 and a battery of `rated_mv`.
     driven_s
         Time constant of the approach to the commanded speed, and of the electric brake.
     coasting_s

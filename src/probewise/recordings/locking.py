@@ -53,7 +53,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
 
 
 def _locked_file(lock: Path, path: Path) -> int | None:
-    """Open and lock the lock file; None where another process holds it."""
+    """Open and lock the lock file, and return its handle; None if another process holds the lock."""
     while True:
         try:
             handle = os.open(lock, os.O_RDWR | os.O_CREAT, 0o666)

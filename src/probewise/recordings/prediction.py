@@ -89,7 +89,7 @@ def write_prediction(prediction: Prediction, path: str | os.PathLike[str]) -> No
 
 
 def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Read `mean`, `sd` and `log_density` (NaN where empty), each of shape (n_points,).
+    """Read `mean`, `sd` and `log_density` from a file of predictions, each (n_points,); an empty density becomes NaN.
 
     Raises
     ------

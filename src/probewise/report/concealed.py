@@ -12,7 +12,7 @@ from probewise.study import ConcealedRow
 
 
 def answer(rows: Sequence[ConcealedRow]) -> str:
-    """Summarise in one sentence how many runs ended sure and wrong, with doubt and without."""
+    """Summarise in one sentence how many runs ended sure and wrong, with full trust in the sensor and with less."""
     wrong = {doubts: _wrong_count([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)}
     return (
         f"Sure and wrong: {wrong[False]} where the robot trusts its sensor, {wrong[True]} where it doubts it, "

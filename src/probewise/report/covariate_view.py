@@ -25,10 +25,11 @@ _LEAST_PERIODS = 3.0  # least number of periods in a recording for folding it
 
 @dataclass(frozen=True, eq=False)
 class CovariateView:
-    """A covariate against which residuals are drawn: its values (n_points,), NaN where it has none, and axis label.
+    """A covariate against which residuals are drawn.
 
-    `names` name the values of a categorical covariate. `window` is the significant interval, in the covariate's unit;
-    of a categorical covariate, in positions on the axis. `place` is the place of the diagnosis shown, if any.
+    `at` holds its values, (n_points,), NaN where it has none, and `label` is the axis label. `names` name the values of
+    a categorical covariate. `window` is the interval to shade, in the covariate's unit, or in positions on the axis for
+    a categorical one. `place` is the `Place` of the diagnosis that is shown, if any.
     """
 
     at: FloatArray

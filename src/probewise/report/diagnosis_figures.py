@@ -192,7 +192,7 @@ def _noise(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 
 
 def _noise_panel(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
-    """Choose the panel that shows a noise effect; spread by level by default."""
+    """Return the function that draws the panel of a noise effect: by default the residuals' spread by level."""
     recording, residuals = diagnosis.recording, np.array(diagnosis.repair.after.residuals)
     unit = unit_name(recording.plan.instrumentation.unit)
     found = {p.name: p.mean for p in diagnosis.report.noise.parameters}

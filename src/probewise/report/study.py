@@ -42,7 +42,7 @@ def answer(study: Study) -> str:
 
 
 def table_of_rows(study: Study) -> Markup:
-    """Build the tables, one line per row: readings needed, information, errors and cost."""
+    """Build two tables with a line for each row of the study: readings needed; information, errors and cost."""
     readings = (
         "row",
         "runs",

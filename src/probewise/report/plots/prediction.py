@@ -32,7 +32,10 @@ MAX_PANELS = 8
 def predicted_against_recorded(
     recording: Recording, mean: FloatArray, sd: FloatArray, *, axes: AxesGrid | None = None
 ) -> AxesGrid:
-    """Draw recorded and predicted readings with the 95 % band of new readings, one panel per scan (paper, figure 7).
+    """Draw recorded and predicted readings with the 95 % band of new readings (paper, figure 7).
+
+    Each panel shows a scan, the last one all single readings. Of too many scans, evenly spaced ones are drawn, so that
+    there are at most eight panels.
 
     Parameters
     ----------

@@ -162,7 +162,7 @@ class Chain:
         ParameterError
             If the plan has a pattern that the scene lacks, or theta holds no valid SSF.
         """
-        at_once = self._at_once(theta, plan)
+        at_once = self._n_at_once(theta, plan)
         if at_once < len(theta):
             blocks = (theta[first : first + at_once] for first in range(0, len(theta), at_once))
             return np.concatenate([self.predict(block, plan) for block in blocks])
@@ -170,8 +170,8 @@ class Chain:
         plain = not self.effects and not is_commanded(plan)
         return self._plain_readings(view.seen, theta) if plain else self.read(view, theta, plan)
 
-    def _at_once(self, theta: FloatArray, plan: Plan) -> int:
-        """Return the number of hypotheses per block, limited by memory where footprints can differ between readings."""
+    def _n_at_once(self, theta: FloatArray, plan: Plan) -> int:
+        """Return how many hypotheses to predict at once; memory limits it where footprints differ between readings."""
         if not any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
             return len(theta)
         return max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
@@ -203,7 +203,7 @@ class Chain:
         return reading
 
     def seen(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Return the seen white fraction R before any effect on it, shape (n_samples or 1, n_points)."""
+        """Return the white fraction R that the sensor sees, before any effect on it, (n_samples or 1, n_points)."""
         return self.look(theta, plan).seen
 
     def look(self, theta: FloatArray, plan: Plan) -> View:
@@ -216,7 +216,7 @@ class Chain:
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
         plain = raised_as_commanded(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._applier(theta, plan)(Stage.FOOTPRINT, plain)
-        geometries = self._geometries(theta, footprint)
+        geometries = self._grouped_by_geometry(theta, footprint)
         if geometries is None:
             seen = response(layout, footprint, n_nodes=self.n_nodes)
         else:
@@ -230,7 +230,7 @@ class Chain:
         found: Poses = self._applier(theta, plan)(Stage.POSE, told)
         return found
 
-    def _geometries(self, theta: FloatArray, footprint: Footprint) -> _GeometryGroups | None:
+    def _grouped_by_geometry(self, theta: FloatArray, footprint: Footprint) -> _GeometryGroups | None:
         """Group hypotheses that differ only in the weights of their Gaussians; None where grouping saves nothing."""
         few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
         if few or footprint.weight.shape[1] > 1:
@@ -270,7 +270,7 @@ class Chain:
 
     @cached_property
     def _last_layout(self) -> dict[Plan, Layout]:
-        """Cache of the last plan's layout."""
+        """Cache of the last plan's layout, where no parameter changes it."""
         return {}
 
     def noise_level(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseLevel:
@@ -307,7 +307,9 @@ class Chain:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which region lies under which reading: the part of the response that does not depend on the footprint.
+    """Which region lies under which reading, and the sensor's pose relative to it: all that does not depend on the SSF.
+
+    Its use raises ParameterError if the plan has a pattern that the regions lack.
 
     Parameters
     ----------
@@ -317,11 +319,6 @@ class Layout:
         Poses relative to the patterns' described places, arrays broadcasting to (n_samples, n_points).
     plan
         Which pattern lies under each reading.
-
-    Raises
-    ------
-    ParameterError
-        If the plan has a pattern that the regions lack.
     """
 
     regions: Mapping[str, Region]
@@ -449,7 +446,10 @@ def _discrete_response(layout: Layout, ssf: DiscreteSSF) -> FloatArray:
 
 
 def region_named(regions: Mapping[str, Region], name: str) -> Region:
-    """Find a pattern's region; raise ParameterError with the remedy where it is not described."""
+    """Return the region of a pattern.
+
+    Raises ParameterError, which says how to describe the pattern, if it has none.
+    """
     try:
         return regions[name]
     except KeyError:

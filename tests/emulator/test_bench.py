@@ -170,9 +170,9 @@ def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClo
     world = World(gaussian_spot([Blob(1.0, (0.0, 6.0), (1.0, 1.0))]), noise_sd=0.0)
     look = LightModel(world, table, lambda: SensorPose(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
     assert look(True) == pytest.approx(60.5)
-    table.obey("turn 180")
+    table.carry_out("turn 180")
     assert look(True) == pytest.approx(10.5)
-    table.obey("uniform:0.5")
+    table.carry_out("uniform:0.5")
     assert look(True) == pytest.approx(35.5)
 
 
@@ -180,7 +180,7 @@ def test_what_a_person_cannot_do_changes_nothing() -> None:
     table = Table(CIRCLE)
     for wish in ("turn", "turn round", "turn nan", "hexagon", ""):
         with pytest.raises(ParameterError, match="turn DEGREES"):
-            table.obey(wish)
+            table.carry_out(wish)
     assert table == Table(CIRCLE)
 
 

@@ -13,7 +13,7 @@ from probewise.report import covariate_view
 from probewise.report import diagnosis as page
 from probewise.report.covariate import category_names, covariate_label, covariate_values
 from probewise.report.covariate_view import is_line
-from probewise.report.diagnosis_figures import changed_most
+from probewise.report.diagnosis_figures import scan_changed_most
 from probewise.report.plots import gain_by_scan, one_scan
 from probewise.report.residual_means import mean_residuals
 from probewise.report.words import typeset
@@ -190,10 +190,10 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
     change = np.zeros(len(plan))
     for rows, name in scans_of(plan):
         change[rows] = {"quadrants": 9.0, "edge_90_out": 0.5}.get(name, 0.1)
-    chosen = changed_most(plan, change)
+    chosen = scan_changed_most(plan, change)
     assert plan.scan_names[plan.scan[chosen[0]]] == "edge_90_out"
     alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
-    assert len(changed_most(alone, np.ones(4))) == 4
+    assert len(scan_changed_most(alone, np.ones(4))) == 4
     assert not is_line(plan, np.arange(1))
 
 

@@ -71,7 +71,7 @@ def test_the_papers_scans_from_both_sides_are_half_as_many_views():
     """Four scans of 101 readings at right angles: the third and the fourth see the first two's places from behind."""
     plan = paper_plan()
     chain = Chain(FreeMixture(1), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
-    edges = chain._layout_of(thetas(1, 1), plan).straight[0]
+    edges = chain._layout_of(thetas(1, 1), plan).straight_batches[0]
     assert len(edges.rows) == 404
     assert len(edges._views.distance_mm) == 202
 

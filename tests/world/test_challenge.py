@@ -275,6 +275,6 @@ def test_every_single_and_outsider_can_be_drawn_at_its_size():
         for turn, name in enumerate(names):
             truth = case(number_of(kind, size=size, other_noise=False, skip=turn)).truth
             assert truth.hidden[0].name == name
-            if INSIDE.get(name, OUTSIDE.get(name)).sized:
+            if INSIDE.get(name, OUTSIDE.get(name)).scalable:
                 assert truth.hidden[0].size_lambda == pytest.approx(size, rel=0.1)
     assert not NEEDS_SENSOR & set(SINGLES)

@@ -78,14 +78,14 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
         If no effect drawn can have the requested size in this plan.
     """
     stratum, n_earlier = stratum_of(number)
-    drawing, laying, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
+    drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
     rng = np.random.default_rng(drawing)
     ssf = "gaussian" if stratum.kind == "ssf_order" else str(rng.choice(list(SSFS)))
     level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
     sensor = draw_sensor(ssf, level, rng=rng)
     plan_names = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
-    plan_name, setup, chosen = _draw_until_sized(
-        stratum, n_earlier, plan_names, sensor, norm_after_refit, rng=rng, laying=np.random.default_rng(laying)
+    plan_name, setup, chosen = _draw_until_of_size(
+        stratum, n_earlier, plan_names, sensor, norm_after_refit, rng=rng, plan_rng=np.random.default_rng(plan_seed)
     )
     if any(isinstance(hidden.effect, Disturbs) for hidden in chosen.hidden):
         model = "white"  # only one noise fault at a time
@@ -129,7 +129,7 @@ class _ConcealedEffects:
     alias: Alias | None = None
 
 
-def _draw_until_sized(
+def _draw_until_of_size(
     stratum: Stratum,
     n_earlier: int,
     plan_names: list[str],
@@ -137,7 +137,7 @@ def _draw_until_sized(
     norm_after_refit: NormAfterRefit,
     *,
     rng: np.random.Generator,
-    laying: np.random.Generator,
+    plan_rng: np.random.Generator,
 ) -> tuple[str, CleanSetup, _ConcealedEffects]:
     """Draw plans, and the stratum's effects a few times in each, until all have the requested size.
 
@@ -145,7 +145,7 @@ def _draw_until_sized(
     """
     failure = NotConvergedError("no plan to try")
     for plan_name in plan_names:
-        setup = CleanSetup(draw_plan(plan_name, rng=laying), sensor)
+        setup = CleanSetup(draw_plan(plan_name, rng=plan_rng), sensor)
         if stratum.kind == "clean":
             return plan_name, setup, _ConcealedEffects()
         sizer = EffectSizer(setup, norm_after_refit)
@@ -195,7 +195,7 @@ def _hidden_of_size(
     sampler = INSIDE.get(name) or OUTSIDE[name]
     of_amplitude = sampler.draw(setup, rng)
     amplitude = sampler.first
-    if sampler.sized:
+    if sampler.scalable:
         amplitude = amplitude_of_size(
             lambda a: sizer.size(of_amplitude(a)), wanted, first=sampler.first, limit=sampler.limit
         )

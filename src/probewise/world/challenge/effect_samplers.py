@@ -76,7 +76,7 @@ class EffectSampler:
         First amplitude of the search for a size.
     limit
         Largest plausible amplitude.
-    sized
+    scalable
         Whether its size can be chosen; otherwise the amplitude is `first`.
     """
 
@@ -84,7 +84,7 @@ class EffectSampler:
     draw: Draw
     first: float
     limit: float
-    sized: bool = True
+    scalable: bool = True
 
 
 def sign(rng: np.random.Generator) -> float:

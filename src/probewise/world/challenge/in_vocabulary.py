@@ -151,7 +151,7 @@ INSIDE: Mapping[str, EffectSampler] = {
     "signal_dependent_noise": EffectSampler(("level",), amplitude_only(concealed.SignalDependentNoise), 1.0, 100.0),
     "correlated_noise": EffectSampler(("scan",), amplitude_only(concealed.CorrelatedNoise), 0.3, 0.95),
     "outliers": EffectSampler((), _outliers, 5.0, 30.0),
-    "dropouts": EffectSampler((), _dropouts, 0.01, 0.01, sized=False),
+    "dropouts": EffectSampler((), _dropouts, 0.01, 0.01, scalable=False),
 }
 """Samplers of the vocabulary's effects by name, in the order of the diagnosis page, section 2."""
 

@@ -66,7 +66,7 @@ class Prior:
         """Return the value at a coordinate."""
         return np.exp(np.clip(coordinate, -60.0, 60.0)) if self.shape == "log" else np.asarray(coordinate * self.width)
 
-    def spread(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+    def stratified_draws(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw n values, one from each of n parts of equal mass, in random order."""
         u = (rng.permutation(n) + rng.random(n)) / n
         if self.shape == "normal":

@@ -94,8 +94,8 @@ class _Integration:
         uses = (column for form, _ in self.effects for column in form.uses)
         return tuple(dict.fromkeys((*self.kind.drives, *uses)))
 
-    def start(self) -> FloatArray:
-        """States at the first row of each run, (n_states, n_samples, n_runs)."""
+    def initial_states(self) -> FloatArray:
+        """Return the states at the first row of each run, (n_states, n_samples, n_runs)."""
         law = self.kind.law
         assert law is not None
         out = []
@@ -183,7 +183,7 @@ class _Integration:
         law = self.kind.law
         assert law is not None
         names, places = list(law.start), self.places
-        s = self.bounded(self.start().copy(), names)
+        s = self.bounded(self.initial_states().copy(), names)
         kept = np.empty((*s.shape, len(places)))
         kept[..., 0] = s
         for k in range(len(places) - 1):
@@ -246,7 +246,7 @@ class _Integration:
                     again |= _mode_ended(form, size, mode, own[names.index(form.target)], rates[form.target])
             s = solved.y[:, -1].reshape(s.shape)
         for i, j in np.argwhere(again):
-            s[:, i, j] = self._of_sample(int(i)).one_gap(begun[:, i, j], k, int(j), names)
+            s[:, i, j] = self._of_sample(int(i)).through_gap_with_events(begun[:, i, j], k, int(j), names)
         return s
 
     @property
@@ -284,7 +284,7 @@ class _Integration:
                 s[k] = np.minimum(s[k], size)
         return s
 
-    def one_gap(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
+    def through_gap_with_events(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
         """Integrate from position k of run j to the next for one sample, with events of friction and bounds."""
         time = self.rows.time
         assert time is not None

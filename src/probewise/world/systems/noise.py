@@ -67,7 +67,7 @@ def noise_of(
             return SystemNoise(name, lambda y, rows, rng: y + sd * _ar1(rows, rho, rng), {"rho": rho}, wanted)
         case "random_walk":
             spectrum = _spectrum_of_walk(len(rows))
-            q = _solved(lambda a: _of_variances(1 + a**2 * spectrum), wanted, 1e-4, 1.0)
+            q = _strength_with_size(lambda a: _lambda_of_variances(1 + a**2 * spectrum), wanted, 1e-4, 1.0)
             return SystemNoise(
                 name,
                 lambda y, rows, rng: (
@@ -79,7 +79,7 @@ def noise_of(
         case "signal_dependent_noise":
             share = (readings - readings.min()) / np.ptp(readings)
             low, span = float(readings.min()), float(np.ptp(readings))
-            ratio = _solved(lambda a: _of_variances(1 + a * share), wanted, 1e-3, 1e4)
+            ratio = _strength_with_size(lambda a: _lambda_of_variances(1 + a * share), wanted, 1e-3, 1e4)
             return SystemNoise(
                 name,
                 lambda y, rows, rng: (
@@ -90,7 +90,9 @@ def noise_of(
             )
         case "noise_per_run":
             logs = rng.standard_normal(whole)
-            power = _solved(lambda a: _of_variances(np.exp(2 * a * logs)[rows.run]), wanted, 1e-2, 3.0)
+            power = _strength_with_size(
+                lambda a: _lambda_of_variances(np.exp(2 * a * logs)[rows.run]), wanted, 1e-2, 3.0
+            )
             own = np.exp(power * logs)
             return SystemNoise(
                 name,
@@ -100,7 +102,7 @@ def noise_of(
             )
         case "outliers":
             return SystemNoise(
-                name, lambda y, rows, rng: y + sd * _outlying(len(y), 0.03, 7.0, rng), {"share": 0.03, "size": 7.0}
+                name, lambda y, rows, rng: y + sd * _outlier_draws(len(y), 0.03, 7.0, rng), {"share": 0.03, "size": 7.0}
             )
         case "dropouts":
             return SystemNoise(
@@ -125,7 +127,7 @@ def _ar1(rows: SystemRows, rho: float, rng: np.random.Generator) -> FloatArray:
     return own
 
 
-def _outlying(n: int, share: float, size: float, rng: np.random.Generator) -> FloatArray:
+def _outlier_draws(n: int, share: float, size: float, rng: np.random.Generator) -> FloatArray:
     return rng.standard_normal(n) + np.where(rng.random(n) < share, size * rng.standard_normal(n), 0.0)
 
 
@@ -137,13 +139,13 @@ def _spectrum_of_walk(n: int) -> FloatArray:
     return np.asarray(np.maximum(np.linalg.eigvalsh(centered)[1:], 0.0))
 
 
-def _of_variances(variances: FloatArray) -> float:
+def _lambda_of_variances(variances: FloatArray) -> float:
     """Return lambda of unequal variances against their mean."""
     n = len(variances)
     return math.sqrt(max(n * math.log(variances.mean()) - float(np.log(variances).sum()), 0.0))
 
 
-def _solved(size: Callable[[float], float], wanted: float, low: float, high: float) -> float:
+def _strength_with_size(size: Callable[[float], float], wanted: float, low: float, high: float) -> float:
     """Return the strength at which a size has the requested value, or the largest if it stays below."""
     if size(high) <= wanted:
         return high

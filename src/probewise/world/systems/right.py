@@ -44,20 +44,24 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     n_runs = len(later.by_run)
     own = [
         np.stack(
-            [kind.priors[name].coordinate(kind.priors[name].spread(n_samples, rng=rng)) for _ in range(n_runs)], axis=1
+            [
+                kind.priors[name].coordinate(kind.priors[name].stratified_draws(n_samples, rng=rng))
+                for _ in range(n_runs)
+            ],
+            axis=1,
         )
         for name in kind.per_run
     ]
     parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
     there = np.concatenate(parts, axis=1)
     effects = [
-        (form, _as_others(numbers, b.free)) for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
+        (form, _of_unseen_run(numbers, b.free)) for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
     ]
     with np.errstate(all="ignore"):
         return simulate(kind, later, ahead.parameters(there), effects).readings
 
 
-def _as_others(numbers: Numbers, free: Sequence[str]) -> Numbers:
+def _of_unseen_run(numbers: Numbers, free: Sequence[str]) -> Numbers:
     """Give a held-out run the mean of the fitted runs' values: a parameter takes up what they have in common."""
     fitted = [numbers[name] for name in free if name.startswith("values[")]
     if not fitted:

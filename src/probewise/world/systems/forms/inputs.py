@@ -22,22 +22,26 @@ Change = Callable[[FloatArray, SystemRows, Numbers], Any]
 def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
     """Yield the forms on each column that drives the system, and on the clock."""
     for column in true.kind.drives:
-        yield from _of_column(true, column)
+        yield from _forms_of_column(true, column)
     time = true.rows.time
     # A clock error is detectable only if the law or the formula uses time.
     if time is not None and (true.kind.law is not None or true.kind.time_anew):
-        yield _linear("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
+        yield _linear_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
 
 
-def _on(column: str, change: Change) -> Callable[[Mapping[str, FloatArray], SystemRows, Numbers], dict[str, Any]]:
+def _changing_column(
+    column: str, change: Change
+) -> Callable[[Mapping[str, FloatArray], SystemRows, Numbers], dict[str, Any]]:
     return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
 
 
-def _linear(name: str, column: str, change: Change, first: float, limit: float, covariates: tuple[str, ...]) -> Form:
+def _linear_form(
+    name: str, column: str, change: Change, first: float, limit: float, covariates: tuple[str, ...]
+) -> Form:
     return Form(
         name,
         "input",
-        _on(column, change),
+        _changing_column(column, change),
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": first}]],
@@ -50,13 +54,13 @@ def _linear(name: str, column: str, change: Change, first: float, limit: float, 
     )
 
 
-def _sized(
+def _nonlinear_form(
     name: str, number: str, change: Change, column: str, tried: FloatArray, covariates: tuple[str, ...], late: str = ""
 ) -> Form:
     return Form(
         name,
         "input",
-        _on(column, change),
+        _changing_column(column, change),
         lambda a, drawn: {number: a},
         lambda rng: {},
         [[{number: float(size)}] for size in tried],
@@ -70,19 +74,19 @@ def _sized(
     )
 
 
-def _of_column(true: TrueSystem, column: str) -> Iterator[Form]:
-    values, spread = true.rows.columns[column], true.spread(column)
+def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
+    values, spread = true.rows.columns[column], true.sd_of(column)
     low, high = float(values.min()), float(values.max())
     span, own = high - low, (column, "level")
     if not span > 0:
         return
-    yield _linear(f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own)
-    yield _linear(f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own)
+    yield _linear_form(f"input_offset:{column}", column, lambda c, rows, v: c + v["a"], 0.01 * spread, 5 * span, own)
+    yield _linear_form(f"input_gain:{column}", column, lambda c, rows, v: c * (1 + v["a"]), 0.01, 0.9, own)
     levels = high - span * np.geomspace(0.004, 0.5, 12)
     yield Form(
         f"input_saturation:{column}",
         "input",
-        _on(column, lambda c, rows, v: np.minimum(c, v["level"])),
+        _changing_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
         lambda a, drawn: {"level": high - a},
         lambda rng: {},
         [[{"level": float(level)}] for level in levels],
@@ -95,7 +99,7 @@ def _of_column(true: TrueSystem, column: str) -> Iterator[Form]:
     )
     sizes = span * np.geomspace(1e-4, 0.3, 10)
     if low <= 0.1 * span:
-        yield _sized(
+        yield _nonlinear_form(
             f"dead_zone:{column}",
             "width",
             lambda c, rows, v: np.sign(c) * np.maximum(np.abs(c) - np.maximum(v["width"], 0.0), 0.0),
@@ -105,7 +109,7 @@ def _of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
     moves = np.concatenate([np.diff(values[rows]) for rows in true.rows.by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
-        yield _sized(f"backlash:{column}", "width", play, column, sizes, ("previous", column))
+        yield _nonlinear_form(f"backlash:{column}", "width", play, column, sizes, ("previous", column))
     if len(np.unique(values)) > 20:
         waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
 
@@ -119,7 +123,7 @@ def _of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         yield Form(
             f"periodic_error:{column}",
             "input",
-            _on(column, wavy),
+            _changing_column(column, wavy),
             lambda a, drawn: {"a": a, **drawn},
             lambda rng: {
                 "period": span / log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
@@ -135,7 +139,7 @@ def _of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
     if true.rows.time is not None:
         taus = true.rows.gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
-        yield _sized(
+        yield _nonlinear_form(
             f"input_delay:{column}",
             "tau_s",
             lambda c, rows, v: delayed(c, rows, np.maximum(v["tau_s"], 0.0)),

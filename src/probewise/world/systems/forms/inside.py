@@ -31,7 +31,7 @@ def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
         for kind, how in own.items():
             yield varying_parameter(true, f"{kind}:{name}", name, how)
         if not (name in true.kind.per_run and true.kind.law is not None):
-            for column in true.logged:
+            for column in true.varying_columns:
                 yield varying_parameter(true, f"depends:{name}:{column}", name, modulations.with_column(true, column))
 
 
@@ -69,7 +69,7 @@ def term_in_rate(
     signed: bool = True,
 ) -> Form:
     """Bind a term a push(states, now, parameters) to the rate of a state; `size` is the scale of the push."""
-    first = 0.01 * true.speed(state) / size
+    first = 0.01 * true.rms_rate(state) / size
     return Form(
         name,
         "rate",
@@ -122,7 +122,7 @@ def _term_of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any]
 
 def _periodic(true: TrueSystem, state: str) -> Form:
     how = modulations.waves(true, _N_WAVES)
-    first = 0.02 * true.speed(state)
+    first = 0.02 * true.rms_rate(state)
     return Form(
         f"periodic_forcing:{state}",
         "rate",
@@ -141,7 +141,7 @@ def _periodic(true: TrueSystem, state: str) -> Form:
 
 
 def _friction_and_bound(true: TrueSystem, state: str) -> Iterator[Form]:
-    speed, values = true.speed(state), true.states[state]
+    speed, values = true.rms_rate(state), true.states[state]
     sizes = speed * np.geomspace(1e-3, 0.3, 4)
     yield Form(
         f"friction:{state}",

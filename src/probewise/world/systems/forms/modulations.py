@@ -69,19 +69,19 @@ def _plain(
 
 
 def along_time(true: TrueSystem) -> Modulation:
-    """Linear drift in recorded time."""
+    """Return a linear drift in recorded time."""
     names = ("time",) if true.rows.time in (None, "time") else ("time", str(true.rows.time))
     return _plain(lambda now, v: v["a"] * now.t, names, float(np.abs(true.rows.t).max()))
 
 
 def with_column(true: TrueSystem, column: str) -> Modulation:
-    """Variation in proportion to a column, about its mean over the recording."""
-    middle = true.middle(column)
-    return _plain(lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.spread(column), (column,))
+    """Return a variation in proportion to a column, about its mean over the recording."""
+    middle = true.mean_of(column)
+    return _plain(lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.sd_of(column), (column,))
 
 
 def step(true: TrueSystem) -> Modulation:
-    """Step at a time, or at a row if there is no time."""
+    """Return a step at a time, or at a row if there is no time."""
     at, timed = ("at_s", True) if true.rows.time is not None else ("at_row", False)
     moments = np.quantile(np.unique(true.rows.t), np.linspace(0.02, 0.98, 40))
 
@@ -91,7 +91,7 @@ def step(true: TrueSystem) -> Modulation:
     return Modulation(
         over,
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {at: true.moment(rng)},
+        lambda rng: {at: true.random_time(rng)},
         lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
         one_by_one,
         lambda a: {"a": a, at: 0.0},
@@ -102,7 +102,7 @@ def step(true: TrueSystem) -> Modulation:
 
 
 def by_run(true: TrueSystem) -> Modulation:
-    """Random value per run, including held-out runs, scaled by the amplitude."""
+    """Return a random value per run, including held-out runs, scaled by the amplitude."""
     n = true.rows.n_runs
     names = [f"values[{k}]" for k in range(n)]
     present = [int(true.rows.run[own[0]]) for own in true.rows.by_run]
@@ -127,7 +127,7 @@ def by_run(true: TrueSystem) -> Modulation:
 
 
 def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
-    """Sine and cosine at each rate."""
+    """Return the bank of a wave: sine and cosine at each rate."""
     return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
 
 
@@ -138,7 +138,7 @@ def wave_joined(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[
 
 
 def waves(true: TrueSystem, n: int) -> Modulation:
-    """One sinusoid in time, up to one period in four rows; the bank has n frequencies."""
+    """Return one sinusoid in time, up to one period in four rows; the bank has n frequencies."""
     rows = true.rows
     slowest, fastest = 1.5 / rows.duration, 0.25 / rows.gap
     return Modulation(
@@ -155,7 +155,7 @@ def waves(true: TrueSystem, n: int) -> Modulation:
 
 
 def settling(true: TrueSystem) -> Modulation:
-    """Exponential settling after the start of each run."""
+    """Return an exponential settling after the start of each run."""
     longest = float(true.rows.since_start.max())
     taus = np.geomspace(true.rows.gap, longest, 12)
     return Modulation(

@@ -33,7 +33,7 @@ OUT_OF_VOCABULARY = (
 
 def forms_out_of_vocabulary(true: TrueSystem, rng: np.random.Generator) -> Iterator[Form]:
     """Bind every effect outside the vocabulary to randomly drawn columns and states."""
-    columns = [str(name) for name in rng.permutation(true.logged)]
+    columns = [str(name) for name in rng.permutation(true.varying_columns)]
     first, second = columns[0], columns[1]
     yield _product(true, first, second)
     yield _switch(true, first, float(rng.uniform(0.55, 0.8)))
@@ -80,8 +80,8 @@ def _added(
 
 
 def _product(true: TrueSystem, one: str, other: str) -> Form:
-    a, b = true.middle(one), true.middle(other)
-    scale = true.spread(one) * true.spread(other)
+    a, b = true.mean_of(one), true.mean_of(other)
+    scale = true.sd_of(one) * true.sd_of(other)
     return _added(
         true,
         f"product:{one}:{other}",
@@ -104,7 +104,7 @@ def _switch(true: TrueSystem, column: str, share: float) -> Form:
 
 def _memory(true: TrueSystem, column: str) -> Form:
     """Add the sum of a column since the start of the run, soft-limited."""
-    middle, spread = true.middle(column), true.spread(column)
+    middle, spread = true.mean_of(column), true.sd_of(column)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         out = np.empty(len(rows))
@@ -123,8 +123,8 @@ def _memory(true: TrueSystem, column: str) -> Form:
 
 def _fading(true: TrueSystem, column: str) -> Form:
     middle, spread, low, high = (
-        true.middle(column),
-        true.spread(column),
+        true.mean_of(column),
+        true.sd_of(column),
         float(true.readings.min()),
         float(true.readings.max()),
     )
@@ -207,7 +207,7 @@ def _leak(true: TrueSystem, state: str) -> Form:
 
 
 def _driven(true: TrueSystem, state: str, column: str) -> Form:
-    middle, spread, most = true.middle(column), true.spread(column), float(np.abs(true.states[state]).max())
+    middle, spread, most = true.mean_of(column), true.sd_of(column), float(np.abs(true.states[state]).max())
     return term_in_rate(
         true,
         f"strange_column_times_state:{state}:{column}",

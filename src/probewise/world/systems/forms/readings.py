@@ -63,7 +63,7 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
     for kind, how in both.items():
         yield added_to_readings(true, f"offset_{kind}", how)
         yield added_to_readings(true, f"gain_{kind}", how, gain=True)
-    for column in true.logged:
+    for column in true.varying_columns:
         yield added_to_readings(true, f"sensitivity:{column}", modulations.with_column(true, column))
     if timed:
         yield added_to_readings(true, "interference", modulations.waves(true, _N_WAVES))

@@ -42,27 +42,27 @@ class TrueSystem:
         return self.kind.sd
 
     @property
-    def logged(self) -> tuple[str, ...]:
+    def varying_columns(self) -> tuple[str, ...]:
         """Columns that vary, except time."""
         return tuple(name for name, v in self.rows.columns.items() if name != self.rows.time and np.ptp(v) > 0)
 
-    def middle(self, column: str) -> float:
-        """Mean of a column."""
+    def mean_of(self, column: str) -> float:
+        """Return the mean of a column."""
         return float(self.rows.columns[column].mean())
 
-    def spread(self, column: str) -> float:
-        """Sd of a column."""
+    def sd_of(self, column: str) -> float:
+        """Return the sd of a column."""
         return float(self.rows.columns[column].std())
 
-    def speed(self, state: str) -> float:
-        """Rms rate of a state, from its values at the rows."""
+    def rms_rate(self, state: str) -> float:
+        """Return the root-mean-square rate of a state, from its values at the rows."""
         found = []
         for own in self.rows.by_run:
             gaps = np.diff(self.rows.t[own])
             found.append(np.diff(self.states[state][own])[gaps > 0] / gaps[gaps > 0])
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
-    def moment(self, rng: np.random.Generator) -> float:
+    def random_time(self, rng: np.random.Generator) -> float:
         """Draw a time, or a row, well inside the recording."""
         at = float(np.quantile(self.rows.t, rng.uniform(0.2, 0.8)))
         return math.floor(at) + 0.5 if self.rows.time is None else at

@@ -80,9 +80,9 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
         *_probability_rows(done),
         *_place_rows(done),
         *_interval_rows(done),
-        *_held_out(done),
+        *_held_out_rows(done),
         *_pair_rows(done),
-        *_out_of_vocabulary(done),
+        *_out_of_vocabulary_rows(done),
         *_alias_rows(done),
         *_time_rows(done),
         Row("cases that failed", share(["failed" in r for r in results])),
@@ -217,7 +217,7 @@ def share_covered(intervals: list[list[float]]) -> Estimate:
     return share([low <= truth <= high for truth, low, high in intervals])
 
 
-def _held_out(done: list[Result]) -> list[Row]:
+def _held_out_rows(done: list[Result]) -> list[Row]:
     inside = [r for r in done if r["kind"] in ("single", "pair") and acts_on_mean(r)]
     gains = _gains_of([r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right")
     white = [r for r in inside if r["noise_model"] == "white"]
@@ -269,7 +269,7 @@ def _each_keeps_its_size(result: Result) -> bool:
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 
-def _out_of_vocabulary(done: list[Result]) -> list[Row]:
+def _out_of_vocabulary_rows(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.9, 20.0: 0.97}
     outside = [r for r in done if is_out_of_vocabulary(r)]
     inside = [r for r in done if r["kind"] != "outside"]

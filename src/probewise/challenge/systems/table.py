@@ -48,18 +48,18 @@ def score_systems(results: Sequence[Result]) -> tuple[Row, ...]:
     """Score the results of `run_system_case`; a case that failed counts in the last row alone."""
     done = [r for r in results if "failed" not in r]
     return (
-        *_clean(done),
-        *_naming(done),
-        *_probabilities(done),
-        *_intervals(done),
-        *_held_out(done),
-        *_unlisted_laws(done),
-        *_time(done),
+        *_clean_rows(done),
+        *_naming_rows(done),
+        *_probability_rows(done),
+        *_interval_rows(done),
+        *_held_out_rows(done),
+        *_unlisted_law_rows(done),
+        *_time_rows(done),
         Row("cases that failed", share(["failed" in r for r in results])),
     )
 
 
-def _clean(done: list[Result]) -> list[Row]:
+def _clean_rows(done: list[Result]) -> list[Row]:
     clean = [r for r in done if r["kind"] == "clean"]
     white, other = ([r for r in clean if r["other_noise"] is o] for o in (False, True))
     models = sorted({r["noise_model"] for r in other})
@@ -73,7 +73,7 @@ def _clean(done: list[Result]) -> list[Row]:
     ]
 
 
-def _naming(done: list[Result]) -> list[Row]:
+def _naming_rows(done: list[Result]) -> list[Row]:
     targets = {6.0: -math.inf, 8.0: 0.9, 12.0: 0.95, 20.0: 0.98}
     shown = singles_of(done, 12.0)
     pairs = [r for r in done if r["kind"] == "pair"]
@@ -95,7 +95,7 @@ def _naming(done: list[Result]) -> list[Row]:
     ]
 
 
-def _probabilities(done: list[Result]) -> list[Row]:
+def _probability_rows(done: list[Result]) -> list[Row]:
     own = singles_of(done, 12.0)
 
     def covers_truth(r: Result) -> bool:
@@ -121,7 +121,7 @@ def _confidently_wrong(result: Result) -> bool:
     )
 
 
-def _intervals(done: list[Result]) -> list[Row]:
+def _interval_rows(done: list[Result]) -> list[Row]:
     stated = [interval for r in done for own in r["parameters"].values() for interval in own.values()]
     return [Row("95 % intervals of effect parameters cover", share_covered(stated), 0.92, 0.98)]
 
@@ -140,7 +140,7 @@ def _shares(results: Sequence[Result]) -> FloatArray:
     return np.array([[repaired / right] for repaired, right in gains]).reshape(-1, 1)
 
 
-def _held_out(done: list[Result]) -> list[Row]:
+def _held_out_rows(done: list[Result]) -> list[Row]:
     named = [r for r in done if r["kind"] in ("single", "pair")]
     clean = [g[0] for g in (gains_of(r, "true") for r in done if r["kind"] == "clean") if g is not None]
     every = [g[0] for g in (gains_of(r, "true") for r in done) if g is not None]
@@ -155,10 +155,10 @@ def _median(rows: FloatArray) -> float:
     return float(np.median(rows))
 
 
-def _unlisted_laws(done: list[Result]) -> list[Row]:
+def _unlisted_law_rows(done: list[Result]) -> list[Row]:
     outside = [r for r in done if r["kind"] == "outside"]
     inside = [r for r in done if r["kind"] != "outside"]
-    good = [_as_good(r) for r in outside]
+    good = [_gains_like_true_law(r) for r in outside]
     told = [g or r["verdict"] == "unknown" for g, r in zip(good, outside, strict=True)]
     return [
         Row("not on the list, lambda 20: unknown, or as good as the true law", share(told), 0.9),
@@ -168,7 +168,7 @@ def _unlisted_laws(done: list[Result]) -> list[Row]:
     ]
 
 
-def _as_good(result: Result) -> bool:
+def _gains_like_true_law(result: Result) -> bool:
     """Return whether a name or formula gains most of what the true law does; aliases count too."""
     if (
         names_match(leading(result, clean=True)[0], effects_to_name(result, merged=True))
@@ -179,7 +179,7 @@ def _as_good(result: Result) -> bool:
     return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
 
 
-def _time(done: list[Result]) -> list[Row]:
+def _time_rows(done: list[Result]) -> list[Row]:
     return [
         Row("processor time of a diagnosis, formula (s)", mean([r["cpu_s"] for r in done if not r["law"]]), most=5.0),
         Row("processor time of a diagnosis, law (s)", mean([r["cpu_s"] for r in done if r["law"]]), most=20.0),

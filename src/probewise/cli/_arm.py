@@ -61,11 +61,11 @@ class ArmName:
         return self.kind in ("nxt", "emulator")
 
     @property
-    def is_apart(self) -> bool:
+    def may_differ_from_geometry(self) -> bool:
         """Whether its true geometry may differ from the given one."""
         return self.kind == "nxt" or (self.kind == "emulator" and bool(self.where))
 
-    def built_as(self, geometry_file: Path | None) -> Path | None:
+    def true_geometry_file(self, geometry_file: Path | None) -> Path | None:
         """Return the file of an emulated arm's true geometry; None: the shipped one."""
         return Path(self.where) if self.where else geometry_file
 

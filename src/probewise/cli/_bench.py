@@ -145,7 +145,7 @@ def open_arm(
     scale = LegoScale() if instrumentation is None else scale_of(instrumentation)
     bench = Bench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
     if chosen.is_lego:
-        return bench.emulated(geometry, chosen.built_as(geometry_file), start_s=start_s), bench
+        return bench.emulated(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
     return bench.simulated(None if geometry_file is None else geometry, start_s=start_s), bench
 
 

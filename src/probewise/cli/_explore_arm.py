@@ -49,7 +49,7 @@ def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Readin
     world, surface = posing.world_like(inputs.sensor), posing.with_cards(hidden.surface, inputs.cards)
     arm: Instrument
     if chosen.is_lego and geometry is not None:
-        built, seed = chosen.built_as(arguments.geometry), inputs.streams.noise
+        built, seed = chosen.true_geometry_file(arguments.geometry), inputs.streams.noise
         arm, _ = open_emulated(geometry, built, world, surface, seed=seed, start_s=start_s)
     else:
         arm = posing.arm_over(

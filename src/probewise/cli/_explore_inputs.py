@@ -93,7 +93,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
         heights_mm=heights_mm,
         trust=arguments.trust,
     )
-    if chosen.is_apart and geometry is not None and geometry.accuracy is not None:
+    if chosen.may_differ_from_geometry and geometry is not None and geometry.accuracy is not None:
         experiment = dataclasses.replace(experiment, fitted_arm=posing.FittedArm.of(geometry, sensor))
     other, other_model = None, _other_model(arguments.model)
     if arguments.both_models:

@@ -353,10 +353,10 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
     instrument, bench = _instrument(arguments, geometry)
     assert isinstance(instrument, LegoArm)
 
-    def said() -> str:
+    def kept_so_far() -> str:
         return kept_message(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
 
-    with reporting_what_is_kept(said), instrument as arm:
+    with reporting_what_is_kept(kept_so_far), instrument as arm:
         answer = questioner(arm)
         ask = answer if bench is None else bench.answer_at_mark
         tell = partial(say, quiet=bench is not None)
@@ -626,7 +626,12 @@ def _warn_and_confirm_lowering(
     from probewise.arm import LegoArm
 
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
-    if chosen is None or not chosen.is_apart or arguments.dry_run or not isinstance(instrument, LegoArm):
+    if (
+        chosen is None
+        or not chosen.may_differ_from_geometry
+        or arguments.dry_run
+        or not isinstance(instrument, LegoArm)
+    ):
         return
     warn_of_clearance(geometry)
     if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():

@@ -126,7 +126,7 @@ class _Listener:
             say(_place(self._bench.arm.sensor_pose()))
             return
         try:
-            self._bench.table.obey(line)
+            self._bench.table.carry_out(line)
             say(f"done: {line}")
         except ParameterError as error:
             say(str(error))

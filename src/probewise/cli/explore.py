@@ -171,7 +171,7 @@ def run(arguments: argparse.Namespace) -> int:
     before = _journal_so_far(journal, resume=arguments.resume)
     site = open_site(arguments, inputs, () if before is None else before.readings)
     say(f"seed {arguments.seed}", quiet=arguments.quiet)
-    if inputs.geometry is not None and inputs.arm.is_apart:
+    if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
         warn_of_clearance(inputs.geometry)
         warn_of_place_sd(inputs.geometry, inputs.experiment.stop_sd_mm)
     pictures = Pictures(out, inputs, arguments.live, site.outline_mm)
@@ -234,7 +234,7 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Pat
     from probewise.report import exploration as report
 
     yield result.summary()
-    if inputs.geometry is not None and inputs.arm.is_apart and inputs.geometry.accuracy is None:
+    if inputs.geometry is not None and inputs.arm.may_differ_from_geometry and inputs.geometry.accuracy is None:
         yield "arm          nobody has fitted its geometry: its own error is not in these sds"
     trust = inputs.experiment.trust
     missing = posing.left_out_of(result.last, trust)

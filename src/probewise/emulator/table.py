@@ -17,8 +17,8 @@ class Table:
     surface: Surface
     turned_rad: float = 0.0
 
-    def obey(self, line: str) -> None:
-        """Obey a line: a scene in one of its forms becomes the surface; `turn DEGREES` sets the rotation of the sensor.
+    def carry_out(self, line: str) -> None:
+        """Carry out a typed line: a scene becomes the surface, `turn DEGREES` sets the rotation of the sensor.
 
         Raises
         ------

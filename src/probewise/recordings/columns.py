@@ -25,7 +25,7 @@ class Table(Protocol):
     """Columns by name: a dict of lists or arrays, or a data frame."""
 
     def keys(self) -> Iterable[Any]:
-        """Names of the columns."""
+        """Return the names of the columns."""
         ...
 
     def __getitem__(self, name: Any, /) -> Any:
@@ -226,5 +226,5 @@ def _text(what: str, text: str) -> str:
 
 
 def _is_missing(cell: object) -> bool:
-    """Whether a cell is None, NaN, or a data frame's marker of a missing value."""
+    """Return whether a cell is None, NaN, or a data frame's marker of a missing value."""
     return cell is None or (isinstance(cell, float) and math.isnan(cell)) or str(cell) in ("<NA>", "NaT")

@@ -232,12 +232,12 @@ class Plan:
         return out
 
     def rows_by_scan(self) -> list[IntArray]:
-        """Row numbers of each scan, in the order they were taken."""
+        """Return the row numbers of each scan, in the order they were taken."""
         ends = np.cumsum(np.bincount(self.scan, minlength=len(self.scan_names)))
         return np.split(np.argsort(self.scan, kind="stable"), ends[:-1]) if len(ends) else []
 
     def rows_by_pattern(self) -> list[tuple[str, IntArray]]:
-        """Names of the patterns that occur, each with its row numbers."""
+        """Return the names of the patterns that occur, each with its row numbers."""
         pairs = [(name, np.flatnonzero(self.pattern == k)) for k, name in enumerate(self.pattern_names)]
         return [(name, rows) for name, rows in pairs if rows.size]
 

@@ -149,7 +149,7 @@ def _side_by_side(at: FloatArray) -> FloatArray:
 def _before_and_after(diagnosis: Diagnosis) -> bytes:
     """Draw the line scan that the repair changes most (or the longest): readings, both models, residuals of each."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
-    rows = changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
+    rows = scan_changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     models = [(BEFORE, diagnosis.repair.before.readings[rows]), (AFTER, diagnosis.repair.after.readings[rows])]
@@ -159,7 +159,7 @@ def _before_and_after(diagnosis: Diagnosis) -> bytes:
     return svg(one_scan(shown.at[rows], readings, models, joined=is_line(plan, rows), label=shown.label, unit=unit))
 
 
-def changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
+def scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
     """Choose the line scan with the largest total change; the longest if none changes; any scan if none is a line.
 
     `change` is the change of each predicted reading, (n_points,).

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator, MultipleLocator
 
 from probewise._arrays import FloatArray
 from probewise.report.plots.canvas import BLACK, SMALL_PT, axes_or_new, label_axes
-from probewise.report.plots.scene import bar_beside, paint_out_of_reach
+from probewise.report.plots.scene import add_colour_bar, paint_out_of_reach
 from probewise.report.words import number
 
 _LINES_DEG = 15.0  # step between contours of equal orientation
@@ -57,7 +57,7 @@ def reach_map(
             label.set_path_effects([withStroke(linewidth=2.0, foreground=BLACK)])
     left, right, low, high = image.get_extent()
     paint_out_of_reach(ax)
-    bar_beside(ax, image, "orientation of the sensor (degrees)")
+    add_colour_bar(ax, image, "orientation of the sensor (degrees)")
     bar = ax.child_axes[-1].yaxis
     bar.set_major_locator(MultipleLocator(_LINES_DEG) if levels.size else MaxNLocator())
     bar.set_major_formatter(FuncFormatter(lambda angle, _: _angle(angle)))

@@ -85,7 +85,7 @@ def playing_field(
         vmax=top,
         interpolation="nearest",
     )
-    bar_beside(ax, image, utility_label)
+    add_colour_bar(ax, image, utility_label)
     if len(outlines_mm):
         ax.add_collection(LineCollection(list(outlines_mm), colors=OUTLINE_BLUE, linewidths=0.7, alpha=0.75))
         ax.plot([], [], color=OUTLINE_BLUE, label=f"{len(outlines_mm)} hypotheses drawn from the posterior")
@@ -134,7 +134,7 @@ def paint_out_of_reach(ax: Axes) -> None:
     ax.add_patch(Rectangle((0.0, 0.0), 0.0, 0.0, facecolor=OUT_OF_REACH, label="out of the arm's reach"))
 
 
-def bar_beside(ax: Axes, image: ScalarMappable, label: str) -> None:
+def add_colour_bar(ax: Axes, image: ScalarMappable, label: str) -> None:
     """Add a colour bar beside axes, of the same height."""
     ax.figure.colorbar(image, cax=ax.inset_axes((1.015, 0.0, 0.022, 1.0)))
     bar = ax.child_axes[-1]

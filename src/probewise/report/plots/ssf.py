@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
 from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_grid, axes_or_new, label_axes
-from probewise.report.plots.scene import bar_beside
+from probewise.report.plots.scene import add_colour_bar
 from probewise.report.words import with_error
 from probewise.sensor import SSFField
 
@@ -46,7 +46,7 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
         vmax=1.0,
         interpolation="nearest",
     )
-    bar_beside(ax, image, "sensitivity (share of its peak)")
+    add_colour_bar(ax, image, "sensitivity (share of its peak)")
     ax.contour(x, y, values, levels=[0.1 * peak, 0.5 * peak], colors="white", linewidths=[0.8, 1.4])
     ax.plot([0], [0], marker="+", color="white", markersize=10, markeredgewidth=1.5)
     reach = _visible_half_width(values, x, y, field.pixel_mm)

@@ -337,7 +337,7 @@ class Layout:
         return [(rows, region_named(self.regions, name)) for name, rows in self.plan.rows_by_pattern()]
 
     @cached_property
-    def straight(self) -> tuple[StraightEdges | StraightCorners, ...]:
+    def straight_batches(self) -> tuple[StraightEdges | StraightCorners, ...]:
         """Known straight edges and corners of all patterns, batched: the common case of calibration."""
         if self.poses.orientation_rad.shape[0] > 1:
             return ()
@@ -350,9 +350,13 @@ class Layout:
         )
 
     @cached_property
-    def others(self) -> list[tuple[IntArray, Region]]:
+    def other_groups(self) -> list[tuple[IntArray, Region]]:
         """Readings over all other regions, in groups that share an orientation."""
-        taken = np.concatenate([part.rows for part in self.straight]) if self.straight else np.empty(0, dtype=np.int64)
+        taken = (
+            np.concatenate([part.rows for part in self.straight_batches])
+            if self.straight_batches
+            else np.empty(0, dtype=np.int64)
+        )
         return [
             (group, region)
             for rows, region in self.parts
@@ -381,9 +385,9 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
         (max(layout.n_samples, *(a.shape[0] for a in (footprint.weight, *footprint.moments))), len(layout.plan))
     )
     poses = layout.poses
-    for part in layout.straight:
+    for part in layout.straight_batches:
         part.write_response(footprint, out)
-    for rows, region in layout.others:
+    for rows, region in layout.other_groups:
         if isinstance(region, UniformRegion):  # whatever the footprint
             level = region.level[:, None]
             for g in range(footprint.weight.shape[2]):

@@ -59,7 +59,7 @@ class ChangePointEffect(NamedEffect[V]):
         return self.between_s or (self.times_s[0], self.times_s[-1])
 
     @staticmethod
-    def since(theta: FloatArray, plan: Plan) -> BoolArray:
+    def is_after_change(theta: FloatArray, plan: Plan) -> BoolArray:
         """Mark the readings taken after the change point, (n_samples, n_points)."""
         return np.asarray(plan.time_s > theta[:, -1:])
 

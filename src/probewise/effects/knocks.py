@@ -40,7 +40,7 @@ class ArmKnock(ChangePointEffect[Poses]):
         return {"dx_mm": self.typical_mm, "dy_mm": self.typical_mm, "turn_deg": self.typical_deg}
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        since = self.since(theta, plan)
+        since = self.is_after_change(theta, plan)
         return replace(
             value,
             x_mm=value.x_mm + theta[:, :1] * since,
@@ -79,7 +79,7 @@ class GainStep(ChangePointEffect[FloatArray]):
         return {"frac": self.typical}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value * (1 + theta[:, :1] * self.since(theta, plan)))
+        return np.asarray(value * (1 + theta[:, :1] * self.is_after_change(theta, plan)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "stronger" if mean[0] > 0 else "weaker"

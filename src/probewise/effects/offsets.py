@@ -103,7 +103,7 @@ class AmbientStep(ChangePointEffect[FloatArray]):
         return {"amp": self.typical}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * self.since(theta, plan))
+        return np.asarray(value + theta[:, :1] * self.is_after_change(theta, plan))
 
     def coarse(self) -> Self:
         """Keep all intervals: the time of the step is what identifies it."""

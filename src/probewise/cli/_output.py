@@ -50,7 +50,10 @@ class Stage:
 
 
 def check_out_directory(path: Path) -> Path:
-    """Return the path; raise FileError, before any work, if no directory can be made there."""
+    """Return the path, before any work.
+
+    Raises ParameterError if a file is in the way, FileError if no directory can be made there.
+    """
     if path.exists() and not path.is_dir():
         raise ParameterError("--out", str(path), "a directory, existing or new; this is a file")
     parent = next(p for p in (path, *path.absolute().parents) if p.exists())
@@ -64,7 +67,10 @@ def check_out_directory(path: Path) -> Path:
 
 
 def check_out_file(path: Path, *inputs: Path) -> Path:
-    """Return the path; raise FileError, before any work, if it cannot be written or would overwrite an input."""
+    """Return the path, before any work.
+
+    Raises ParameterError if it is a directory or an input, FileError if it cannot be written.
+    """
     if path.is_dir():
         raise ParameterError("--out", str(path), "a file name; this is a directory")
     for taken in inputs:

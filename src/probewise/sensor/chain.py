@@ -160,7 +160,8 @@ class Chain:
         ShapeError
             If the columns of theta do not match `names`.
         ParameterError
-            If the plan has a pattern that the scene lacks, or theta holds no valid SSF.
+            If the plan has a pattern that the scene lacks, theta holds no valid SSF, or a height is commanded of a
+        `DiscreteSSF`.
         """
         at_once = self._n_at_once(theta, plan)
         if at_once < len(theta):

@@ -36,6 +36,8 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     ----------
     theta
         Columns a_n, u_n, v_n (mm), A_n, B_n, C_n (1/mm^2), shape (n_samples, 6 n_gaussians).
+    n_gaussians
+        Number of Gaussians, N.
 
     Returns
     -------
@@ -44,7 +46,9 @@ def footprint_of(theta: FloatArray, n_gaussians: int) -> Footprint:
     Raises
     ------
     ParameterError
-        If AB - C^2 or the total mass is not positive. Single amplitudes may be negative.
+        If A, AB - C^2 or the total mass is not positive. Single amplitudes may be negative.
+    ShapeError
+        If theta has another number of columns.
     """
     if theta.ndim != 2 or theta.shape[1] != 6 * n_gaussians:
         raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (n_samples, {6 * n_gaussians})")
@@ -120,7 +124,10 @@ class FixedMixture:
 
     @classmethod
     def from_parameters(cls, theta: FloatArray) -> FixedMixture:
-        """Take one row of the paper's parameters a_1 to C_N, shape (6 n_gaussians,)."""
+        """Build from one row of the paper's parameters a_1 to C_N, shape (6 n_gaussians,).
+
+        Raises ShapeError for another shape, ParameterError if a Gaussian or the mass is not positive.
+        """
         theta = np.asarray(theta, dtype=np.float64)
         if theta.ndim != 1 or theta.size == 0 or theta.size % 6:
             raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (6 n_gaussians,)")
@@ -243,6 +250,13 @@ def field_of(
     Returns
     -------
     The mean field (paper, "logWt-weighted average of the sampled SSF fields").
+
+    Raises
+    ------
+    ShapeError
+        If an axis has fewer than two pixels.
+    ParameterError
+        If the pixels are not evenly spaced, with one spacing for both axes.
     """
     if len(u_mm) < 2 or len(v_mm) < 2:
         raise ShapeError(f"u_mm has {len(u_mm)} pixels, v_mm {len(v_mm)}; allowed: 2 or more each")

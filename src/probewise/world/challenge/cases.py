@@ -75,7 +75,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     Raises
     ------
     NotConvergedError
-        If no effect drawn can have the requested size in this plan.
+        If no effect drawn can have the requested size, in any of the plans tried.
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)

@@ -38,9 +38,9 @@ def draw_plan(name: str, *, rng: np.random.Generator) -> Plan:
 def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     """Make three held-out plans that differ from `plan`: "angle", "pattern" and "direction", each read after it.
 
-    "angle": a scan across a boundary with the sensor at an unused angle. "pattern": a scan over a triangle, or beside a
-    disc where the plan has no disc. "direction": a boundary crossed from +x to -x where the plan goes one way only, or
-    obliquely where it goes both ways.
+    "angle": a scan across a boundary with the sensor at an unused angle. "pattern": a scan beside the middle of a disc,
+    or of a triangle if the plan has a disc already. "direction": a boundary crossed from +x to -x where the plan goes
+    one way only, or obliquely where it goes both ways.
     """
     one_way = not (plan.direction[:, 0] < 0).any()
     line = np.stack([np.linspace(-50, 50, 101), np.zeros(101)], axis=-1)

@@ -36,8 +36,9 @@ class Region:
 def region_of(effect: Concealed, sizer: EffectSizer) -> Region | None:
     """Return the region of a local effect, or None for a global one.
 
-    Of a step in time: the rest of the recording; of a saturation: the levels above it; of an edge shadow or an effect
-    about a place: the distances, or the range of X in scans along X, where it is at least half its maximum.
+    Of an effect on named scans: these scans. Of a step in time: the rest of the recording. Of a saturation: the levels
+    above it. Of an edge shadow or an effect about a place: the distances, or the range of X in scans along X, where it
+    is at least half its maximum.
     """
     plan, clean = sizer.clean.plan, sizer.clean.readings
     match effect:

@@ -102,7 +102,10 @@ class Drawn:
         return np.asarray(trace.readings[0])
 
     def diagnosed_readings(self, effects: Sequence[Placed]) -> FloatArray:
-        """Return noise-free readings with these effects at the rows given to the diagnosis, (n_points,)."""
+        """Return noise-free readings with these effects at the rows given to the diagnosis, (n_points,).
+
+        Raises NotConvergedError if they are not finite.
+        """
         with np.errstate(all="ignore"):
             readings: FloatArray = simulate(
                 self.kind, self.diagnosed, self.nominal.parameters(self.true_coordinates[None, :]), effects

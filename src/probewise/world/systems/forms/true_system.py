@@ -69,7 +69,7 @@ class TrueSystem:
 
 
 def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
-    """Draw a number whose logarithm is uniform."""
+    """Draw a number whose logarithm is uniform; raise NotConvergedError if the range is empty."""
     if not 0 < low < high:
         raise NotConvergedError(f"nothing lies between {low:g} and {high:g}: too few rows")
     return math.exp(rng.uniform(math.log(low), math.log(high)))

@@ -33,7 +33,7 @@ def run_challenge(
     seed
         The sealed seed: with its number, it determines a case.
     work
-        Function that runs a case.
+        Function that runs a case; by default the light sensor's.
     of
         Name of the apparatus, if not the light sensor: campaigns on different apparatus do not mix.
     path
@@ -45,10 +45,12 @@ def run_challenge(
 
     Returns
     -------
-    Results of `run_case` in the order of the cases.
+    Results of `work`, in the order of the cases.
 
     Raises
     ------
+    ParameterError
+        If `n_cases` is less than 1.
     FileError, NotConvergedError
         See `run_campaign`.
     """

@@ -176,7 +176,7 @@ class LegoArm:
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
         """Move the sensor over a place and lower it, by default to reading height.
 
-        The first lowering is in steps, each confirmed by `first_down`.
+        With `first_down`, the first lowering to reading height is in steps, each confirmed by it.
 
         Raises
         ------

@@ -46,7 +46,8 @@ class Naive:
     def estimated(cls, black: ArrayLike, white: ArrayLike, *, sd_floor: float) -> Naive:
         """Estimate means and sds from readings over known black and known white, two or more of each.
 
-        `sd_floor`, for instance `step / sqrt(12)`, bounds the sd where all readings are equal.
+        `sd_floor`, for instance `step / sqrt(12)`, bounds the sd where all readings are equal. Raises ParameterError if
+        readings are too few or not finite.
         """
         values: list[float] = []
         for name, readings in (("black", black), ("white", white)):

@@ -36,7 +36,7 @@ class EllipseRegion(RegionBatch):
         return np.where(p * p + q * q <= 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over turned square pixels, with its tangent for the edge: (n_regions, n_points)."""
+        """Return the mean albedo over turned square pixels, a tangent in place of the edge: (n_regions, n_points)."""
         p, q = self._unit(centers_mm)
         a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
         level = np.hypot(p, q)

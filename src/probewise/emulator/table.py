@@ -36,3 +36,5 @@ class Table:
                 self.surface = parse_scene(line.strip())
         except ValueError as error:
             raise ParameterError("line", line, f"turn DEGREES; {'; '.join(FORMS)}; in mm and degrees") from error
+
+    obey = carry_out  # its old name

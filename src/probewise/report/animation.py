@@ -41,7 +41,7 @@ def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -
 def _palette(sheets: Sequence[Image.Image]) -> Image.Image:
     """Choose 256 colours for all frames together: with a palette for each, a colour would change between frames.
 
-    They are chosen to cover all colours, not the most frequent, so that the small square at the next place keeps its colour.
+    They cover all colours, not the most frequent, so that the small square at the next place keeps its colour.
     """
     weights = np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
     codes = np.unique(np.concatenate([np.unique(np.asarray(sheet) @ weights) for sheet in sheets]))

@@ -117,6 +117,8 @@ class LightSensor:
         """The command that switches the LED off and unconfigures the input."""
         return SetInputMode(self.port, SensorType.NONE, Mode.RAW)
 
+    off = off_command  # its old name
+
 
 def _require_consistent(values: InputValues) -> None:
     """Refuse values that the firmware never sends: each reading comes in four consistent conversions.

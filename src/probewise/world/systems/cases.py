@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,12 @@ class Drawn:
     def size(self, effects: Sequence[Placed]) -> float:
         """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
         return math.sqrt(self.nominal.fit(self.diagnosed_readings(effects), self.true_coordinates).chi_square)
+
+    # Old names.
+    everywhere, changed = readings_at_all_rows, diagnosed_readings
+    kept, seen, at, bare = (
+        property(attrgetter(name)) for name in ("kept_rows", "diagnosed", "true_coordinates", "without_effects")
+    )
 
 
 @dataclass(frozen=True, eq=False)

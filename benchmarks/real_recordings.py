@@ -18,7 +18,7 @@ import numpy as np
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model, fit, start_with_more_gaussians, starts_of_one_gaussian
 from probewise.diagnosis.fitting.free_form import FreeForm
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent
 from probewise.inference import sd_floor
 from probewise.recordings import Recording, read_recording
@@ -63,7 +63,7 @@ def kept_back(recording: Recording, combinations: list[tuple[str, ...]], *, free
 
 
 def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
-    extent, law = Extent.of(recording), white(int(recording.usable.sum()), least=sd_floor(recording))
+    extent, law = Extent.of(recording), white_noise(int(recording.usable.sum()), least=sd_floor(recording))
     one = default_sensor(extent, 1)
     found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law)
     if free_form:

@@ -35,7 +35,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
     """Build the table of all effects: detectability, aliases, and the size at which each is detectable.
 
     `of` names the model whose own parameters absorb part of an effect. Where it was computed, a column gives the number
-    of rows that the plan needs to detect an effect.
+    of rows like these that detect an effect which changes the readings by one noise sd (rms).
     """
     counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")

@@ -10,7 +10,7 @@ from probewise.diagnosis.evidence.detectable import log_detectable
 from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
 
@@ -28,7 +28,7 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
     z = np.concatenate([np.full(sensor.n_params, 0.2), model.coordinates_of_last_effect(np.array([[amount, 0.0]]))[0]])
     predicted, slopes = model.jacobian(z)
     found = Fit(model, z, predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
-    law = white(len(PLAN))
+    law = white_noise(len(PLAN))
     null = Model(sensor, (), PLAN)
     left = fit(null, Recording(PLAN, predicted), z[: sensor.n_params], law.at_least(SD), tolerance=1e-6).residuals
     expected = float(log_ndtr(np.linalg.norm(left) / SD - LEAST_VISIBLE))
@@ -39,4 +39,4 @@ def test_a_fit_without_effects_is_as_it_is():
     model = Model(default_sensor(EXTENT, 1), (), PLAN)
     predicted, slopes = model.jacobian(np.zeros(7))
     found = Fit(model, np.zeros(7), predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
-    assert log_detectable(found, white(len(PLAN)), np.arange(len(PLAN))) == 0.0
+    assert log_detectable(found, white_noise(len(PLAN)), np.arange(len(PLAN))) == 0.0

@@ -14,7 +14,7 @@ from probewise.diagnosis.evidence.joint import JointProblem, StandardNormal
 from probewise.diagnosis.evidence.laplace import weigh
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.effects import Extent
 from probewise.recordings import Recording, paper_plan
@@ -99,7 +99,7 @@ def test_where_no_names_can_be_traded_nothing_is_folded():
     recording = Recording(PLAN, np.random.default_rng(5).normal(30.0, 1.0, len(PLAN)))
     for n_gaussians, same in ((1, True), (2, False)):
         sensor = default_sensor(EXTENT, n_gaussians)
-        found = fit(Model(sensor, (), PLAN), recording, np.zeros(sensor.n_params), white(len(PLAN), least=0.1))
+        found = fit(Model(sensor, (), PLAN), recording, np.zeros(sensor.n_params), white_noise(len(PLAN), least=0.1))
         evidence = weigh(found, NoiseModel((), recording, least_sd=0.1))
         problem = JointProblem(found.model, recording, evidence)
         once = folded(problem, found.z)

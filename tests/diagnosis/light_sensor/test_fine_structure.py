@@ -11,7 +11,7 @@ from probewise.diagnosis.fitting.fit import Fit, Model, fit
 from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.fitting.own_model import OwnModel
 from probewise.diagnosis.light_sensor.fine_structure import fine_structure
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import LogUniform, Product
 from probewise.recordings import Recording, paper_plan, two_way_plan
@@ -24,7 +24,7 @@ NOISE_SD = 0.4
 
 def fitted(recording: Recording, *, free: bool = True) -> Fit:
     sensor = default_sensor(Extent.of(recording), 1)
-    law = white(len(recording))
+    law = white_noise(len(recording))
     one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law.at_least(NOISE_SD))
     if not free:
         return one
@@ -81,7 +81,7 @@ def test_effects_outlast_it():
     rng = np.random.default_rng(7)
     recording = Recording(plan, world.expected(plan) + NOISE_SD * rng.standard_normal(len(plan)))
     found = fitted(recording)
-    law = white(len(recording))
+    law = white_noise(len(recording))
     extent = Extent.of(recording)
     more = fine_structure(found.model, found.z, usable(recording))
     without, beside = Linearised.of(found, law), Linearised.of(found, law, more)

@@ -10,7 +10,7 @@ from probewise.diagnosis.evidence.laplace import weigh
 from probewise.diagnosis.fitting.coordinates import FARTHEST, SensorCoordinates, default_sensor
 from probewise.diagnosis.fitting.fit import Model, fit
 from probewise.diagnosis.fitting.free_form import FreeForm
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.effects import Extent
@@ -50,7 +50,7 @@ def test_a_posterior_against_the_bound_of_its_prior_is_drawn_from():
     truth[:, -1] += 20 * 0.05
     readings = tight.chain(PLAN, (), n_nodes=16).predict(truth, PLAN)[0] + 0.3 * rng.standard_normal(len(PLAN))
     recording = Recording(PLAN, readings)
-    found = fit(Model(tight, (), PLAN), recording, np.zeros(7), white(len(PLAN), least=1e-3))
+    found = fit(Model(tight, (), PLAN), recording, np.zeros(7), white_noise(len(PLAN), least=1e-3))
     noise = weigh(found, NoiseModel((), recording, least_sd=1e-3))
     samples = sample_model(found, noise, recording, weights={}, rng=rng)
     z = tight.z(samples.theta)

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.noise.law import white
+from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.search.pruning import prune
 from probewise.diagnosis.search.unknown import Unknown
 
@@ -26,7 +26,7 @@ class Held:
     log_share: float = 0.0
     n_gaussians: int = 1
     weights: dict = field(default_factory=dict)
-    law = white(N)
+    law = white_noise(N)
 
     @property
     def evidence(self):

@@ -114,7 +114,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fit.add_argument("--resume", action="store_true", help="continue after the marks in MARKS.csv")
 
-    home = _task(tasks, "home", "Bring all joints to where their counters are 0.", moves=True)
+    home = _task(
+        tasks,
+        "home",
+        "Bring all joints home, where their counters are 0; joints with a stop find it first.",
+        moves=True,
+    )
     home.add_argument(
         "--here", action="store_true", help="let a person bring the arm home by hand, and set the counters to 0 there"
     )
@@ -141,12 +146,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     record = _task(
         tasks,
         "record",
-        "Carry out a plan and write the recording; asks when there is something to do.",
+        "Carry out a plan and write the recording; asks a person to lay sheets and turn the sensor.",
         moves=True,
         arms=_ALL_ARMS,
     )
     record.add_argument(
-        "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER}, the paper's"
+        "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER} or two_way, which ship"
     )
     record.add_argument("--out", type=parse_path, required=True, metavar="REC.csv", help="where the recording goes")
     record.add_argument(
@@ -683,4 +688,4 @@ TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
     "record": _record,
 }
 
-VERB = Verb("arm", "Check, move and read the LEGO arm; record a plan with it.", add_arguments, run)
+VERB = Verb("arm", "Check, move and read the LEGO arm; record a plan with it or another arm.", add_arguments, run)

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--thorough",
         action="store_true",
         help="compute the evidence of the leading hypotheses by nested sampling too; it counts where it differs from "
-        "the Laplace approximation by more than a nat (says first how long it may take)",
+        "the Laplace approximation by more than a nat and its own error (says first how long it may take)",
     )
     add_out_directory(parser)
     add_common(parser)

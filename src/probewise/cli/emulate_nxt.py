@@ -48,9 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME[=RATE]",
-        help="a fault and its probability per telegram, 0 to 1: fragment, merge, double, corrupt, drop, half, error, "
-        "silence, deaf, unasked, disconnect; late=RATE,SECONDS; sag=MV, by which the battery falls per minute; may be "
-        "given several times",
+        help="a fault and its probability per telegram, 0 to 1: fragment, merge, double, corrupt, half, error, "
+        "silence, deaf, unasked, disconnect; drop, per byte; late=RATE,SECONDS; sag=MV, by which the battery falls per "
+        "minute; may be given several times",
     )
     parser.add_argument("--name", default="NXT", help="the brick's name, up to 14 characters (default NXT)")
     parser.add_argument(

@@ -16,7 +16,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         "sensor",
         "S.json",
-        "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json or calibrated.json",
+        "sensor model, as calibrate and diagnose write it; with --simulator a repaired.json, calibrated.json or "
+        "fitted.json",
     )
     add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
     parser.add_argument("--out", type=parse_path, required=True, metavar="P.csv", help="where the prediction goes")

@@ -31,14 +31,14 @@ from probewise.experiment import (
 )
 from probewise.experiment.acquisition import ArmOverGrid, inquire
 from probewise.experiment.arm_error import arm_error
-from probewise.experiment.checking import ENOUGH_BITS, NAMES, bits_of_names, far_side
+from probewise.experiment.checking import ENOUGH_BITS, NAMES, Outline, bits_of_names
 from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
 from probewise.experiment.posterior import prior_posterior, reconsidered, updated
 from probewise.experiment.refitted import fits, refitted
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
-from probewise.inquiry import prior_entropy
+from probewise.inquiry import Readout, prior_entropy
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
 from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
@@ -217,7 +217,7 @@ def test_a_reading_tells_names_by_what_they_predict():
     alike = np.tile(20.0 + 3.0 * even, 2)
     apart = np.concatenate([20.0 + 3.0 * even, 90.0 + 3.0 * even])
     near = np.concatenate([20.0 + 0.5 * even, 23.0 + 2.0 * even])
-    bits = bits_of_names(weight, np.stack([alike, apart, near], axis=1), names, 1.0)
+    bits = bits_of_names(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
     at = np.linspace(-20.0, 60.0, 20_001)
     given = [norm.pdf(at, mean, math.hypot(sd, 1.0)) for mean, sd in ((20.0, 0.5), (23.0, 2.0))]
     both = 0.5 * (given[0] + given[1])
@@ -266,7 +266,9 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     with arm_of(Trial(REFERENCE, 0)) as arm:
         field = ArmOverGrid.under(arm, doubting.grid)
     prospect, _ = inquire(doubting, joined, joined.theta[:20], field, at=inside)
-    far = far_side(prospect, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
+    outline = Outline.of(prospect, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
+    assert outline is not None
+    far = outline.far_side
     if asked_deg is None:
         assert far is None
         return

@@ -8,33 +8,39 @@ have put its far side anywhere. Both are asked before a run with doubt ends.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.arm.instrument import Reading
-from probewise.inquiry import Prospect
+from probewise.inquiry import Prospect, Readout, entropy_bits
+from probewise.inquiry.given_reading import GivenReading
 from probewise.scene import outlines
 from probewise.scene.albedo import Region
 from probewise.scene.regions import EllipseRegion, PolygonRegion
 
-__all__ = ["ENOUGH_BITS", "FAR_SIDE", "NAMES", "bits_of_names", "far_side"]
+__all__ = ["ENOUGH_BITS", "FAR_SIDE", "NAMES", "Outline", "bits_of_names", "places_of"]
 
 ENOUGH_BITS = 0.08
 """Expected information about the name of what is left out for which a reading is taken after the shape is known."""
 
 NAMES = "expected information about what the sensor leaves out (bits)"
-FAR_SIDE = "the side of the shape that no reading has seen (1 there)"
+FAR_SIDE = "expected information (bits) on the side of the shape that no reading has seen"
 _NODES = 12  # of the reading expected under a name
+_CELL = 0.5  # noise sds: cells of the reading; twice as wide, they lose four times as much
 _FAR = 0.75  # of the shape's diameter: two opposite readings at the edge of a circle leave 0.71
 _AT_EDGE = 1.0  # spacings of the grid within which a reading is at the edge
 
 
-def bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], noise_sd: float) -> FloatArray:
-    """Return the expected information of a reading about the name alone, by a Gaussian for each name.
+def bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout) -> FloatArray:
+    """Return the expected information of a reading about the name alone: the smaller of two estimates.
 
-    Histograms of the few hypotheses that a name has would tell names apart that agree.
+    Both err upwards. By a Gaussian for each name, names seem to differ whose predictions have a few stragglers; by the
+    cells of the reading, names that agree but have few hypotheses.
 
     Parameters
     ----------
@@ -42,16 +48,24 @@ def bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str
         Weight and name of each hypothesis, (n,).
     answers
         Predicted readings, (n, n_designs).
-    noise_sd
-        Sd of a reading's noise.
+    readout
+        Cells and noise of a reading.
 
     Returns
     -------
     Bits, (n_designs,).
     """
+    each = [names == name for name in np.unique(names)]
+    by_gaussians = _bits_by_gaussians(weight, answers, each, readout.noise_sd)
+    return np.asarray(np.maximum(np.minimum(by_gaussians, _bits_by_cells(weight, answers, each, readout)), 0.0))
+
+
+def _bits_by_gaussians(
+    weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], noise_sd: float
+) -> FloatArray:
+    """Return the information from the mean and sd of each name's predictions; `each` marks its hypotheses, (n,)."""
     share, mean, sd = [], [], []
-    for name in np.unique(names):
-        own = names == name
+    for own in each:
         part = float(weight[own].sum())
         average = weight[own] @ answers[own] / part
         share.append(part)
@@ -68,42 +82,77 @@ def bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str
         most = log_density.max(axis=1)
         of_all = most + np.log((p * np.exp(log_density - most[:, None])).sum(axis=1))
         told += part * (node_weight @ (log_density[:, k] - of_all))
-    return np.asarray(np.maximum(told / math.log(2.0), 0.0))
+    return np.asarray(told / math.log(2.0))
 
 
-def far_side(prospect: Prospect, region: Region, readings: tuple[Reading, ...]) -> int | None:
-    """Return the available design on the part of an outline that is farthest from every reading at the edge.
+def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout) -> FloatArray:
+    """Return the information from the distribution of the reading over its cells, of all hypotheses and each name's."""
+    given = GivenReading(answers, weight, readout, fine=_CELL)
+    told = entropy_bits(given.mass)
+    for own in each:
+        part = float(weight[own].sum())
+        told -= part * entropy_bits(given.sum(own / part))
+    return np.asarray(told)
 
-    Parameters
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """The outline of a probable shape within reach, and how far it is from the readings at it.
+
+    Attributes
     ----------
-    prospect
-        The available designs.
-    region
-        The probable shape, one region.
-    readings
-        The readings so far.
-
-    Returns
-    -------
-    Its index among the available designs; None where every part is nearer than three quarters of the diameter, or is
-    out of reach, or where the shape is neither an ellipse nor a polygon.
+    edge_mm
+        Places on the outline, (n, 2).
+    nearest
+        Index of the available design nearest to each, (n,).
+    apart_mm
+        Distance of each from the nearest reading at the outline, (n,); infinite if there is none.
+    spacing_mm, diameter_mm
+        Spacing of the grid, and diameter of the outline within reach.
     """
-    if not isinstance(region, EllipseRegion | PolygonRegion):
-        return None
-    edge = outlines(region)[0]
-    grid = prospect.designs.grid
-    spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
-    there = np.stack([prospect.plan.x_mm[prospect.rows], prospect.plan.y_mm[prospect.rows]], axis=1)
-    away = np.linalg.norm(edge[:, None] - there, axis=2)
-    edge, nearest = edge[away.min(axis=1) <= spacing], away.argmin(axis=1)[away.min(axis=1) <= spacing]
-    if not len(edge):
-        return None
-    taken = np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings])
-    apart = np.linalg.norm(edge[:, None] - taken, axis=2)
-    at_edge = apart.min(axis=0) <= _AT_EDGE * spacing
-    if not at_edge.any():
-        return int(nearest[0])
-    distance = apart[:, at_edge].min(axis=1)
-    diameter = np.linalg.norm(edge[:, None] - edge, axis=2).max()
-    farthest = int(distance.argmax())
-    return int(nearest[farthest]) if distance[farthest] > _FAR * diameter else None
+
+    edge_mm: FloatArray
+    nearest: IntArray
+    apart_mm: FloatArray
+    spacing_mm: float
+    diameter_mm: float
+
+    @classmethod
+    def of(cls, prospect: Prospect, region: Region, readings: Sequence[Reading]) -> Self | None:
+        """Lay out the outline of one region; None if it is neither an ellipse nor a polygon, or out of reach."""
+        if not isinstance(region, EllipseRegion | PolygonRegion):
+            return None
+        edge = outlines(region)[0]
+        grid = prospect.designs.grid
+        spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
+        away = np.linalg.norm(edge[:, None] - places_of(prospect), axis=2)
+        within = away.min(axis=1) <= spacing
+        if not within.any():
+            return None
+        edge, nearest = edge[within], away.argmin(axis=1)[within]
+        diameter = float(np.linalg.norm(edge[:, None] - edge, axis=2).max())
+        unread = cls(edge, nearest, np.full(len(edge), np.inf), spacing, diameter)
+        taken = np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings]).reshape(-1, 2)
+        apart = unread.apart_with(taken).min(axis=1, initial=np.inf)
+        return cls(edge, nearest, apart, spacing, diameter)
+
+    def apart_with(self, places_mm: FloatArray) -> FloatArray:
+        """Return `apart_mm` with one more reading at each of these places, (n_places, 2) -> (n, n_places)."""
+        apart = np.linalg.norm(self.edge_mm[:, None] - places_mm, axis=2)
+        at_edge = apart.min(axis=0) <= _AT_EDGE * self.spacing_mm
+        return np.asarray(np.minimum(np.where(at_edge, apart, np.inf), self.apart_mm[:, None]))
+
+    @property
+    def far_side(self) -> int | None:
+        """Design at the part farthest from every reading at the outline; None if none is farther than `_FAR`."""
+        farthest = int(self.apart_mm.argmax())
+        return int(self.nearest[farthest]) if self.apart_mm[farthest] > _FAR * self.diameter_mm else None
+
+    def seen_with(self, places_mm: FloatArray) -> BoolArray:
+        """Return whether one more reading at each place leaves no far side, (n_places, 2) -> (n_places,)."""
+        return np.asarray(self.apart_with(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
+
+
+def places_of(prospect: Prospect) -> FloatArray:
+    """Return the places of the available designs, (n, 2)."""
+    return np.stack([prospect.plan.x_mm[prospect.rows], prospect.plan.y_mm[prospect.rows]], axis=1)

@@ -30,13 +30,15 @@ class GivenReading:
         Weights of the hypotheses, (n,).
     readout
         The cells of a reading and its noise.
+    fine
+        Width of a cell in noise sds, if readings are not rounded.
     """
 
-    def __init__(self, answers: FloatArray, weight: FloatArray, readout: Readout) -> None:
+    def __init__(self, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0) -> None:
         levels = spread_levels(float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
         self._index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
         self._weight = weight
-        self._chance = readout.probability(levels, fine=1.0, most=MOST_LEVELS)
+        self._chance = readout.probability(levels, fine=fine, most=MOST_LEVELS)
 
     @cached_property
     def mass(self) -> FloatArray:

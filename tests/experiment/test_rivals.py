@@ -227,6 +227,21 @@ def test_a_reading_tells_names_by_what_they_predict():
     assert bits[2] == pytest.approx(exact, abs=0.01)
 
 
+def test_a_few_stragglers_of_a_name_promise_nothing():
+    """One hypothesis in 120 that predicts otherwise tells as little as its weight allows: exactly, by quadrature."""
+    n = 120
+    even = 20.0 + 0.5 * norm.ppf((np.arange(n) + 0.5) / n)
+    weight, names = np.full(2 * n, 0.5 / n), np.repeat(["", "halo"], n)
+    straggling = np.concatenate([even, np.append(even[:-1], 60.0)])
+    bits = bits_of_names(weight, straggling[:, None], names, Readout(1.0))
+    at = np.linspace(0.0, 80.0, 20_001)
+    given = [norm.pdf(at[:, None], own, 1.0).mean(axis=1) for own in np.split(straggling, 2)]
+    both = np.maximum(0.5 * (given[0] + given[1]), 1e-300)
+    exact = sum(0.5 * np.trapezoid(each * np.log2(np.maximum(each, 1e-300) / both), at) for each in given)
+    assert exact < 0.01
+    assert bits[0] == pytest.approx(exact, abs=0.002)
+
+
 def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting):
     """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
     rng = np.random.default_rng(3)
@@ -269,6 +284,9 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     outline = Outline.of(prospect, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
     assert outline is not None
     far = outline.far_side
+    opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])
+    tried = np.concatenate([opposite, [[x, y]]])
+    assert outline.seen_with(tried).tolist() == ([True, False, False] if asked_deg else [True, True, True])
     if asked_deg is None:
         assert far is None
         return

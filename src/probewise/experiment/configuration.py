@@ -161,31 +161,9 @@ class Experiment:
         require_likelihood(self.likelihood)
         require_number("noise_sd", self.noise_sd)
         require_callable("utility", self.utility, "a utility of probewise.inquiry, such as InformationGain()")
-        if not 0 < self.stop_sd_mm < math.inf:
-            raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
-        if not 0 < self.stop_probability < 1:
-            raise ParameterError("stop_probability", self.stop_probability, "between 0 and 1")
-        if not 0 < self.trust <= 1:
-            raise ParameterError("trust", self.trust, "greater than 0, up to 1")
-        if not 0 <= self.doubt_p < 1:
-            raise ParameterError("doubt_p", self.doubt_p, "0 or more, below 1")
-        if self.n_samples < 2:
-            raise ParameterError("n_samples", self.n_samples, "2 or more: one hypothesis leaves nothing to ask")
-        if self.n_particles < max(self.n_samples, 100):
-            raise ParameterError("n_particles", self.n_particles, "100 or more, and no fewer than n_samples")
-        if self.batch < 1 or (self.batch > 1 and self.utility not in (Finishing(), InformationGain())):
-            raise ParameterError("batch", self.batch, "1, or more with the utility Finishing() or InformationGain()")
-        if bool(self.heights_mm) != (self.calibrated_height_mm is not None):
-            raise ParameterError(
-                "calibrated_height_mm", self.calibrated_height_mm, "a height where heights_mm may be chosen, else None"
-            )
-        if not all(0 < height < math.inf for height in (*self.heights_mm, self.calibrated_height_mm or 1.0)):
-            raise ParameterError("heights_mm", self.heights_mm, "finite, greater than 0")
-        if self.calibrated_height_mm is not None:
-            low, high = self.calibrated_height_mm / MOST_LIFTED, self.calibrated_height_mm * MOST_LIFTED
-            if not all(low <= height <= high for height in self.heights_mm):
-                allowed = f"{low:g} to {high:g}: the sensor was calibrated at {self.calibrated_height_mm:g} mm"
-                raise ParameterError("heights_mm", self.heights_mm, allowed)
+        self._require_rules()
+        self._require_sizes()
+        self._require_heights()
         if self.model.names != self.prior.names:
             raise ParameterError(
                 "model.names",
@@ -197,6 +175,40 @@ class Experiment:
         if self.trust < 1:
             rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
         _ = self.readout, self.designs  # their constructors check the values
+
+    def _require_rules(self) -> None:
+        """Check when the run stops, and what it doubts."""
+        if not 0 < self.stop_sd_mm < math.inf:
+            raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
+        if not 0 < self.stop_probability < 1:
+            raise ParameterError("stop_probability", self.stop_probability, "between 0 and 1")
+        if not 0 < self.trust <= 1:
+            raise ParameterError("trust", self.trust, "greater than 0, up to 1")
+        if not 0 <= self.doubt_p < 1:
+            raise ParameterError("doubt_p", self.doubt_p, "0 or more, below 1")
+
+    def _require_sizes(self) -> None:
+        """Check the numbers of samples, and of readings chosen together."""
+        if self.n_samples < 2:
+            raise ParameterError("n_samples", self.n_samples, "2 or more: one hypothesis leaves nothing to ask")
+        if self.n_particles < max(self.n_samples, 100):
+            raise ParameterError("n_particles", self.n_particles, "100 or more, and no fewer than n_samples")
+        if self.batch < 1 or (self.batch > 1 and self.utility not in (Finishing(), InformationGain())):
+            raise ParameterError("batch", self.batch, "1, or more with the utility Finishing() or InformationGain()")
+
+    def _require_heights(self) -> None:
+        """Check the heights: positive, and near enough to that of the calibration, which they need."""
+        if bool(self.heights_mm) != (self.calibrated_height_mm is not None):
+            raise ParameterError(
+                "calibrated_height_mm", self.calibrated_height_mm, "a height where heights_mm may be chosen, else None"
+            )
+        if not all(0 < height < math.inf for height in (*self.heights_mm, self.calibrated_height_mm or 1.0)):
+            raise ParameterError("heights_mm", self.heights_mm, "finite, greater than 0")
+        if self.calibrated_height_mm is not None:
+            low, high = self.calibrated_height_mm / MOST_LIFTED, self.calibrated_height_mm * MOST_LIFTED
+            if not all(low <= height <= high for height in self.heights_mm):
+                allowed = f"{low:g} to {high:g}: the sensor was calibrated at {self.calibrated_height_mm:g} mm"
+                raise ParameterError("heights_mm", self.heights_mm, allowed)
 
     @cached_property
     def learning(self) -> Method:
@@ -281,7 +293,7 @@ class Experiment:
         sd, shapes
             Posterior sds of the shape's parameters, and the shapes' probabilities.
         chance_off
-            Probability that a length is off by three times the target sd (`judging.chance_off`); it is used if the
+            Probability that a length is off by three times the target sd (`stopping_rule.chance_off`); it is used if the
             sensor is doubted, since the posterior then has tails that sds do not show.
         """
         likely = max(shapes.values(), default=1.0)

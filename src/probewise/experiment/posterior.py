@@ -259,9 +259,10 @@ def _sampled_from_others(
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
         donors += [own.weighted] if own.log_z > hopeless else []
         n = max(len(own.ancestor), _size(kind, 0.0, n_particles))
-        found = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
-        if isinstance(found, float):
-            particles[k] = replace(own, ceiling=max(found, own.log_z) + _RULED_OUT)
+        anew = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
+        found = anew.samples
+        if anew.promised < hopeless:
+            particles[k] = replace(own, ceiling=max(anew.promised, own.log_z) + _RULED_OUT)
             continue
         if found is None or found.n_eff < _FEWEST:
             particles[k] = replace(own, strained=own.strained or own.hurried)
@@ -274,6 +275,14 @@ def _sampled_from_others(
     return particles
 
 
+@dataclass(frozen=True, eq=False)
+class _FromOthers:
+    """Samples of a kind, None if none was found, and the log evidence that fits promise, infinite without fits."""
+
+    samples: Weighted | None
+    promised: float = math.inf
+
+
 def _from_others(
     kind: HypothesisKind,
     problem: SensorProblem,
@@ -282,29 +291,29 @@ def _from_others(
     n: int,
     hopeless: float,
     rng: np.random.Generator,
-) -> Weighted | float | None:
+) -> _FromOthers:
     """Sample a kind's posterior with what others believe: refits of it, or the samples themselves for a noise law.
 
-    Returns a number, the log evidence that the fits promise, where that is below `hopeless`, and None where no sample
-    was found.
+    No samples are drawn if the fits promise less than `hopeless`.
     """
     noise = declared_noise(kind.likelihood)
     if kind.effect is not None:
         if noise is None:
-            return None
+            return _FromOthers(None)
         sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
         found = fits(kind, problem, donors, noise_sd=sd, rng=rng)
         if found.highest < hopeless:
-            return found.highest
-        return refitted(found, problem, own, n_draws=2 * n, with_own=own.log_z > hopeless, rng=rng)
+            return _FromOthers(None, found.highest)
+        with_own = own.log_z > hopeless
+        return _FromOthers(refitted(found, problem, own, n_draws=2 * n, with_own=with_own, rng=rng), found.highest)
     n_own = len(kind.prior.names)
     points = [donor.samples(n // 2, rng=rng)[:, :n_own] for donor in donors]
     if own.log_z > hopeless:
         points.append(own.samples(n // 2, rng=rng))
     try:
-        return redrawn(np.concatenate(points), kind.prior.names, problem, rng=rng, n_draws=n)
+        return _FromOthers(redrawn(np.concatenate(points), kind.prior.names, problem, rng=rng, n_draws=n))
     except NotConvergedError:
-        return None
+        return _FromOthers(None)
 
 
 def _size(kind: HypothesisKind, probability: float, n_particles: int) -> int:

@@ -17,8 +17,6 @@ from probewise.inquiry import Goal, Grid, Prospect, UtilityMap, choose, choose_s
 from probewise.inquiry.forecast import thinned
 from probewise.nested.importance import Weighted
 
-__all__ = ["ArmOverGrid", "inquire", "next_poses"]
-
 
 @dataclass(frozen=True, eq=False)
 class ArmOverGrid:

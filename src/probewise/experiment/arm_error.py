@@ -32,8 +32,6 @@ from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
 from probewise.scene.shapes import AnyOf
 
-__all__ = ["arm_error", "moved_by_arm", "with_arm_error"]
-
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
 _STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are
 _LEAST = 1e-3  # probability of a kind of hypotheses that is asked

@@ -23,8 +23,6 @@ from probewise.scene import outlines
 from probewise.scene.albedo import Region
 from probewise.scene.regions import EllipseRegion, PolygonRegion
 
-__all__ = ["ENOUGH_BITS", "FAR_SIDE", "NAMES", "Outline", "bits_of_names", "places_of"]
-
 ENOUGH_BITS = 0.08
 """Expected information about the name of what is left out for which a reading is taken after the shape is known."""
 

@@ -43,10 +43,7 @@ from probewise.scene.albedo import Shape, require_shape
 from probewise.scene.shapes import AnyOf
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["Experiment", "OneScan", "widest_mm"]
-
-
-MOST_LIFTED = 10.0
+_MOST_LIFTED = 10.0
 """Largest factor between reading height and calibrated height, either way."""
 
 MOST_OFF = 0.01
@@ -205,7 +202,7 @@ class Experiment:
         if not all(0 < height < math.inf for height in (*self.heights_mm, self.calibrated_height_mm or 1.0)):
             raise ParameterError("heights_mm", self.heights_mm, "finite, greater than 0")
         if self.calibrated_height_mm is not None:
-            low, high = self.calibrated_height_mm / MOST_LIFTED, self.calibrated_height_mm * MOST_LIFTED
+            low, high = self.calibrated_height_mm / _MOST_LIFTED, self.calibrated_height_mm * _MOST_LIFTED
             if not all(low <= height <= high for height in self.heights_mm):
                 allowed = f"{low:g} to {high:g}: the sensor was calibrated at {self.calibrated_height_mm:g} mm"
                 raise ParameterError("heights_mm", self.heights_mm, allowed)
@@ -293,8 +290,8 @@ class Experiment:
         sd, shapes
             Posterior sds of the shape's parameters, and the shapes' probabilities.
         chance_off
-            Probability that a length is off by three times the target sd (`stopping_rule.chance_off`); it is used if the
-            sensor is doubted, since the posterior then has tails that sds do not show.
+            Probability that a length is off by three times the target sd, see `stopping_rule.chance_off`; it counts if
+            the sensor is doubted, since the posterior then has tails that sds do not show.
         """
         likely = max(shapes.values(), default=1.0)
         sure = self.trust == 1 or chance_off < MOST_OFF

@@ -12,8 +12,6 @@ import numpy as np
 
 from probewise.errors import ParameterError
 
-__all__ = ["value_digest"]
-
 
 def value_digest(value: object) -> str:
     """Digest a value built of frozen dataclasses, arrays, numbers and texts (sha256, hex).

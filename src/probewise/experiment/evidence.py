@@ -21,8 +21,6 @@ from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["Bridged", "bridged", "redrawn"]
-
 _WIDE = 3.0  # factor on the width of some kernels, so that draws extend beyond the samples
 _OF_WIDE = 0.15  # share of the draws from those
 _STEPS = 60

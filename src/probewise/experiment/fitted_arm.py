@@ -10,8 +10,6 @@ from probewise.arm.geometry import Geometry
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.errors import ParameterError
 
-__all__ = ["FittedArm"]
-
 
 @dataclass(frozen=True, eq=False)
 class FittedArm:

@@ -16,8 +16,6 @@ from probewise.nested.weights import weighted_quantiles
 from probewise.scene.albedo import Shape
 from probewise.scene.shapes import AnyOf, RegularPolygon
 
-__all__ = ["FORMAT", "OFF_MM", "FoundParameter", "FoundShape", "found_shape", "result_json", "samples_csv"]
-
 FORMAT = "exploration/1"
 
 OFF_MM = 12.0

@@ -15,8 +15,6 @@ from probewise.priors import Prior
 from probewise.scene import SHAPES, AnyOf, Field, Shape, outlines
 from probewise.world import Surface
 
-__all__ = ["Hidden", "Truth", "members_of"]
-
 Truth = Sequence[float] | Mapping[str, float] | Mapping[str, Sequence[float]] | Mapping[str, Mapping[str, float]]
 """Parameters of the first shape, in order or by name; or {"rectangle": ...}, those of a shape by its name."""
 

@@ -36,20 +36,9 @@ from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.strict_json import json_of
 from probewise.recordings.text import read_bytes
 
-__all__ = [
-    "FORMAT",
-    "Entry",
-    "Journal",
-    "JournalWriter",
-    "PosteriorSummary",
-    "read_journal",
-    "recording_of",
-    "require_same_settings",
-]
-
 FORMAT = "journal/1"
 PATTERN = "field"
-SUMMARY_KEY = ', "belief": '
+_SUMMARY_KEY = ', "belief": '
 # Settings in which a resumed run may differ: files may have moved, and an arm may have another name.
 _FREE = frozenset({"format", "version", "spawn_key", "arm", "sensor_file"})
 
@@ -194,7 +183,7 @@ def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
 
 def _first_part(tail: bytes) -> bytes:
     """Return the part of an incomplete line up to its reading, without the summary."""
-    mark = SUMMARY_KEY.encode()
+    mark = _SUMMARY_KEY.encode()
     head = tail.split(mark)[0]
     torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
     return head[: len(head) - torn]
@@ -368,7 +357,7 @@ class JournalWriter:
             "bits": summary.bits,
             "next": _pose_line(summary.next_pose),
         }
-        self._write(SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n")
+        self._write(_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n")
 
     def close(self) -> None:
         """Close the file and let other processes write to it."""

@@ -16,8 +16,6 @@ from scipy.spatial import cKDTree
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["MOST_KERNELS", "LocalKernels"]
-
 MOST_KERNELS = 250
 _NEIGHBOURS = 10  # neighbours per parameter, enough for a covariance
 _RIDGE = 1e-6  # of the overall covariance, to avoid singular ones

@@ -23,8 +23,6 @@ from probewise.scene.shapes import AnyOf
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["HypothesisKind", "kinds_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class HypothesisKind:

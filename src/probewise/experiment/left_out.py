@@ -14,8 +14,6 @@ from probewise.experiment.pace import clocked
 from probewise.experiment.rivals import WITH_CARDS
 from probewise.experiment.state import Step
 
-__all__ = ["CLEAN", "LeftOut", "left_out_of", "repaired"]
-
 CLEAN = "clean"
 _CREDIBLE = 0.95
 _NAMED = 0.5

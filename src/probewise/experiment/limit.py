@@ -10,8 +10,6 @@ from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
 from probewise.inquiry import Bound, capacity_bits, fewest_readings, prior_entropy, target_entropy
 
-__all__ = ["least_readings"]
-
 _MET = 5.0  # noise sds from the background at which a reading counts as on the shape
 
 

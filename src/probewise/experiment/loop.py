@@ -48,8 +48,6 @@ from probewise.experiment.stopping_rule import (
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
-__all__ = ["begin", "explore", "run", "step"]
-
 
 def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generator) -> ExplorationState:
     """Choose the first place, by the map of hypotheses drawn from the prior.

@@ -19,9 +19,7 @@ from probewise.nested.sampler import LIVE_PER_PARAM
 from probewise.nested.stop import RemainingEvidence
 from probewise.recordings.plan import Recording
 
-__all__ = ["Method", "SequentialMonteCarlo", "from_scratch"]
-
-DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
+_DLOGZ = 0.5  # the final live points are posterior samples too; a smaller value would only refine log Z
 
 
 class Method(Protocol):
@@ -101,7 +99,7 @@ def from_scratch(problem: SensorProblem, n_live: int, rng: np.random.Generator) 
         rng=rng,
         n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
         move=KernelMove(),
-        stop=RemainingEvidence(DLOGZ),
+        stop=RemainingEvidence(_DLOGZ),
         max_cost=1.0,  # speed matters, since the robot waits
         return_interrupted=False,
     )

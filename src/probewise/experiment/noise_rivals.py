@@ -24,8 +24,6 @@ from probewise.effects.density import log_gaussian_density
 from probewise.priors import LogUniform
 from probewise.sensor import NoiseLevel
 
-__all__ = ["Correlated", "Flickering", "Lost", "OnLattice", "Tailed", "WithSignal", "noise_laws"]
-
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
 _EXACT = 1e-3  # of the noise sd: within which a value counts as the same, lost to black or rounded

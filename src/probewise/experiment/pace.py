@@ -18,8 +18,6 @@ from probewise.effects.wrapped_effect import WrappedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor.stages import Effect, Poses
 
-__all__ = ["EACH_S", "FromRest", "Pace", "Paced", "Told", "clocked", "run_time_s"]
-
 EACH_S = 8.0
 """Seconds of a run's own time that each reading takes on average."""
 

@@ -46,15 +46,6 @@ from probewise.scene import Field, HypothesisScene, KnownScene, Shape
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, NaiveSensor
 from probewise.world import World
 
-__all__ = [
-    "N_LIVE",
-    "NestedSampling",
-    "levels_from",
-    "levels_in",
-    "paper_experiment",
-    "student_t_bounds",
-]
-
 N_LIVE = 300
 """Live points of nested sampling in the paper."""
 

@@ -25,13 +25,11 @@ from probewise.nested.result import NestedResult
 from probewise.nested.weights import n_effective, resampled
 from probewise.priors import Prior
 
-__all__ = ["BRIEF", "STEADY", "THOROUGH", "Effort", "Particles", "prior_particles", "resized", "sampled", "update"]
-
-KEEP = 0.5  # least effective share of the samples without resampling
-SURPRISED = 12.5  # nats by which even the best sample misses the last reading: five sds of Gaussian noise
-STIFF = 0.5  # accepted steps per sample below which the moves are unreliable
-MOST_ROUNDS = 6
-MANY_DEGREES = 4
+_KEEP = 0.5  # least effective share of the samples without resampling
+_SURPRISED = 12.5  # nats by which even the best sample misses the last reading: five sds of Gaussian noise
+_STIFF = 0.5  # accepted steps per sample below which the moves are unreliable
+_MOST_ROUNDS = 6
+_MANY_DEGREES = 4
 _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 
@@ -44,7 +42,7 @@ class Effort:
 
     enough: float
     n_kernels: int
-    keep: float = KEEP
+    keep: float = _KEEP
     most: float = math.inf
 
 
@@ -164,7 +162,7 @@ def update(
         return previous
     predicted = problem.model.predict(before.theta, problem.recording.plan)
     strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
-    if bridge.misfit_nats(predicted) > SURPRISED:
+    if bridge.misfit_nats(predicted) > _SURPRISED:
         if fall_back is not None:
             return _from_scratch(fall_back(), n, bridge, n, rng)
         strained = True
@@ -192,7 +190,7 @@ def update(
             now.take(rows), share, bridge, rng, _partitioned(rows) if fall_back is None else None, effort
         )
         n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
-        if moves.accepted < STIFF:
+        if moves.accepted < _STIFF:
             if fall_back is not None:
                 return _from_scratch(fall_back(), n, bridge, n_calls, rng)
             strained = True
@@ -212,7 +210,7 @@ def update(
         tail,
     )
     degrees = n_resampled - previous.n_resampled
-    hurried, with_ease = previous.hurried or degrees >= MANY_DEGREES, degrees <= 1 and not strained
+    hurried, with_ease = previous.hurried or degrees >= _MANY_DEGREES, degrees <= 1 and not strained
     return Particles(
         found,
         ancestor,
@@ -362,7 +360,7 @@ def _move(
     effort = THOROUGH if effort is None else effort
     kernels = [LocalKernels.about(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
     now, accepted, n_calls = start, 0.0, 0
-    for _ in range(MOST_ROUNDS):
+    for _ in range(_MOST_ROUNDS):
         for propose in (_from_kernels, _along_differences):
             theta, log_ratio = np.empty_like(now.theta), np.empty(n)
             for k, rows in enumerate(parts):

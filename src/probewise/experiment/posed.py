@@ -14,8 +14,6 @@ from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
 from probewise.nested import NestedStop
 from probewise.scene import Card, Field, Shape
 
-__all__ = ["MethodName", "pose_experiment"]
-
 MethodName: TypeAlias = Literal["particles", "paper"]
 
 

@@ -37,8 +37,6 @@ from probewise.nested.importance import Weighted
 from probewise.nested.result import NestedResult
 from probewise.recordings.plan import Recording
 
-__all__ = ["WARY", "Posterior", "prior_posterior", "reconsidered", "updated"]
-
 FromScratch = Callable[[SensorProblem], NestedResult]
 
 _IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples

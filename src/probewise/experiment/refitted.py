@@ -24,8 +24,6 @@ from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["Fits", "fits", "refitted"]
-
 _STARTS = 90
 _STEPS = 8
 _HELD = 1e12  # stiffness of a parameter that is held, in inverse squares of its scale

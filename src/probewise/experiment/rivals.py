@@ -37,8 +37,6 @@ from probewise.recordings.plan import Instrumentation, Plan
 from probewise.sensor import Chain, FixedLevels
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["OF_MOTION", "ON_FIELD", "Rival", "declared_noise", "rivals_of"]
-
 _DURATION_S = 150.0
 _SCAN_MM = 100.0
 

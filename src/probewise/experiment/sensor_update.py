@@ -20,8 +20,6 @@ from probewise.priors import Normal, Product
 from probewise.sensor import FixedMixture, Footprint, footprint_of
 from probewise.sensor.stages import require_columns
 
-__all__ = ["AdjustedMixture", "Change", "sensor_prior"]
-
 
 @dataclass(frozen=True)
 class Change:

@@ -25,8 +25,6 @@ from probewise.recordings.plan import Plan
 from probewise.scene import outlines
 from probewise.scene.regions import EllipseRegion, PolygonRegion
 
-__all__ = ["settling"]
-
 _NEAR = 15.0  # times the target sd: beyond it, the ordinary information is used
 _HYPOTHESES = 800
 _FAIRNESS = 0.75  # power of a kind's probability in its share of the drawn hypotheses

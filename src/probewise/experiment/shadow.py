@@ -13,8 +13,6 @@ from probewise.experiment.loop import begin, step
 from probewise.experiment.state import Step
 from probewise.inquiry import prior_entropy
 
-__all__ = ["shadow_run"]
-
 
 def shadow_run(
     steps: Iterable[Step], other: Experiment, field: ArmOverGrid, *, rng: np.random.Generator

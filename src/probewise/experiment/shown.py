@@ -20,8 +20,6 @@ from probewise.effects.wrapped_effect import WrappedEffect
 from probewise.experiment.pace import EACH_S
 from probewise.priors import LogUniform, Prior, Product, Uniform
 
-__all__ = ["Shown"]
-
 _SMALLEST = 4.0
 """Smallest sd of an effect's size, in typical sizes of a recording: a smaller one hardly moves the shape."""
 

@@ -45,27 +45,6 @@ from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSe
 from probewise.sensor.stages import AnyEffect
 from probewise.world import Covered, Oval, Spot, Surface, World
 
-__all__ = [
-    "TRUST",
-    "Model",
-    "Streams",
-    "arm_over",
-    "bin_width_of",
-    "calibrated_height",
-    "chain_of",
-    "experiment_for",
-    "levels_of",
-    "posing",
-    "scale_of",
-    "sensor_named",
-    "shape_named",
-    "shape_of",
-    "surface_of",
-    "surface_under",
-    "usual_trust",
-    "world_like",
-]
-
 Model: TypeAlias = Literal["ssf", "naive"]
 
 _CELLS_PER_SD = 8.0  # cells per noise sd for unrounded readings

@@ -14,8 +14,6 @@ from probewise.experiment.loop import begin, step
 from probewise.experiment.state import Exploration, Step
 from probewise.inquiry import prior_entropy
 
-__all__ = ["run_from"]
-
 
 def run_from(
     first: Pose, instrument: Instrument, experiment: Experiment, *, rng: np.random.Generator, max_readings: int = 100

@@ -21,8 +21,6 @@ from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Instrumentation, Recording
 
-__all__ = ["PAPER_BITS", "ArmError", "Exploration", "ExplorationState", "Step"]
-
 PAPER_BITS = 25.0
 """Bits in the paper's count for a circle known to 4 mm: one per reading of the naive model."""
 

@@ -15,9 +15,6 @@ from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
 from probewise.scene.shapes import AnyOf
 
-__all__ = ["OFF_SDS", "chance_off", "doubt", "fit", "information", "learnt", "moments", "stop_reason"]
-
-
 OFF_SDS = 3.0
 """Error, in units of the stopping rule's sd, above which a length counts as wrong: 12 mm for 4 mm."""
 

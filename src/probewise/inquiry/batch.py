@@ -12,8 +12,6 @@ from probewise.inquiry.choice import choose
 from probewise.inquiry.forecast import thinned
 from probewise.inquiry.prospect import Prospect
 
-__all__ = ["choose_several"]
-
 _OUTCOMES = 16  # simulated outcomes of the readings chosen so far
 _FEW = 600  # hypotheses used to simulate them
 

@@ -12,8 +12,6 @@ from probewise.errors import ParameterError
 from probewise.inquiry.forecast import spread_levels
 from probewise.inquiry.readout import Readout, entropy_bits
 
-__all__ = ["Bound", "capacity_bits", "fewest_readings", "target_entropy"]
-
 _PER_SD = 4.0
 _MOST_ROUNDS = 2000
 _CLOSE_BITS = 1e-4

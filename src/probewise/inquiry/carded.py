@@ -16,8 +16,6 @@ from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import Layout, response
 from probewise.sensor.stages import Poses, SensorModel
 
-__all__ = ["CardedForecast", "CardedModel", "cards_of"]
-
 _REACH = 6.0  # sds of the footprint
 _SHOWS = 1e-4  # share of the footprint on a card from which the card counts
 _MOST_ASKED = 400

@@ -7,8 +7,6 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, require_finite
 from probewise.errors import ReachError, ShapeError
 
-__all__ = ["TIE", "best_places", "choose"]
-
 TIE = 1e-9
 """Utilities closer than this count as equal, since they differ by rounding only."""
 

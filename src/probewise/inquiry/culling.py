@@ -16,8 +16,6 @@ from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.commanded import is_commanded
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["CullingBounds"]
-
 _REACH = 6.0  # sds of the footprint beyond which it is negligible: 1e-9 of the levels' difference
 _TILE_MM = 110.0
 _FAR_MM = 1e5

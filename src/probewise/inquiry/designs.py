@@ -13,8 +13,6 @@ from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
 from probewise.recordings.plan import Plan
 
-__all__ = ["Design", "Designs"]
-
 
 @dataclass(frozen=True)
 class Design:

@@ -23,8 +23,6 @@ from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
 from probewise.sensor.stages import AnyEffect, SensorModel, require_columns
 
-__all__ = ["DiscTable", "is_alike_everywhere"]
-
 NAMES = ("x_mm", "y_mm", "radius_mm")
 
 _COARSE_MM = 0.5  # spacing of distances at which the model is evaluated, for a cubic spline

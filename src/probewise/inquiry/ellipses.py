@@ -13,8 +13,6 @@ from probewise.inquiry.unit_gaussian import seen_of_bend
 from probewise.scene import EllipseRegion
 from probewise.sensor import FixedMixture
 
-__all__ = ["CrossedEllipses", "Ellipses"]
-
 _TINY = np.float32(1e-6)
 
 

@@ -13,8 +13,6 @@ from probewise.inquiry.given_reading import GivenReading
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.utility import InformationGain, Utility
 
-__all__ = ["Finishing"]
-
 _NEAR = 15.0  # times the target sd: beyond it, no single reading ends a run
 _MOST_ASKED = 800  # hypotheses
 _MOST_DESIGNS = 250  # the best by the other utility

@@ -14,18 +14,6 @@ from probewise.inquiry.designs import Designs
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
-__all__ = [
-    "MOST_LEVELS",
-    "DirectForecast",
-    "Forecast",
-    "PredictiveDistributions",
-    "by_combination",
-    "by_level",
-    "predicted",
-    "spread_levels",
-    "thinned",
-]
-
 MOST_LEVELS = 1000
 """Largest number of levels and of cells of a reading, more than the hypotheses can fill."""
 

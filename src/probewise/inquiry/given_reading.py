@@ -10,8 +10,6 @@ from probewise._arrays import FloatArray
 from probewise.inquiry.forecast import MOST_LEVELS, by_level, spread_levels
 from probewise.inquiry.readout import Readout
 
-__all__ = ["GivenReading"]
-
 _PER_SD = 2.0  # levels of the predicted reading per noise sd
 _LEAST = 1e-12
 

@@ -11,8 +11,6 @@ from probewise._arrays import FloatArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.plan import Plan
 
-__all__ = ["Grid"]
-
 
 @dataclass(frozen=True)
 class Grid:

@@ -18,8 +18,6 @@ from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.priors import Prior
 
-__all__ = ["bits_gained", "gaussian_entropy", "neighbour_entropy", "prior_entropy"]
-
 
 def bits_gained(information: float, log_prior: FloatArray, weight: FloatArray, prior_entropy_bits: float) -> float:
     """Convert nested sampling's information to prior minus posterior differential entropy.

@@ -11,8 +11,6 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 
-__all__ = ["FunctionValue", "Label", "ParameterValue", "WhichShape"]
-
 
 class Label(Protocol):
     """A labelling of hypotheses; those with the same label need not be distinguished."""

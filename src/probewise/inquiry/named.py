@@ -8,8 +8,6 @@ from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.labels import ParameterValue, WhichShape
 from probewise.inquiry.utility import InformationAbout, InformationGain, PerSecond, ReadingEntropy, Utility
 
-__all__ = ["UTILITY_NAMES", "utility_named"]
-
 UTILITY_NAMES = ("finishing", "information", "entropy", "per-second", "about:PARAMETER", "which-shape")
 
 

@@ -14,8 +14,6 @@ from probewise.inquiry.unit_gaussian import N_OPENINGS, seen_of_corner
 from probewise.scene import PolygonRegion
 from probewise.sensor import FixedMixture
 
-__all__ = ["CrossedPolygons", "Polygons"]
-
 _MOST_EDGES = 8
 _LEAST = np.float32(1e-9)
 

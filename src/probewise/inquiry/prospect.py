@@ -14,8 +14,6 @@ from probewise.inquiry.forecast import MOST_LEVELS, Forecast, PredictiveDistribu
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 
-__all__ = ["Goal", "Prospect"]
-
 _CELL = 0.75  # width of a cell in noise sds, for unrounded readings: loses 2 % of a nat, uniformly
 _SETTLED = 1.0 - 1e-7  # weight of one level from which it counts as certain
 _BLOCK = 512  # designs per batch, to fit the cache

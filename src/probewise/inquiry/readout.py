@@ -11,8 +11,6 @@ from scipy.special import ndtr
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 
-__all__ = ["Readout", "entropy_bits"]
-
 _REACH = 5.0  # noise sds beyond the levels that the cells cover
 _FINE = 0.25  # width of a cell in noise sds, for unrounded readings: loses 0.3 % of a nat
 _LEAST = np.float32(1e-30)

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.grid import Grid
 
-__all__ = ["ROWS", "Interval", "Ring", "Spans", "single", "whole"]
-
 ROWS = 3
 """Rows of a grid per batch, to fit the cache."""
 

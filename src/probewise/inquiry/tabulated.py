@@ -31,8 +31,6 @@ from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["DiscForecast", "TabulatedForecast", "forecast_of"]
-
 _PER_SD = 2.0  # levels per noise sd: rounding adds 2 % to its variance, which thousands of hypotheses average out
 _N_CHECKED = 64  # shapes drawn from the prior, checked at 16 places each
 _PLACES = 16

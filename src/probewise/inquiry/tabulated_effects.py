@@ -15,8 +15,6 @@ from probewise.scene.cards import seen_with_cards
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel, Stage, View
 
-__all__ = ["TabulatedChain"]
-
 
 @dataclass(frozen=True, eq=False)
 class TabulatedChain:

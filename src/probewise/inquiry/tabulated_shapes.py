@@ -18,8 +18,6 @@ from probewise.inquiry.unit_gaussian import REACH
 from probewise.scene import EllipseRegion, MixtureOfRegions, PolygonRegion, Region
 from probewise.sensor import FixedMixture
 
-__all__ = ["TabulatedShapes"]
-
 
 class _Crossed(Protocol):
     """Shapes of one kind, each intersected by a row of places."""

@@ -14,8 +14,6 @@ from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["Rival", "tell_apart"]
-
 _PER_SD = 8.0  # levels per noise sd
 _BLOCK = 512
 

@@ -14,8 +14,6 @@ from scipy.special import ndtr
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.scanlines import single, whole
 
-__all__ = ["N_OPENINGS", "REACH", "seen_of_bend", "seen_of_corner"]
-
 REACH = 4.0
 """Sds beyond which an edge is negligible: 3e-5 of the span."""
 

@@ -12,8 +12,6 @@ from probewise.errors import ParameterError
 from probewise.inquiry.labels import Label
 from probewise.inquiry.prospect import Prospect
 
-__all__ = ["InformationAbout", "InformationGain", "PerSecond", "ReadingEntropy", "Utility", "label_entropy"]
-
 
 class Utility(Protocol):
     """Utility of a reading at each design; larger is better. A frozen dataclass, so that a journal can record it."""

@@ -19,8 +19,6 @@ from probewise.inquiry.utility import ReadingEntropy, Utility
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
-__all__ = ["UtilityMap", "entropy_map", "utility_map"]
-
 FLAT = 1e-5
 """Utilities that differ by less count as equal, since they are computed in single precision."""
 

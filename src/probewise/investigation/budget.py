@@ -11,8 +11,6 @@ from probewise._kinds import require_number
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 
-__all__ = ["Budget"]
-
 
 @dataclass(frozen=True)
 class Budget:

@@ -27,8 +27,6 @@ from probewise.recordings import (
 )
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["RoundsFolder", "Take"]
-
 Take: TypeAlias = Callable[[int, Plan, str, Sequence[Reading]], Iterator[Reading]]
 """Function of a round's number, its plan, the plan in words and the readings so far; yields the further readings."""
 

@@ -16,8 +16,6 @@ from probewise.investigation.rounds import Round, settled_by
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_plan
 
-__all__ = ["MOST_ROUNDS", "Record", "investigate"]
-
 MOST_ROUNDS = 6
 
 Record: TypeAlias = Callable[[int, Plan, str], Recording]

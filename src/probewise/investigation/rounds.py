@@ -8,8 +8,6 @@ from probewise._display import ShowsItself
 from probewise.diagnosis import Diagnosis
 from probewise.recordings.plan import Recording
 
-__all__ = ["SURE", "Investigation", "Round", "settled_by"]
-
 SURE = 0.95  # probability from which a hypothesis is settled
 
 

@@ -15,8 +15,6 @@ from probewise.recordings.plan import Plan
 from probewise.world import World, concealed
 from probewise.world.concealed import Concealed
 
-__all__ = ["SimulatedRecorder", "parse_concealed"]
-
 NOTHING = "nothing"
 _LARGEST = 1e9  # largest magnitude of a parameter of an effect
 

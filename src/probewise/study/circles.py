@@ -11,8 +11,6 @@ from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.scene import Circle, Field
 
-__all__ = ["FIELD", "POPULATIONS", "Population", "noise_of"]
-
 FIELD = Field()
 _SEED = 2013
 

@@ -53,16 +53,6 @@ from probewise.world.concealed import (
 from probewise.world.concealed.stages import Stage
 from probewise.world.rows import Rows
 
-__all__ = [
-    "CONCEALED",
-    "ConcealedRow",
-    "ConcealedTrial",
-    "concealed_rows",
-    "concealed_table",
-    "run_concealed",
-    "run_concealed_trial",
-]
-
 _EACH_S = 8.0  # seconds between readings, about
 _MIDDLE_MM = (FIELD.width_mm / 2, FIELD.height_mm / 2)
 _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)

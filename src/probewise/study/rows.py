@@ -12,8 +12,6 @@ from probewise.inquiry import utility_named
 from probewise.nested import NESTED_STOP, NestedStop
 from probewise.study.circles import POPULATIONS
 
-__all__ = ["REFERENCE", "Row", "paper_rows", "standard_rows"]
-
 _IN_BATCHES = ("finishing", "information")
 
 

@@ -17,8 +17,6 @@ from probewise.study.rows import Row
 from probewise.study.table import Summary, summarise
 from probewise.study.trial import Trial, run_trial
 
-__all__ = ["Study", "read_study", "run_study"]
-
 
 @dataclass(frozen=True, eq=False)
 class Study:

@@ -13,8 +13,6 @@ from scipy.stats import binom, poisson
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 
-__all__ = ["LEAST_FOR_MEDIAN", "Estimate", "Summary", "share_within", "summarise"]
-
 WRONG_MM = 12.0
 """Three times the 4 mm of the stopping rule: a run that ends with a larger error is sure and wrong."""
 

@@ -37,8 +37,6 @@ from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, Spot, World, gaussian_spot
 
-__all__ = ["Trial", "arm_of", "experiment_for_trial", "experiment_of", "judged", "reached", "run_trial", "timed_steps"]
-
 SEED = 2013
 # The study's sensor: one Gaussian, in mm and LEGO units; the world uses the same numbers, rasterised to pixels.
 DARK, BRIGHT = 10.0, 60.0

@@ -16,8 +16,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.inquiry.any_settings.noise import ReadingNoise
 
-__all__ = ["Predictive"]
-
 _N_GROUPS = 32
 _N_OUTLIERS = 32
 _BLOCK = 2_000_000  # densities held at a time

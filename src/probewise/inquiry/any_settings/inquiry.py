@@ -22,8 +22,6 @@ from probewise.nested.pose import AnyPrior
 from probewise.nested.weights import resampled
 from probewise.priors import require_prior
 
-__all__ = ["Inquiry"]
-
 _N_ASKED = 1000  # samples whose predictions value the settings
 _FEWER_ASKED = 200  # of a model that is called for one sample at a time
 _N_IMAGINED = 8

@@ -16,8 +16,6 @@ from probewise._kinds import require_number
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Marginal
 
-__all__ = ["AnyNoise", "ReadingNoise"]
-
 AnyNoise: TypeAlias = "float | Callable[[FloatArray], Any] | Marginal | ReadingNoise"
 
 _ALLOWED_SD = (

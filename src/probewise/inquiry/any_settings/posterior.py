@@ -20,8 +20,6 @@ from probewise.nested.weights import n_effective
 from probewise.priors import Joint, Prior, Product
 from probewise.systems.calls import Caller
 
-__all__ = ["NOISE_SD", "Model", "Readings", "prior_samples", "updated"]
-
 NOISE_SD = "noise.sd"
 """Name of the parameter that an unknown sd of the noise is."""
 

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from probewise._arrays import IntArray
 from probewise.errors import ParameterError
 
-__all__ = ["Column", "Settings"]
-
 Column: TypeAlias = NDArray[Any]
 
 _ALLOWED = (

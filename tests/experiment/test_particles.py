@@ -12,7 +12,15 @@ from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
 from probewise.experiment.evidence import bridged, redrawn
 from probewise.experiment.kernels import LocalKernels
-from probewise.experiment.particles import Particles, _Bridge, _move, _partitioned, prior_particles, resized, update
+from probewise.experiment.particles import (
+    Particles,
+    _LastReading,
+    _move,
+    _partitioned,
+    prior_particles,
+    resized,
+    update,
+)
 from probewise.experiment.stopping_rule import information
 from probewise.nested import run
 from probewise.priors import Product, Uniform
@@ -245,7 +253,7 @@ def test_copies_of_one_sample_are_not_moved(small):
     """They are left where they are, and the posterior is marked as strained."""
     problem = small.experiment().problem([Reading(40.0, Pose(50.0, 30.0, 0.0), 1.0)])
     theta = np.repeat(problem.prior.from_unit_cube(np.full((1, len(problem.prior.names)), 0.5)), 60, axis=0)
-    cloud = _Bridge(problem).cloud(theta)
-    moved, moves = _move(cloud, 1.0, _Bridge(problem), np.random.default_rng(1))
+    cloud = _LastReading(problem).cloud(theta)
+    moved, moves = _move(cloud, 1.0, _LastReading(problem), np.random.default_rng(1))
     assert moves.accepted == 0.0
     np.testing.assert_array_equal(moved.theta, theta)

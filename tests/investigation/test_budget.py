@@ -42,7 +42,7 @@ def test_minutes_count_from_the_end_of_the_last_round():
 
 
 def test_spending_never_leaves_less_than_nothing():
-    left = Budget(10, 1.0).less(first_scans(1), 0.0)
+    left = Budget(10, 1.0).minus(first_scans(1), 0.0)
     assert (left.readings, left.minutes) == (0, pytest.approx(max(1.0 - first_scans(1).time_s.max() / 60, 0.0)))
 
 

@@ -23,7 +23,7 @@ from probewise.scene import outlines
 from probewise.scene.albedo import Region
 from probewise.scene.regions import EllipseRegion, PolygonRegion
 
-ENOUGH_BITS = 0.08
+ENOUGH_BITS = 0.05
 """Expected information about the name of what is left out for which a reading is taken after the shape is known."""
 
 NAMES = "expected information about what the sensor leaves out (bits)"
@@ -89,7 +89,7 @@ def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolA
     told = entropy_bits(given.mass)
     for own in each:
         part = float(weight[own].sum())
-        told -= part * entropy_bits(given.sum(own / part))
+        told -= part * entropy_bits(given.sum_by_cell(own / part))
     return np.asarray(told)
 
 

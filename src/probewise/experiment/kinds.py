@@ -107,7 +107,7 @@ def kinds_of(
                 continue
             if not isinstance(chain, Chain):
                 raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
-            both = Joint((own, _Called(rival.name, rival.effect.prior)))
+            both = Joint((own, _PrefixedPrior(rival.name, rival.effect.prior)))
             acting = chain.with_effects(rival.effect)
             model = part.model(TabulatedChain.of(acting, quick) or acting)
             kinds.append(
@@ -126,7 +126,7 @@ def _with_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) 
     informed = [effect.informed for effect in estimated]
     known = tuple(effect for effect in chain.effects if not isinstance(effect, Estimated))
     acting = replace(chain, effects=(*known, *informed))
-    both = Joint((own, *(_Called(effect.name, effect.prior) for effect in informed)))
+    both = Joint((own, *(_PrefixedPrior(effect.name, effect.prior) for effect in informed)))
     return both, TabulatedChain.of(acting, quick) or acting
 
 
@@ -164,7 +164,7 @@ class _Part:
         more = whole.names[len(middle) :]
         columns = np.concatenate([self.columns, np.arange(len(middle), len(whole.names))])
         others = frozen(np.concatenate([middle, np.zeros(len(more))]))
-        return _Asked(whole, (*self.prior.names, *more), columns, others)
+        return _RestrictedModel(whole, (*self.prior.names, *more), columns, others)
 
 
 def _parts(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_Part]:
@@ -180,7 +180,7 @@ def _parts(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_Part
 
 
 @dataclass(frozen=True, eq=False)
-class _Asked:
+class _RestrictedModel:
     """A model restricted to some parameters; the others, which have no influence, are fixed."""
 
     whole: SensorModel
@@ -196,7 +196,7 @@ class _Asked:
 
 
 @dataclass(frozen=True, eq=False)
-class _Called:
+class _PrefixedPrior:
     """An effect's prior with the parameter names of a chain."""
 
     effect: str

@@ -38,11 +38,11 @@ from probewise.experiment.state import ArmError, Exploration, ExplorationState, 
 from probewise.experiment.stopping_rule import (
     OFF_SDS,
     chance_off,
-    doubt,
-    fit,
+    doubt_message,
+    goodness_of_fit,
     information,
-    learnt,
     moments,
+    sensor_moments,
     stop_reason,
 )
 from probewise.inquiry import Goal, bits_gained, prior_entropy
@@ -132,12 +132,14 @@ def step(
         posterior = wary.joined(rng=rng)
     mean, sd, shapes = moments(experiment, posterior)
     leader = carried.kinds[carried.leader]
-    p_value, worst = fit(experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording))
+    p_value, worst = goodness_of_fit(
+        experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording)
+    )
     if leader.likelihood is not experiment.likelihood:
         p_value = 1.0  # this noise model allows for outliers
     notes = () if posterior.run is None else posterior.run.warnings
     if p_value < experiment.doubt_p:
-        notes = (*notes, doubt(p_value, worst, readings))
+        notes = (*notes, doubt_message(p_value, worst, readings))
     drawn = experiment.learning.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
     likely = max(shapes, key=shapes.__getitem__, default="")
 
@@ -173,7 +175,7 @@ def step(
         bits=bits_gained(information(posterior), problem.prior.log_prob(posterior.theta), posterior.weight, prior_bits),
         p_value=p_value,
         posterior=posterior,
-        sensor=learnt(experiment, posterior),
+        sensor=sensor_moments(experiment, posterior),
         left_out=carried.left_out,
         kinds=carried,
         chance_off=off,

@@ -152,8 +152,8 @@ def update(
         As many samples as before; `run` is the run from scratch, if one was needed. If no sample could have given the
         reading, the evidence is zero and the samples are unchanged.
     """
-    bridge = _Bridge(problem)
-    previous = replace(previous, ceiling=previous.ceiling + bridge.perfect)
+    last = _LastReading(problem)
+    previous = replace(previous, ceiling=previous.ceiling + last.perfect)
     before = previous.weighted
     n = len(before.theta)
     effort = THOROUGH if effort is None else effort
@@ -162,18 +162,18 @@ def update(
         return previous
     predicted = problem.model.predict(before.theta, problem.recording.plan)
     strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
-    if bridge.misfit_nats(predicted) > _SURPRISED:
+    if last.misfit_nats(predicted) > _SURPRISED:
         if fall_back is not None:
-            return _from_scratch(fall_back(), n, bridge, n, rng)
+            return _from_scratch(fall_back(), n, last, n, rng)
         strained = True
-    now = _Cloud(before.theta, problem.prior.log_prob(before.theta), *bridge.weigh(predicted))
+    now = _Cloud(before.theta, problem.prior.log_prob(before.theta), *last.weigh(predicted))
     log_weight, base = before.log_weight, before.log_likelihood
     log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
     while True:
         all_at_once = n_effective(_reweighed(log_weight, now.after, base))
         if all_at_once == 0.0:
             if fall_back is not None:
-                return _from_scratch(fall_back(), n, bridge, n_calls, rng)
+                return _from_scratch(fall_back(), n, last, n_calls, rng)
             return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
         given_up = n_resampled - previous.n_resampled >= effort.most
         strained |= given_up and all_at_once < least
@@ -186,13 +186,11 @@ def update(
         if share == 1.0 and n_eff >= least:
             break
         rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
-        now, moves = _move(
-            now.take(rows), share, bridge, rng, _partitioned(rows) if fall_back is None else None, effort
-        )
+        now, moves = _move(now.take(rows), share, last, rng, _partitioned(rows) if fall_back is None else None, effort)
         n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
         if moves.accepted < _STIFF:
             if fall_back is not None:
-                return _from_scratch(fall_back(), n, bridge, n_calls, rng)
+                return _from_scratch(fall_back(), n, last, n_calls, rng)
             strained = True
         base, log_weight = now.at(share), np.full(n, -math.log(n))
         if share == 1.0:
@@ -236,7 +234,9 @@ def resized(
     rows = resampled(had.weight, n, rng)
     start = _Cloud(had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1)))
     moved, moves = (
-        _move(start, 1.0, _Bridge(problem), rng, effort=effort) if len(problem.recording) else (start, _Moves(0.0, 0))
+        _move(start, 1.0, _LastReading(problem), rng, effort=effort)
+        if len(problem.recording)
+        else (start, _Moves(0.0, 0))
     )
     found = replace(_equally_weighted(moved, had), n_calls=had.n_calls + moves.n_calls)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
@@ -246,9 +246,9 @@ def sampled(
     found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: Effort | None = None
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
-    bridge = _Bridge(problem)
-    cloud = bridge.cloud(found.theta[resampled(found.weight, n, rng)])
-    moved, moves = _move(cloud, 1.0, bridge, rng, effort=effort)
+    last = _LastReading(problem)
+    cloud = last.cloud(found.theta[resampled(found.weight, n, rng)])
+    moved, moves = _move(cloud, 1.0, last, rng, effort=effort)
     drawn = replace(_equally_weighted(moved, found), n_calls=found.n_calls + n + moves.n_calls)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 
@@ -288,7 +288,7 @@ class _Cloud:
 
 
 @dataclass(frozen=True, eq=False)
-class _Bridge:
+class _LastReading:
     """The problem with and without its last reading, from one prediction."""
 
     problem: SensorProblem
@@ -342,7 +342,7 @@ class _Moves:
 def _move(
     start: _Cloud,
     share: float,
-    bridge: _Bridge,
+    last: _LastReading,
     rng: np.random.Generator,
     parts: Sequence[IntArray] | None = None,
     effort: Effort | None = None,
@@ -365,7 +365,7 @@ def _move(
             theta, log_ratio = np.empty_like(now.theta), np.empty(n)
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
-            proposed = bridge.cloud(theta)
+            proposed = last.cloud(theta)
             odds = proposed.log_prior + proposed.at(share) - now.log_prior - now.at(share) + log_ratio
             taken = np.log(rng.random(n)) < odds
             now = now.put(taken, proposed)
@@ -418,13 +418,13 @@ def _reweighed(log_weight: FloatArray, after: FloatArray, before: FloatArray) ->
 def _from_scratch(
     run: NestedResult,
     n: int,
-    bridge: _Bridge,
+    last: _LastReading,
     n_calls: int,
     rng: np.random.Generator,
 ) -> Particles:
     """Resample as many samples as before from a run, and move them apart."""
-    found = bridge.cloud(run.samples(n, rng=rng))
-    moved, moves = _move(found, 1.0, bridge, rng)
+    found = last.cloud(run.samples(n, rng=rng))
+    moved, moves = _move(found, 1.0, last, rng)
     even = np.full(n, -math.log(n))
     calls = n_calls + run.n_calls + n + moves.n_calls
     drawn = Weighted(

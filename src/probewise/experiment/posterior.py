@@ -81,7 +81,7 @@ class Posterior:
     @property
     def probability(self) -> FloatArray:
         """Probability of each kind, (n_kinds,), summing to one."""
-        return _shares(self.log_odds)
+        return _normalised(self.log_odds)
 
     @property
     def log_z(self) -> float:
@@ -181,18 +181,20 @@ def updated(
         found = update(only, problem, rng=rng, fall_back=lambda: from_scratch(problem))
         return replace(previous, particles=(found,))
     doubted = any(kind.left_out for kind in previous.kinds)
-    particles = _taken_in(previous, problems, STEADY if doubted else THOROUGH, rng)
+    particles = _with_last_reading(previous, problems, STEADY if doubted else THOROUGH, rng)
     now = replace(previous, particles=tuple(particles))
     if doubted:
         particles = _sampled_from_others(now, problems, n_particles, rng)
         now = replace(previous, particles=tuple(particles))
         particles = [
-            _weighed_again(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
+            _with_bridged_evidence(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
             for p, problem, odds in zip(particles, problems, now.log_odds, strict=True)
         ]
         now = replace(previous, particles=tuple(particles))
     n = min(n_particles, _MOST_DRAWS) if doubted else n_particles
-    now = _without_doubt(now, problems, n, from_scratch, rng, most_off=_DOUBTED_OFF if doubted else _MOST_OFF)
+    now = _reestimated_where_doubtful(
+        now, problems, n, from_scratch, rng, most_off=_DOUBTED_OFF if doubted else _MOST_OFF
+    )
     particles = list(now.particles)
     if not np.isfinite(now.log_odds).any():
         raise NotConvergedError("no hypothesis of any kind could have given these readings")
@@ -205,7 +207,7 @@ def updated(
     return replace(now, particles=tuple(particles))
 
 
-def _taken_in(
+def _with_last_reading(
     previous: Posterior, problems: list[SensorProblem], usual: Effort, rng: np.random.Generator
 ) -> list[Particles]:
     """Take the last reading into every kind, with less effort into improbable rivals."""
@@ -228,7 +230,9 @@ def reconsidered(
     """Sample every rival anew that might matter, but for those that were before: to be asked before a run ends."""
     problems = [kind.problem(recording) for kind in posterior.kinds]
     now = replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
-    return _without_doubt(now, problems, min(n_particles, _MOST_DRAWS), from_scratch, rng, most_off=_OFF_AT_THE_END)
+    return _reestimated_where_doubtful(
+        now, problems, min(n_particles, _MOST_DRAWS), from_scratch, rng, most_off=_OFF_AT_THE_END
+    )
 
 
 def _sampled_from_others(
@@ -268,7 +272,7 @@ def _sampled_from_others(
         if found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
             continue
         fresh = sampled(found, n, problem, rng=rng, effort=BRIEF)
-        fresh = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
+        fresh = _restarted(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
         particles[k] = replace(fresh, refitted=found.n_eff >= _WELL_FOUND, strained=found.n_eff < _LEAST_FOUND)
     return particles
 
@@ -321,12 +325,13 @@ def _size(kind: HypothesisKind, probability: float, n_particles: int) -> int:
     return n_particles if probability >= _IMPROBABLE else n_particles // _FEWER
 
 
-def _shares(log_odds: FloatArray) -> FloatArray:
+def _normalised(log_odds: FloatArray) -> FloatArray:
+    """Return probabilities in the ratios of exp(log_odds), summing to one."""
     share = np.exp(log_odds - log_odds.max())
     return np.asarray(share / share.sum())
 
 
-def _without_doubt(
+def _reestimated_where_doubtful(
     now: Posterior,
     problems: list[SensorProblem],
     n: int,
@@ -361,14 +366,17 @@ def _most_doubtful(now: Posterior, settled: set[int], most_off: float) -> int | 
             continue
         odds = log_odds[k] - float(logsumexp(others))
         doubt = 2 * particles.log_z_error + (_CARRIED if particles.n_resampled else 0.0)
-        off[k] = max(abs(_share(odds + way * doubt) - _share(odds)) for way in (-1, 1))
-        may_be_right = _share(odds + _STRAINED) > _LOST and _share(odds - _STRAINED) < 1 - _LOST
-        if particles.strained and (_share(odds) > _HAS_A_SAY if doubted else may_be_right):
+        p, low, high = (_probability_of_log_odds(odds + by) for by in (0.0, -doubt, doubt))
+        off[k] = max(p - low, high - p)
+        least, most = (_probability_of_log_odds(odds + by) for by in (-_STRAINED, _STRAINED))
+        may_be_right = most > _LOST and least < 1 - _LOST
+        if particles.strained and (p > _HAS_A_SAY if doubted else may_be_right):
             off[k] = 1.0
     return int(off.argmax()) if off.max() > most_off else None
 
 
-def _share(odds: float) -> float:
+def _probability_of_log_odds(odds: float) -> float:
+    """Return the probability with these log odds."""
     return float(expit(odds))
 
 
@@ -380,7 +388,7 @@ def _reestimated(
     if not particles.strained:
         found = bridged(had, problem, rng=rng, n_draws=n)
         if abs(found.log_z - had.log_z) < _TOLD_APART:
-            return _from_here(particles, found)
+            return _restarted(particles, found)
     try:
         run = from_scratch(problem)
     except NotConvergedError:  # no hypothesis of this kind could have given the readings
@@ -390,19 +398,19 @@ def _reestimated(
         points = np.concatenate([points, had.samples(n // 2, rng=rng)])
     drawn = redrawn(points, problem.prior.names, problem, rng=rng, n_draws=2 * n)
     fresh = sampled(replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng)
-    fresh = _from_here(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=n))
+    fresh = _restarted(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=n))
     return replace(fresh, weighted=replace(fresh.weighted, run=run), refitted=True)
 
 
-def _weighed_again(particles: Particles, problem: SensorProblem, rng: np.random.Generator) -> Particles:
+def _with_bridged_evidence(particles: Particles, problem: SensorProblem, rng: np.random.Generator) -> Particles:
     """Re-estimate the evidence of hurried samples by bridge sampling; the moved samples themselves are valid."""
     found = bridged(particles.weighted, problem, rng=rng, n_draws=min(2 * len(particles.ancestor), _DRAWS))
     return (
-        replace(_from_here(particles, found), strained=particles.strained) if math.isfinite(found.log_z) else particles
+        replace(_restarted(particles, found), strained=particles.strained) if math.isfinite(found.log_z) else particles
     )
 
 
-def _from_here(particles: Particles, found: Bridged) -> Particles:
+def _restarted(particles: Particles, found: Bridged) -> Particles:
     """Return the samples with a new evidence as an independent start."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)

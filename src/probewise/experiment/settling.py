@@ -57,10 +57,11 @@ def settling(
     `known` says whether the posterior knows the shape. The second value returned says whether a reading is to be taken
     even so.
 
-    Candidates are the designs with the largest information, those at edges and centres of probable shapes, earlier
-    places, and some random ones.
+    Candidates are the designs with the largest information, those at edges and centres of probable shapes and on the
+    far side, earlier places, and some random ones.
     """
-    if prospect.goal is None:
+    goal = prospect.goal
+    if goal is None:
         return utilities, False
     theta, lengths, weight = _draw_hypotheses(experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng)
     spread = weight @ (lengths - weight @ lengths) ** 2
@@ -74,26 +75,27 @@ def settling(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
     names = np.array([kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own])
-    named = bits_of_names(weight, answers, names, prospect.readout)
-    bits = _expected_bits(weight, answers, prospect)
     seen = np.ones(len(rows), dtype=np.bool_) if outline is None else outline.seen_with(places_of(prospect)[rows])
+    if known and not far:
+        utility = bits_of_names(weight, answers, names, prospect.readout)
+        return _map(prospect, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
+    utility = _expected_bits(weight, answers, prospect)
     if known:
         # The far side first: it has to be read in any case, and tells something about the names too.
-        if len(far):
-            there = seen if seen.any() else np.isin(rows, far)
-            return _map(prospect, utilities, rows, np.where(there, np.maximum(bits, _LEAST_BITS), 0.0), FAR_SIDE), True
-        return _map(prospect, utilities, rows, named, NAMES), bool(named.max() >= ENOUGH_BITS)
-    utility, label = bits, _LABEL
+        there = seen if seen.any() else np.isin(rows, far)
+        return _map(prospect, utilities, rows, np.where(there, np.maximum(utility, _LEAST_BITS), 0.0), FAR_SIDE), True
     order = np.argsort(-utility, kind="stable")
     best = np.unique(np.concatenate([order[:_ENDING], order[seen[order]][:_ENDING]]))
     chance = _probability_of_knowing(
-        lengths, weight, answers[:, best], prospect, prospect.goal.sd, OFF_SDS * experiment.stop_sd_mm
+        lengths, weight, answers[:, best], prospect, goal.sd, OFF_SDS * experiment.stop_sd_mm
     )
-    if chance.max() >= _LEAST_CHANCE:
-        utility, label = np.zeros(len(utility)), _ENDS
-        # Another reading has to follow where the far side is left; of two that are alike, the one that tells names.
-        utility[best] = chance * np.where(seen[best], 1.0, _UNSEEN) + named[best]
-    return _map(prospect, utilities, rows, utility, label), False
+    if chance.max() < _LEAST_CHANCE:
+        return _map(prospect, utilities, rows, utility, _LABEL), False
+    # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
+    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_of_names(
+        weight, answers[:, best], names, prospect.readout
+    )
+    return _map(prospect, utilities, rows[best], ends, _ENDS), False
 
 
 def _map(prospect: Prospect, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str) -> UtilityMap:

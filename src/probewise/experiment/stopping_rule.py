@@ -63,14 +63,14 @@ def chance_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> fl
     return float(weight[off].sum() / weight.sum())
 
 
-def learnt(experiment: Experiment, posterior: Weighted) -> dict[str, tuple[float, float]]:
+def sensor_moments(experiment: Experiment, posterior: Weighted) -> dict[str, tuple[float, float]]:
     """Return posterior mean and sd of the sensor's parameters by name; empty if the sensor is known."""
     n_sensor = int(experiment.shape_columns[0])
     mean, sd = posterior.mean(), posterior.sd()
     return {name: (float(mean[k]), float(sd[k])) for k, name in enumerate(experiment.names[:n_sensor])}
 
 
-def fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
+def goodness_of_fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
     """Return the p-value of the best hypothesis (upper tail of chi-square), and its worst-fitting reading.
 
     It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.
@@ -83,7 +83,7 @@ def fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> 
     return float(chdtrc(max(int(recording.usable.sum()), 1), float(z @ z))), int(np.argmax(np.abs(z)))
 
 
-def doubt(p_value: float, worst: int, readings: Sequence[Reading]) -> str:
+def doubt_message(p_value: float, worst: int, readings: Sequence[Reading]) -> str:
     """Return the message that no hypothesis explains the readings, with the worst-fitting one."""
     return (
         f"no hypothesis explains the readings: the best has p = {p_value:.1g} and is worst at reading {worst + 1} "

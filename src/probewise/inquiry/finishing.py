@@ -79,6 +79,6 @@ def _probability_of_ending(prospect: Prospect, goal: Goal, designs: IntArray) ->
     given = GivenReading(answers, share, prospect.readout)
     ends = np.ones(given.mass.shape, dtype=np.bool_)
     for length in away.T:
-        mean = given.sum(length) / given.mass
-        ends &= given.sum(length**2) / given.mass - mean**2 < goal.sd**2
+        mean = given.sum_by_cell(length) / given.mass
+        ends &= given.sum_by_cell(length**2) / given.mass - mean**2 < goal.sd**2
     return np.asarray((given.mass * ends).sum(axis=1) / given.mass.sum(axis=1))

@@ -41,9 +41,9 @@ class GivenReading:
     @cached_property
     def mass(self) -> FloatArray:
         """Total weight in each cell, (n_designs, n_cells); never 0."""
-        return np.maximum(self.sum(np.ones(len(self._weight))), _LEAST)
+        return np.maximum(self.sum_by_cell(np.ones(len(self._weight))), _LEAST)
 
-    def sum(self, values: FloatArray) -> FloatArray:
+    def sum_by_cell(self, values: FloatArray) -> FloatArray:
         """Sum weight times value, (n,), over the hypotheses in each cell, (n_designs, n_cells)."""
         return np.asarray(by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
 

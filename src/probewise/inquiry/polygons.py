@@ -19,7 +19,7 @@ _LEAST = np.float32(1e-9)
 
 
 @dataclass(frozen=True, eq=False)
-class Polygons:
+class EdgesInFootprintSds:
     """Edges of polygons as half-planes, in sds of each Gaussian of the footprint across the edge.
 
     Distance inside edge k = across x + up y + offset, arrays (n_gaussians, n_edges, n_polygons). `opening` numbers

@@ -12,7 +12,7 @@ from scipy.special import ndtri
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.ellipses import Ellipses
 from probewise.inquiry.grid import Grid
-from probewise.inquiry.polygons import Polygons
+from probewise.inquiry.polygons import EdgesInFootprintSds
 from probewise.inquiry.scanlines import ROWS, Interval, Spans, single, whole
 from probewise.inquiry.unit_gaussian import REACH
 from probewise.scene import EllipseRegion, MixtureOfRegions, PolygonRegion, Region
@@ -130,4 +130,8 @@ def _by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
 def _kind_of(region: Region, footprint: FixedMixture) -> _SameShapes | None:
     if not isinstance(region, (EllipseRegion, PolygonRegion)) or (region.outside, region.inside) != (0.0, 1.0):
         return None
-    return Ellipses.of(region, footprint) if isinstance(region, EllipseRegion) else Polygons.of(region, footprint)
+    return (
+        Ellipses.of(region, footprint)
+        if isinstance(region, EllipseRegion)
+        else EdgesInFootprintSds.of(region, footprint)
+    )

@@ -27,7 +27,7 @@ class Budget:
             if not require_number(name, getattr(self, name)) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
-    def less(self, plan: Plan, after_s: float) -> Budget:
+    def minus(self, plan: Plan, after_s: float) -> Budget:
         """Subtract the cost of a plan that begins after a time; the budget stays at 0 or more."""
         return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes(plan, after_s), 0.0))
 

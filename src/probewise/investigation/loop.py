@@ -107,7 +107,7 @@ def _rounds(
         yield Round(number, recordings[-1], asked, diagnosis, reason, settled is not None)
         if reason is not None or following is None or affordable is None:
             return
-        budget = budget.less(affordable, over_s)
+        budget = budget.minus(affordable, over_s)
         asked, wanted = following.description, affordable
 
 

@@ -35,7 +35,7 @@ from probewise.experiment.checking import ENOUGH_BITS, NAMES, Outline, bits_of_n
 from probewise.experiment.method import from_scratch
 from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
 from probewise.experiment.posterior import prior_posterior, reconsidered, updated
-from probewise.experiment.refitted import fits, refitted
+from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
@@ -450,8 +450,8 @@ def test_a_rival_whose_samples_went_astray_is_found_from_what_others_believe(dou
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     lost = replace(prior_posterior([kind], 500, rng=rng).particles[0].weighted, log_z=-1000.0)
-    fitted = fits(kind, problem, [donor], noise_sd=1.0, rng=rng)
-    found = refitted(fitted, problem, lost, n_draws=2000, with_own=False, rng=rng)
+    fitted = fit_kind(kind, problem, [donor], noise_sd=1.0, rng=rng)
+    found = sampled_about_fits(fitted, problem, lost, n_draws=2000, with_own=False, rng=rng)
     assert found is not None
     assert found.log_z == pytest.approx(right.log_z, abs=4 * math.hypot(found.log_z_error, right.log_z_error))
     assert found.mean()[3] == pytest.approx(6.0, abs=4 * found.sd()[3])
@@ -464,7 +464,7 @@ def test_what_fits_promise_is_the_evidence(doubting):
     right = from_scratch(problem, 200, rng)
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
-    assert fits(kind, problem, [donor], noise_sd=1.0, rng=rng).highest == pytest.approx(right.log_z, abs=3.0)
+    assert fit_kind(kind, problem, [donor], noise_sd=1.0, rng=rng).highest_log_z == pytest.approx(right.log_z, abs=3.0)
 
 
 def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch):
@@ -477,17 +477,17 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
         now = updated(now, recording.take(np.arange(n)), 3000, rng=rng, from_scratch=solved)
     once = reconsidered(now, recording, 3000, rng=rng, from_scratch=solved)
     done = [kind for kind, p in zip(kinds, once.particles, strict=True) if p.refitted]
-    ruled_out = {kind: p for kind, p in zip(kinds, once.particles, strict=True) if math.isfinite(p.ceiling)}
+    ruled_out = {kind: p for kind, p in zip(kinds, once.particles, strict=True) if math.isfinite(p.log_z_limit)}
     assert done
     assert ruled_out
-    assert all(p.ceiling >= p.log_z for p in ruled_out.values())
+    assert all(p.log_z_limit >= p.log_z for p in ruled_out.values())
 
     def fitted(kind, *args, **options):
         assert kind not in done
         assert kind not in ruled_out
-        return fits(kind, *args, **options)
+        return fit_kind(kind, *args, **options)
 
-    monkeypatch.setattr(posterior, "fits", fitted)
+    monkeypatch.setattr(posterior, "fit_kind", fitted)
     reconsidered(once, recording, 3000, rng=rng, from_scratch=solved)
 
 
@@ -503,10 +503,10 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
         return from_scratch(problem, 100, rng)
 
     def by_few(found, problem, own, *, n_draws, with_own, rng):
-        weighted = refitted(found, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
+        weighted = sampled_about_fits(found, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
         return replace(weighted, n_eff=7.0)
 
-    monkeypatch.setattr(posterior, "refitted", by_few)
+    monkeypatch.setattr(posterior, "sampled_about_fits", by_few)
     plain, lost = (replace(p, weighted=replace(p.weighted, log_z=-1000.0)) for p in now.particles)
     now = replace(now, particles=(plain, lost))
     found = reconsidered(now, recording, 3000, rng=rng, from_scratch=from_nothing)

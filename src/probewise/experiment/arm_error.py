@@ -1,13 +1,13 @@
-"""What an error of the arm's geometry does to a shape that was found.
+"""Effect of an error in the arm's geometry on the posterior of the shape.
 
-A geometry that was fitted to marks is off by one error that all readings of a run share: where the sensor truly stood
-when it was told to stand there. No reading of the run shows that error, it moves the whole shape. The shape's posterior
-mean moves by the covariance, over the posterior, of the parameters with the slope of the log likelihood by the error
-(exact to first order, for any likelihood); so the samples that the run ends with tell it, without another inference.
+A geometry fitted to marks has one error that all readings of a run share: the sensor stood elsewhere than commanded. No
+reading of the run shows that error; it moves the whole shape. To first order, for any likelihood, the posterior mean
+of the shape moves by the posterior covariance of its parameters with the slope of the log likelihood by the error. So
+the samples at the end of a run suffice, without another inference.
 
-Where the log likelihood is quadratic, its slope by the error is a linear function of its slopes by the shape's
-parameters, and the coefficients are the answer, however few the samples. So these slopes serve as control variates:
-their covariance with the parameters is known, minus one each (Stein's identity), and the samples tell the rest alone.
+If the log likelihood is quadratic, its slope by the error is a linear function of its slopes by the shape's parameters,
+and the coefficients are the answer, however few the samples. So these slopes serve as control variates: their
+covariance with the parameters is known, minus one each (Stein's identity), and the samples only estimate the rest.
 """
 
 from __future__ import annotations
@@ -45,22 +45,22 @@ def with_arm_error(
     calibrated_mm: tuple[float, float] | None = None,
     rng: np.random.Generator,
 ) -> Exploration:
-    """Add the error of the arm's geometry to what a run that has ended claims of its shape.
+    """Widen the posterior of a run that has ended by the error of the arm's geometry.
 
-    A run whose experiment has a `fitted_arm` has it already, and its stopping rule counts it.
+    If the run's experiment has a `fitted_arm`, its posterior and stopping rule include that error already.
 
     Parameters
     ----------
     run
-        The run, whose readings tell the places that the arm knows of.
+        The run; its readings hold the places that the arm reported.
     geometry, levels, calibrated_mm
         See `FittedArm`.
     rng
-        Draws the errors by which posterior samples are moved.
+        Source of the errors, drawn for each posterior sample.
 
     Returns
     -------
-    The run, its `posterior` and `sd` as wide as readings and arm together leave the shape.
+    The run with `posterior` and `sd` of readings and arm together.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def arm_error(
     likely_shape: str,
     rng: np.random.Generator,
 ) -> ArmError:
-    """Tell what the error of the arm's geometry does to the shape.
+    """Compute by how much the error of the arm's geometry moves and widens the posterior of the shape.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ def arm_error(
     mean, sd, likely_shape
         Moments of the shape's parameters, (n_params,) each, and the label of the most probable shape, see `Step`.
     rng
-        Draws the errors by which posterior samples are moved.
+        Source of the errors, drawn for each posterior sample.
 
     Raises
     ------
@@ -127,7 +127,7 @@ def arm_error(
         falls = geometry.light_per_mm * white / (white - dark)
     # From here on what the light does stands for the height: the share by which light above black rises.
     off[:, 2] *= -falls
-    slopes = _moved_by(experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape)
+    slopes = _mean_shifts(experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape)
     theta = posterior.theta[:, experiment.shape_columns]
     return ArmError(slopes, moved_by_arm(experiment, slopes, theta, likely_shape, rng=rng))
 
@@ -143,7 +143,7 @@ def moved_by_arm(
 
 
 def _effect_of_errors(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
-    """Tell what independent errors of one sd do to x, y, height and orientation at places: (n_points, 4, n_errors)."""
+    """Return the change of x, y, height and orientation at places by each error of one sd: (n_points, 4, n_errors)."""
     root = _matrix_root(np.array(accuracy.covariance))
     place = slopes_mm(geometry, places_mm) @ root
     if not np.isfinite(place).all():
@@ -153,14 +153,14 @@ def _effect_of_errors(geometry: Geometry, places_mm: FloatArray, accuracy: Accur
 
 
 def _matrix_root(covariance: FloatArray) -> FloatArray:
-    """Write a covariance as a product of a matrix (n, n_errors) with its transpose."""
+    """Return a matrix, (n, n_errors), whose product with its transpose is the covariance."""
     scale = np.sqrt(np.diagonal(covariance))
     scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _moved_by(
+def _mean_shifts(
     experiment: Experiment,
     posterior: Posterior,
     recording: Recording,
@@ -186,8 +186,8 @@ def _moved_by(
         theta = particles.weighted.theta[some]
         thetas.append(theta[:, own])
         weights.append(probability * particles.weighted.weight[some])
-        by_error.append(_by_error(kind, theta, recording, off, dark))
-        by_shape.append(_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
+        by_error.append(_slopes_by_error(kind, theta, recording, off, dark))
+        by_shape.append(_slopes_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
     theta, slope, known = (_centred(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
@@ -202,10 +202,10 @@ def _centred(columns: FloatArray, weight: FloatArray) -> FloatArray:
     return columns - weight @ columns
 
 
-def _by_shape(
+def _slopes_by_shape(
     kind: HypothesisKind, theta: FloatArray, recording: Recording, columns: IntArray, steps: FloatArray
 ) -> FloatArray:
-    """Give the slope of each hypothesis's log likelihood by each parameter of the shape, (n_samples, n_columns)."""
+    """Differentiate each hypothesis's log likelihood by each parameter of the shape: (n_samples, n_columns)."""
     problem, slopes = kind.problem(recording), []
     for column, step in zip(columns.tolist(), steps.tolist(), strict=True):
         up, down = theta.copy(), theta.copy()
@@ -215,10 +215,10 @@ def _by_shape(
     return np.stack(slopes, axis=-1)
 
 
-def _by_error(
+def _slopes_by_error(
     kind: HypothesisKind, theta: FloatArray, recording: Recording, off: FloatArray, dark: float
 ) -> FloatArray:
-    """Give the slope of each hypothesis's log likelihood by each independent error, (n_samples, n_errors)."""
+    """Differentiate each hypothesis's log likelihood by each independent error: (n_samples, n_errors)."""
     plan, usable = recording.plan, recording.usable
     predicted = kind.model.predict(theta, plan)
 

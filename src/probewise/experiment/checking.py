@@ -1,8 +1,8 @@
 """Readings of a run that knows its shape: what the sensor leaves out, and the side of the shape that nobody has seen.
 
-A dozen readings that fit the plain sensor leave most faults open, and some of these a single further reading would
-show. And a shape that is known from one side alone is known by the sensor model alone: a fault of no known name may
-have put its far side anywhere. Both are asked before a run with doubt ends.
+A dozen readings that fit the plain sensor leave most faults open, and a single further reading would show some of them.
+And the far side of a shape that was read from one side follows from the sensor model alone: a fault outside the
+vocabulary may have put it anywhere. A run that doubts its sensor checks both before it ends.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ class OneScan:
     def __post_init__(self) -> None:
         if not 0 < self.sd_floor < self.sd_ceiling < math.inf:
             raise ParameterError(
-                "sd_floor, sd_ceiling", (self.sd_floor, self.sd_ceiling), "0 < floor < ceiling, finite"
+                "sd_floor, sd_ceiling", (self.sd_floor, self.sd_ceiling), "0 < floor < log_z_limit, finite"
             )
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
@@ -259,7 +259,7 @@ class Experiment:
 
     @cached_property
     def forecast(self) -> Forecast:
-        """Predictions for many hypotheses at once, cached."""
+        """Predictor of readings for many hypotheses at many designs, by tables where possible; built once."""
         if self.calibrated_height_mm is None:
             return forecast_of(self.model)
         return forecast_of(self.model, highest=max(self.heights_mm) / self.calibrated_height_mm)

@@ -1,4 +1,4 @@
-"""An arm whose geometry was fitted to marks: how well it knows where its sensor stands, and what that does to light."""
+"""An arm whose geometry was fitted to marks: its accuracy, and what an error of its height does to the light."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from probewise.errors import ParameterError
 
 @dataclass(frozen=True, eq=False)
 class FittedArm:
-    """What is known of the arm of a run, so that its own error counts in what the run claims.
+    """Geometry of a run's arm and levels of its sensor, so that the stated sds include the arm's own error.
 
     Parameters
     ----------
     geometry
         The arm's, fitted to marks.
     levels
-        What the sensor reads over black and over white: light above black falls with the height, as the geometry says
-        or, where it does not, with the square.
+        Readings over black and over white. Light above black falls with the height as the geometry says, otherwise with
+        its square.
     calibrated_mm
-        Where on the field this arm took the readings that the sensor was calibrated by: an error of the height there is
-        in the sensor's levels already. By default in the field's middle, as `arm record` does.
+        Place on the field where this arm took the readings of the calibration: the sensor's levels include the error of
+        the height there. Default: the middle of the field, as in `arm record`.
     """
 
     geometry: Geometry

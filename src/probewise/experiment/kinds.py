@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.effects import Estimated
 from probewise.errors import ParameterError
-from probewise.experiment.pace import Told
+from probewise.experiment.pace import EffectWithSentence
 from probewise.experiment.rivals import Rival
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import TabulatedChain
@@ -55,7 +55,7 @@ class HypothesisKind:
     likelihood: Likelihood
     placed: Callable[[FloatArray, np.random.Generator], FloatArray]
     whole_names: tuple[str, ...]
-    effect: Told | None = None
+    effect: EffectWithSentence | None = None
 
     def problem(self, recording: Recording) -> SensorProblem:
         """Set up the inference of this kind from a recording."""
@@ -119,7 +119,7 @@ def kinds_of(
 
 
 def _with_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior, SensorModel]:
-    """Return prior and model with the estimated effects of a repaired sensor among the parameters."""
+    """Add the effects that a repair estimated to prior and model, as parameters with the priors that it found."""
     estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
     if not estimated or not isinstance(chain, Chain):
         return own, quick

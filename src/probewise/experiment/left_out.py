@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise.calibration import FittedSensor
 from probewise.effects import AmbientStep, GainDrift, OffsetDrift, spoken_name
-from probewise.experiment.pace import clocked
+from probewise.experiment.pace import in_seconds
 from probewise.experiment.rivals import WITH_CARDS
 from probewise.experiment.state import Step
 
@@ -79,11 +79,11 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
     if p < _NAMED:
         said = f"Something may be left out, most probably {spoken_name(name)} (probability {p:.3g})."
     else:
-        said = f"The sensor model leaves something out: {_said(last, name)} (probability {p:.3g})."
+        said = f"The sensor model leaves something out: {_sentence_of(last, name)} (probability {p:.3g})."
     return LeftOut(probability, wary, f"{said}{beside} {aliases}".strip())
 
 
-def _said(last: Step, name: str) -> str:
+def _sentence_of(last: Step, name: str) -> str:
     """Describe an effect, with its numbers if it has any."""
     best = max(
         (k for k, kind in enumerate(last.kinds.kinds) if kind.left_out == name), key=lambda k: last.kinds.log_odds[k]
@@ -93,7 +93,7 @@ def _said(last: Step, name: str) -> str:
         return spoken_name(name)
     own = slice(-len(kind.effect.prior.names), None)
     posterior = last.kinds.particles[best].weighted
-    mean, sd = (clocked(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd()))
+    mean, sd = (in_seconds(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd()))
     return kind.effect.sentence(mean, sd)
 
 
@@ -112,7 +112,7 @@ def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> F
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
     n_own, n = len(effect.prior.names), len(sensor.samples)
-    own = clocked(effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace)
+    own = in_seconds(effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace)
     return replace(
         sensor,
         names=(*sensor.names, *(f"{name}.{parameter}" for parameter in effect.prior.names)),

@@ -33,7 +33,7 @@ from probewise.experiment.journal import (
 )
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import prior_posterior
-from probewise.experiment.settling import settling
+from probewise.experiment.settling import utility_near_end
 from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
 from probewise.experiment.stopping_rule import (
     OFF_SDS,
@@ -50,7 +50,7 @@ from probewise.nested.importance import Weighted
 
 
 def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generator) -> ExplorationState:
-    """Choose the first place, by the map of hypotheses drawn from the prior.
+    """Return the state before the first reading: draws from the prior, and the pose that promises most by them.
 
     Parameters
     ----------
@@ -151,10 +151,12 @@ def step(
 
     arm = arms() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
     known, off = _is_known(experiment, posterior, arm, likely, rng)
-    prospect, utilities = inquire(experiment, posterior, drawn, field, at=reading, goal=_remaining_sd(experiment, arm))
+    prospect, utilities = inquire(
+        experiment, posterior, drawn, field, at=reading, goal=_remaining_goal(experiment, arm)
+    )
     asks = False
     if experiment.trust < 1:
-        utilities, asks = settling(experiment, wary, prospect, utilities, readings, rng=rng, known=known)
+        utilities, asks = utility_near_end(experiment, wary, prospect, utilities, readings, rng=rng, known=known)
         asks = asks and (max_readings is None or len(readings) < max_readings)
     if arm is None and (utilities.flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = arms()
@@ -187,8 +189,8 @@ def step(
     return ExplorationState(readings, carried, pose, tuple(planned)), info
 
 
-def _remaining_sd(experiment: Experiment, arm: ArmError | None) -> Goal | None:
-    """Return the sd that the readings have to reach, beside the arm's own error; None: the experiment's own."""
+def _remaining_goal(experiment: Experiment, arm: ArmError | None) -> Goal | None:
+    """Return the goal that the arm's own error leaves to the readings; None: the experiment's own."""
     goal = experiment.goal
     if arm is None or goal is None:
         return None

@@ -41,7 +41,7 @@ class Method(Protocol):
         ...
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Sample anew what earlier readings may have led astray, before a run with doubt in its sensor ends."""
+        """Sample rivals again whose samples may have lost the truth; called before a run with doubt ends."""
         ...
 
     def drawn(

@@ -63,7 +63,7 @@ class Tailed:
         narrow = _log_density_of_each(readings, predicted, self.sd, self.step)
         nodes = []
         for share, size in zip(self.shares, self.sizes, strict=True):
-            wide = _about(readings, predicted, self.sd * size, self.step)
+            wide = _log_density_if_wide(readings, predicted, self.sd * size, self.step)
             nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
         return _mean_over(nodes)
 
@@ -156,7 +156,9 @@ class Flickering:
         nodes = []
         for amplitude in self.amplitudes:
             sd = math.hypot(self.sd, _PER_PHASE * amplitude)
-            phases = [_about(readings, predicted + amplitude * sine, sd, self.step) for sine in sines.tolist()]
+            phases = [
+                _log_density_if_wide(readings, predicted + amplitude * sine, sd, self.step) for sine in sines.tolist()
+            ]
             nodes.append(_mean_over(phases).sum(axis=1))
         return _mean_over(nodes)
 
@@ -235,8 +237,11 @@ def _log_density_of_each(
     return np.asarray(log_density(level, readings, predicted) + math.log(step))
 
 
-def _about(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
-    """Return the same for noise wider than the cell, by the density at the cell's middle with its variance added."""
+def _log_density_if_wide(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
+    """Return what `_log_density_of_each` does, quickly if the noise is wider than the cell.
+
+    Then the density at the middle of the cell is used, with the variance of a uniform cell added.
+    """
     if sd < step:
         return _log_density_of_each(readings, predicted, sd, step)
     wide = math.hypot(sd, step / math.sqrt(12.0))

@@ -26,7 +26,7 @@ _COLUMN = "paced_s"
 
 @dataclass(frozen=True)
 class Pace:
-    """Start time of a run, and mean seconds per reading."""
+    """Start time of a run in seconds, and mean seconds per reading."""
 
     start_s: float = 0.0
     each_s: float = EACH_S
@@ -53,19 +53,19 @@ def run_time_s(plan: Plan) -> FloatArray | None:
     return plan.covariates.get(_COLUMN)
 
 
-class Told(Effect[Any], Protocol):
-    """An effect that can say what it does."""
+class EffectWithSentence(Effect[Any], Protocol):
+    """An effect with a sentence that describes it."""
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say it, of its parameters' posterior means and sds."""
+        """Describe the effect, given posterior means and sds of its parameters."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class Paced(WrappedEffect[FloatArray]):
-    """An effect in time, in the run's own time: its prior, and its formula if the plan has that time."""
+    """An effect that uses the run's own time: for its prior and, if the plan has that time, for its formula."""
 
-    effect: Told
+    effect: EffectWithSentence
 
     powers: ClassVar[Mapping[str, int]] = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 
@@ -88,7 +88,7 @@ class Paced(WrappedEffect[FloatArray]):
 class FromRest(WrappedEffect[Any]):
     """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
 
-    effect: Told
+    effect: EffectWithSentence
 
     def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
         """Apply the effect to all readings but the run's first."""
@@ -109,6 +109,6 @@ class FromRest(WrappedEffect[Any]):
         return self.effect.sentence(mean, sd)
 
 
-def clocked(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
+def in_seconds(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
     """Return an effect's parameters in seconds, whether or not it is `Paced`."""
     return effect.by_the_clock(theta, pace) if isinstance(effect, Paced) else theta

@@ -82,7 +82,7 @@ class NestedSampling:
         return f"the paper's: nested sampling anew after each reading, {self.n_live} live points"
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """See `Method.updated`; every kind of hypotheses has its own run."""
+        """See `Method.updated`: nested sampling anew, once for each kind of hypotheses."""
         found = tuple(
             self._sampled_anew(had, kind, recording, rng)
             for kind, had in zip(previous.kinds, previous.particles, strict=True)
@@ -93,7 +93,7 @@ class NestedSampling:
         return now
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """See `Method.reconsidered`; nothing is carried that could be led astray."""
+        """See `Method.reconsidered`; return the posterior as it is, since every reading starts anew."""
         return posterior
 
     def drawn(

@@ -34,21 +34,30 @@ _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 
 @dataclass(frozen=True)
-class Effort:
-    """Accepted steps per sample to aim for, number of kernels, least effective share of the samples, most temperatures.
+class MoveEffort:
+    """Effort of an update by one reading.
 
-    Samples that need more temperatures for one reading are far from where it leads, and are marked as strained.
+    Attributes
+    ----------
+    steps_per_sample
+        Accepted Metropolis-Hastings steps per sample to aim for.
+    n_kernels
+        Number of kernels that propose them.
+    least_share
+        Least effective share of the samples without resampling.
+    most_temperatures
+        Largest number of temperatures. Samples that need more are far from the new posterior, and marked as strained.
     """
 
-    enough: float
+    steps_per_sample: float
     n_kernels: int
-    keep: float = _KEEP
-    most: float = math.inf
+    least_share: float = _KEEP
+    most_temperatures: float = math.inf
 
 
-THOROUGH = Effort(1.5, MOST_KERNELS)
-STEADY = Effort(1.2, 120, 0.4, 12)
-BRIEF = Effort(1.0, 75, 0.3, 10)
+THOROUGH = MoveEffort(1.5, MOST_KERNELS)
+STEADY = MoveEffort(1.2, 120, 0.4, 12)
+BRIEF = MoveEffort(1.0, 75, 0.3, 10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +82,8 @@ class Particles:
         product of mean weights is nearly always too small.
     refitted
         Whether the samples were found by fits to all readings or from scratch, and have followed those since with ease.
-    ceiling
-        Log evidence that such fits rule out to be exceeded; infinite where they do not.
+    log_z_limit
+        Upper limit of the log evidence by fits that came nowhere near the best kind; infinite if there were none.
     """
 
     weighted: Weighted
@@ -84,7 +93,7 @@ class Particles:
     strained: bool = False
     hurried: bool = False
     refitted: bool = False
-    ceiling: float = math.inf
+    log_z_limit: float = math.inf
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -128,7 +137,7 @@ def update(
     *,
     rng: np.random.Generator,
     fall_back: Callable[[], NestedResult] | None = None,
-    effort: Effort | None = None,
+    effort: MoveEffort | None = None,
 ) -> Particles:
     """Update the samples with the last reading of a problem.
 
@@ -144,7 +153,7 @@ def update(
         Solves the whole problem from scratch, if no sample predicts the reading or they cannot be moved. Without it,
         the samples continue and are marked as strained.
     effort
-        Effort of moves; by default that for a probable kind of hypotheses.
+        MoveEffort of moves; by default that for a probable kind of hypotheses.
 
     Returns
     -------
@@ -153,11 +162,11 @@ def update(
         reading, the evidence is zero and the samples are unchanged.
     """
     last = _LastReading(problem)
-    previous = replace(previous, ceiling=previous.ceiling + last.perfect)
+    previous = replace(previous, log_z_limit=previous.log_z_limit + last.perfect)
     before = previous.weighted
     n = len(before.theta)
     effort = THOROUGH if effort is None else effort
-    least = effort.keep * n
+    least = effort.least_share * n
     if before.log_z == -math.inf:
         return previous
     predicted = problem.model.predict(before.theta, problem.recording.plan)
@@ -166,7 +175,7 @@ def update(
         if fall_back is not None:
             return _from_scratch(fall_back(), n, last, n, rng)
         strained = True
-    now = _Cloud(before.theta, problem.prior.log_prob(before.theta), *last.weigh(predicted))
+    now = _Cloud(before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods(predicted))
     log_weight, base = before.log_weight, before.log_likelihood
     log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
     while True:
@@ -175,7 +184,7 @@ def update(
             if fall_back is not None:
                 return _from_scratch(fall_back(), n, last, n_calls, rng)
             return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
-        given_up = n_resampled - previous.n_resampled >= effort.most
+        given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
         strained |= given_up and all_at_once < least
         share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
         weighed = _reweighed(log_weight, now.at(share), base)
@@ -217,12 +226,12 @@ def update(
         strained,
         hurried,
         previous.refitted and with_ease,
-        previous.ceiling,
+        previous.log_z_limit,
     )
 
 
 def resized(
-    particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: Effort | None = None
+    particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: MoveEffort | None = None
 ) -> Particles:
     """Resample to another number of samples, and move them apart.
 
@@ -243,7 +252,7 @@ def resized(
 
 
 def sampled(
-    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: Effort | None = None
+    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: MoveEffort | None = None
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     last = _LastReading(problem)
@@ -308,7 +317,7 @@ class _LastReading:
         reading = recording.readings[-1:]
         return float(scores(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
 
-    def weigh(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def log_likelihoods(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
         usable = self.problem.recording.usable
         earlier = usable.copy()
@@ -329,7 +338,7 @@ class _LastReading:
         possible = np.isfinite(log_prior)
         if possible.any():
             predicted = problem.model.predict(theta[possible], problem.recording.plan)
-            before[possible], after[possible] = self.weigh(predicted)
+            before[possible], after[possible] = self.log_likelihoods(predicted)
         return _Cloud(theta, log_prior, before, after)
 
 
@@ -345,7 +354,7 @@ def _move(
     last: _LastReading,
     rng: np.random.Generator,
     parts: Sequence[IntArray] | None = None,
-    effort: Effort | None = None,
+    effort: MoveEffort | None = None,
 ) -> tuple[_Cloud, _Moves]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
@@ -371,7 +380,7 @@ def _move(
             now = now.put(taken, proposed)
             n_calls += n
             accepted += float(taken.mean())
-        if accepted >= effort.enough:
+        if accepted >= effort.steps_per_sample:
             break
     return now, _Moves(accepted, n_calls)
 

@@ -23,14 +23,14 @@ from probewise.experiment.particles import (
     BRIEF,
     STEADY,
     THOROUGH,
-    Effort,
+    MoveEffort,
     Particles,
     prior_particles,
     resized,
     sampled,
     update,
 )
-from probewise.experiment.refitted import fits, refitted
+from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import declared_noise
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
@@ -208,7 +208,7 @@ def updated(
 
 
 def _with_last_reading(
-    previous: Posterior, problems: list[SensorProblem], usual: Effort, rng: np.random.Generator
+    previous: Posterior, problems: list[SensorProblem], usual: MoveEffort, rng: np.random.Generator
 ) -> list[Particles]:
     """Take the last reading into every kind, with less effort into improbable rivals."""
     return [
@@ -227,7 +227,7 @@ def reconsidered(
     rng: np.random.Generator,
     from_scratch: FromScratch,
 ) -> Posterior:
-    """Sample every rival anew that might matter, but for those that were before: to be asked before a run ends."""
+    """Sample every rival again that might matter, unless it already was; called before a run ends."""
     problems = [kind.problem(recording) for kind in posterior.kinds]
     now = replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
     return _reestimated_where_doubtful(
@@ -255,7 +255,7 @@ def _sampled_from_others(
         beyond = own.log_z < particles[plain].log_z - _NESTED
         hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
         wanted = (each and not own.refitted) or beyond or own.strained or own.hurried
-        if not wanted or own.ceiling < hopeless:
+        if not wanted or own.log_z_limit < hopeless:
             continue
         best = max(alike, key=lambda j: log_odds[j])
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
@@ -264,7 +264,7 @@ def _sampled_from_others(
         anew = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
         found = anew.samples
         if anew.promised < hopeless:
-            particles[k] = replace(own, ceiling=max(anew.promised, own.log_z) + _RULED_OUT)
+            particles[k] = replace(own, log_z_limit=max(anew.promised, own.log_z) + _RULED_OUT)
             continue
         if found is None or found.n_eff < _FEWEST:
             particles[k] = replace(own, strained=own.strained or own.hurried)
@@ -303,11 +303,13 @@ def _from_others(
         if noise is None:
             return _FromOthers(None)
         sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
-        found = fits(kind, problem, donors, noise_sd=sd, rng=rng)
-        if found.highest < hopeless:
-            return _FromOthers(None, found.highest)
+        found = fit_kind(kind, problem, donors, noise_sd=sd, rng=rng)
+        if found.highest_log_z < hopeless:
+            return _FromOthers(None, found.highest_log_z)
         with_own = own.log_z > hopeless
-        return _FromOthers(refitted(found, problem, own, n_draws=2 * n, with_own=with_own, rng=rng), found.highest)
+        return _FromOthers(
+            sampled_about_fits(found, problem, own, n_draws=2 * n, with_own=with_own, rng=rng), found.highest_log_z
+        )
     n_own = len(kind.prior.names)
     points = [donor.samples(n // 2, rng=rng)[:, :n_own] for donor in donors]
     if own.log_z > hopeless:
@@ -415,4 +417,4 @@ def _restarted(particles: Particles, found: Bridged) -> Particles:
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
     start = Particles(weighted, np.arange(len(had.theta)), found.error**2)
-    return replace(start, refitted=particles.refitted, ceiling=particles.ceiling)
+    return replace(start, refitted=particles.refitted, log_z_limit=particles.log_z_limit)

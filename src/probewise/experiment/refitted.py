@@ -1,4 +1,4 @@
-"""Samples of a kind of hypotheses that do not depend on its own history: refits of what other kinds believe.
+"""Samples of a kind of hypotheses from fits to all readings that start at samples of other kinds.
 
 The samples of a rival may have gathered where the earlier readings led them, with none where the truth is; no later
 reading brings them back. Other kinds have samples there. Each of these, with a size of the effect drawn from its prior,
@@ -72,12 +72,12 @@ class Fits:
         return np.asarray(self.score[self.good] + log_volume)
 
     @property
-    def highest(self) -> float:
-        """The largest of these; minus infinity where there is none."""
+    def highest_log_z(self) -> float:
+        """Largest of `log_z`; minus infinity if no fit is good."""
         return float(self.log_z.max(initial=-math.inf))
 
 
-def fits(
+def fit_kind(
     kind: HypothesisKind,
     problem: SensorProblem,
     donors: Sequence[Weighted],
@@ -85,14 +85,14 @@ def fits(
     noise_sd: float,
     rng: np.random.Generator,
 ) -> Fits:
-    """Fit a kind with an effect on the mean to all readings, from the samples of other kinds.
+    """Fit a kind with an effect on the mean to all readings, starting at samples of other kinds.
 
     Parameters
     ----------
     kind, problem
         The kind and its problem.
     donors
-        Posteriors whose first parameters are the shape's.
+        Posteriors of other kinds, whose first parameters are the shape's.
     noise_sd
         Sd of a reading's noise.
     rng
@@ -171,7 +171,7 @@ def _slopes(
     return np.ascontiguousarray(((there - at_theta) / nudge[:, None, None]).transpose(1, 2, 0))
 
 
-def refitted(
+def sampled_about_fits(
     found: Fits,
     problem: SensorProblem,
     own: Weighted,
@@ -204,15 +204,15 @@ def refitted(
     n_params = found.theta.shape[1]
     best = found.good[np.argsort(-found.log_z)][:_KEPT]
     densities = [LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse(found.precision[best]))]
-    if with_own and len(rows := _distinct(own, n_params, rng)):
+    if with_own and len(rows := _resampled_rows(own, n_params, rng)):
         densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
-    first = _weighed(own, problem, densities, n_draws // 2, rng)
-    if first is None or not len(rows := _distinct(first, n_params, rng)):
+    first = _importance_sampled(own, problem, densities, n_draws // 2, rng)
+    if first is None or not len(rows := _resampled_rows(first, n_params, rng)):
         return first
     # A posterior is more curved than the Gaussians about its fits: once more, about what these have found.
     near = LocalKernels.about(first.theta[rows], rng=rng, most=_KERNELS)
     far = LocalKernels.about(first.theta[rows], rng=rng, widened=_FAR, most=_KERNELS)
-    return _weighed(first, problem, [near, near, far, *densities], n_draws, rng) or first
+    return _importance_sampled(first, problem, [near, near, far, *densities], n_draws, rng) or first
 
 
 def _inverse(precision: FloatArray) -> FloatArray:
@@ -222,13 +222,13 @@ def _inverse(precision: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(precision * both + _JITTER * np.eye(precision.shape[1])) * both)
 
 
-def _distinct(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
+def _resampled_rows(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
     """Resample rows of a posterior; none where too few are distinct to fit kernels."""
     rows = resampled(posterior.weight, len(posterior.theta), rng)
     return rows if len(np.unique(rows)) > 4 * n_params else rows[:0]
 
 
-def _weighed(
+def _importance_sampled(
     own: Weighted, problem: SensorProblem, densities: list[LocalKernels], n: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Sample by importance sampling from an even mixture of densities; None where hardly a draw is possible."""

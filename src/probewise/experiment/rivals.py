@@ -28,7 +28,7 @@ from probewise.effects import (
 )
 from probewise.errors import ParameterError
 from probewise.experiment.noise_rivals import noise_laws
-from probewise.experiment.pace import EACH_S, FromRest, Paced, Told
+from probewise.experiment.pace import EACH_S, EffectWithSentence, FromRest, Paced
 from probewise.experiment.shown import Shown
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
@@ -75,7 +75,7 @@ class Rival:
     """One alternative to the sensor model: an effect on the mean, or another noise model."""
 
     name: str
-    effect: Told | None = None
+    effect: EffectWithSentence | None = None
     likelihood: Likelihood | None = None
 
 
@@ -118,7 +118,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     return tuple(found)
 
 
-def _ways(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[Told]:
+def _ways(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[EffectWithSentence]:
     """List the ways in which an effect may act in a run: one that changes with time does so at the run's own pace."""
     if effect.name in OF_MOTION:
         return [Shown(effect, field_mm), FromRest(Shown(effect, field_mm))]

@@ -42,7 +42,7 @@ _LABEL = "expected information about the shape and what the sensor leaves out (b
 _ENDS = "probability that a reading there ends the run, and bits about what the sensor leaves out"
 
 
-def settling(
+def utility_near_end(
     experiment: Experiment,
     posterior: Posterior,
     prospect: Prospect,
@@ -54,8 +54,8 @@ def settling(
 ) -> tuple[UtilityMap, bool]:
     """Return the map of the utility over designs for all kinds, or the given one far from the end.
 
-    `known` says whether the posterior knows the shape. The second value returned says whether a reading is to be taken
-    even so.
+    `known` says whether the posterior meets the stopping rule. The second value returned says whether the run has to
+    take another reading even so.
 
     Candidates are the designs with the largest information, those at edges and centres of probable shapes and on the
     far side, earlier places, and some random ones.
@@ -67,7 +67,7 @@ def settling(
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return utilities, False
-    outline = Outline.of(prospect, experiment.shape.region(_middle(experiment, prospect)), readings)
+    outline = Outline.of(prospect, experiment.shape.region(_mean_shape(experiment, prospect)), readings)
     far = () if outline is None or outline.far_side is None else (outline.far_side,)
     rows = np.union1d(_candidates(experiment, prospect, utilities, theta, readings, rng), far).astype(np.int64)
     plan = Pace.of(readings).on(_plan(prospect, rows, readings[-1]))
@@ -106,7 +106,7 @@ def _map(prospect: Prospect, utilities: UtilityMap, rows: IntArray, utility: Flo
     return UtilityMap(prospect.designs, values, utilities.reachable, label)
 
 
-def _middle(experiment: Experiment, prospect: Prospect) -> FloatArray:
+def _mean_shape(experiment: Experiment, prospect: Prospect) -> FloatArray:
     """Return the posterior mean of the shape's parameters, (1, n_params)."""
     theta = prospect.theta[:, experiment.shape_columns]
     return np.asarray((prospect.weight @ theta)[None] / prospect.weight.sum())

@@ -2,7 +2,7 @@
 
 A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small for the dozen readings
 of a run. Such an effect changes neither the readings nor the shape: it counts as nothing left out. A change point
-may come at any of up to a hundred readings, sooner as likely as later in proportion. A patch may lie anywhere on the
+is log-uniform over up to a hundred readings. A patch may lie anywhere on the
 field, not only along scanned lines.
 """
 
@@ -51,5 +51,5 @@ class Shown(WrappedEffect[Any]):
         return self.within_run.get(name, marginal)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say what it does."""
+        """See `EffectWithSentence.sentence`."""
         return self.effect.sentence(mean, sd)

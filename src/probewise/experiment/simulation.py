@@ -21,7 +21,7 @@ from probewise.calibration.sensor_file import require_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
-from probewise.experiment.pace import FromRest, Told
+from probewise.experiment.pace import EffectWithSentence, FromRest
 from probewise.experiment.rivals import OF_MOTION
 from probewise.experiment.sensor_update import AdjustedMixture, sensor_prior
 from probewise.inference import Naive, Rounded
@@ -243,7 +243,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
         values = tuple(means[name] for name in names)
         samples = [sensor.samples[:, sensor.names.index(name)] for name in names]
         if estimated and all(own.std() > 0 for own in samples):
-            acting = FromRest(cast(Told, effect)) if effect.name in OF_MOTION else effect
+            acting = FromRest(cast(EffectWithSentence, effect)) if effect.name in OF_MOTION else effect
             effects.append(Estimated(acting, values, tuple(map(_known_to, samples))))
         else:
             effects.append(Known(effect, values))

@@ -146,7 +146,7 @@ class Step(ShowsItself):
 
 @dataclass(frozen=True, eq=False)
 class ArmError:
-    """What an error of the arm's geometry, one for all readings, does to the shape that was found.
+    """Effect of an error in the arm's geometry, common to all readings, on the posterior of the shape.
 
     Attributes
     ----------
@@ -172,9 +172,9 @@ class Exploration(ShowsItself):
     Attributes
     ----------
     experiment, steps
-        What was asked, and what each reading taught.
+        The configuration, and the result of each reading.
     hidden
-        What lay there, where that is known.
+        The true shape, if it is known.
     """
 
     experiment: Experiment
@@ -183,7 +183,7 @@ class Exploration(ShowsItself):
 
     @property
     def arm(self) -> ArmError | None:
-        """What the arm's own error adds in the end, where that is known."""
+        """The arm's own error after the last reading, if it is known."""
         return self.last.arm
 
     @property
@@ -198,7 +198,7 @@ class Exploration(ShowsItself):
 
     @property
     def posterior(self) -> Weighted:
-        """The weighted posterior after the last reading; with the arm's own error, where that is known."""
+        """The weighted posterior after the last reading, with the arm's own error if that is known."""
         found = self.last.posterior
         if self.arm is None:
             return found
@@ -208,7 +208,7 @@ class Exploration(ShowsItself):
 
     @property
     def sd(self) -> FloatArray:
-        """Posterior sds of the shape's parameters, (n_params,); with the arm's own error, where that is known."""
+        """Posterior sds of the shape's parameters, (n_params,), with the arm's own error if that is known."""
         return self.last.sd if self.arm is None else np.hypot(self.last.sd, self.arm.sd)
 
     @property

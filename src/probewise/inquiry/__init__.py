@@ -1,12 +1,11 @@
 """Choose the next measurement (paper, the machine learning system, figures 3 and 8).
 
-Hypotheses that are still believed predict a reading at every place of a fine grid; where
-their predictions differ most, a reading tells most. The utility of a reading is a small function
-behind one seam, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses; `InformationGain`
-asks the whole posterior and leaves out what is only noise. Thousands of hypotheses are not asked one by one
-(`DirectForecast`) but looked up: discs in a table of the sensor's own (`DiscForecast`), ellipses and convex polygons in
-tables of what the unit Gaussian sees of a corner and of a bent edge (`TabulatedForecast`). An instrument that sees no
-field of shapes has an `Inquiry` over its own settings.
+Samples of the posterior predict a reading at every place of a fine grid; where their predictions differ most, a reading
+tells most. The utility of a reading has one interface, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses;
+`InformationGain` uses the whole posterior and subtracts the entropy of the noise. Readings of thousands of hypotheses
+are looked up: discs in a table of the sensor's response (`DiscForecast`), ellipses and convex polygons in tables of the
+unit Gaussian's mass inside a corner and a bent edge (`TabulatedForecast`); any other model predicts some hundreds
+directly (`DirectForecast`). An instrument without a field of shapes has an `Inquiry` over its own settings.
 """
 
 from probewise.inquiry.any_settings import Inquiry, Predictive, ReadingNoise

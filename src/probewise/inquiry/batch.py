@@ -44,13 +44,13 @@ def choose_several(prospect: Prospect, n: int, *, rng: np.random.Generator) -> t
     few = replace(prospect, theta=prospect.theta[rows], weight=share / share.sum())
     weights = [few.weight] * _OUTCOMES
     for _ in range(n - 1):
-        weights = _after_imagined(few, chosen[-1], weights, rng)
+        weights = _after_simulated(few, chosen[-1], weights, rng)
         gain = np.mean([few.information(weight) for weight in weights], axis=0)
         chosen.append(choose(gain, everywhere, rng=rng))
     return tuple(int(prospect.rows[row]) for row in chosen)
 
 
-def _after_imagined(
+def _after_simulated(
     prospect: Prospect, row: int, weights: list[FloatArray], rng: np.random.Generator
 ) -> list[FloatArray]:
     """Simulate an outcome of one design for each posterior, and update the posterior."""

@@ -95,7 +95,7 @@ class CardedForecast:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """See `Forecast.predict`."""
-        return CardedModel(self.chain, _Predicts(self.base)).predict(theta, plan)
+        return CardedModel(self.chain, _AsModel(self.base)).predict(theta, plan)
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
@@ -113,7 +113,7 @@ class CardedForecast:
 
 
 @dataclass(frozen=True, eq=False)
-class _Predicts:
+class _AsModel:
     """A forecast's predictions as a sensor model's."""
 
     forecast: Forecast

@@ -53,7 +53,7 @@ class CullingBounds:
         outside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
         return cls(frozen(low - reach), frozen(high + reach), float(outside))
 
-    def parts(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
+    def tiles(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
         """Yield tiles of the field: rows of the plan, and the hypotheses visible there."""
         column, row = (np.floor(place / _TILE_MM).astype(np.int64) for place in (plan.x_mm, plan.y_mm))
         tiles = np.unique(np.stack([column, row]), axis=1, return_inverse=True)[1].ravel()

@@ -85,7 +85,7 @@ class DiscTable:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
         fine = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _FINE_MM)) + 1)
-        asked = np.stack([_asked(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)])
+        asked = np.stack([_levels_about(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)])
         asked = np.concatenate([asked, asked[:, :1]], axis=1)
         levels = np.ascontiguousarray(CubicSpline(coarse, asked, axis=-1)(fine))  # so that it is flat for free
         return cls(dark, bright, margin, bends, frozen(levels))
@@ -177,10 +177,10 @@ class DiscTable:
             ring = spans.ring()
             level: IntArray = np.full(len(ring.place), bright)  # a place exactly on the edge is inside
             if margin > 0.0:
-                away = _Away.of(discs, spans, ring, y_mm, turn[start : start + ROWS].ravel())
+                away = _EdgePairs.of(discs, spans, ring, y_mm, turn[start : start + ROWS].ravel())
                 level = nearest.reshape(-1)[self._entry(away)]
             rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
-            mass[rows] = spans.weigh(weight, ring, level, (dark, bright), n_levels)
+            mass[rows] = spans.histogram(weight, ring, level, (dark, bright), n_levels)
         return mass
 
     def _margin_of(self, nearest: IntArray, ends: tuple[int, int]) -> float:
@@ -191,7 +191,7 @@ class DiscTable:
         off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
         return float(np.abs(distance[off]).max(initial=0.0))
 
-    def _entry(self, away: _Away) -> IntArray:
+    def _entry(self, away: _EdgePairs) -> IntArray:
         """Return the index of the table's nearest entry for pairs of disc and place."""
         _, n_directions, n_distances = self.levels.shape
         step = away.distance_mm + np.float32(self.margin_mm)
@@ -238,7 +238,7 @@ def _spans(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) ->
 
 
 @dataclass(frozen=True, eq=False)
-class _Away:
+class _EdgePairs:
     """Pairs of disc and place near its edge, (n_pairs,) each: place relative to the centre in the sensor's frame."""
 
     x_mm: FloatArray
@@ -280,7 +280,7 @@ def _cell(position: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
     return below, position - below
 
 
-def _asked(model: SensorModel, radius_mm: float, directions: FloatArray, distance_mm: FloatArray) -> FloatArray:
+def _levels_about(model: SensorModel, radius_mm: float, directions: FloatArray, distance_mm: FloatArray) -> FloatArray:
     """Evaluate the model at places about one disc, -> (n_directions, n_distances)."""
     away = (radius_mm + distance_mm)[:, None] * directions[:, None, :]
     places = away.reshape(-1, 2)
@@ -294,7 +294,7 @@ def _asked(model: SensorModel, radius_mm: float, directions: FloatArray, distanc
 def _levels(model: SensorModel, radius_mm: float) -> tuple[float, float]:
     """Return the levels far outside and at the middle of a large disc."""
     east = np.array([[1.0, 0.0]])
-    dark, bright = _asked(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
+    dark, bright = _levels_about(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
     if dark == bright:
         raise ParameterError(
             "levels", (dark, bright), "two different levels: a sensor that tells the disc from its surroundings"
@@ -309,7 +309,7 @@ def _margin(
     margin = _COARSE_MM
     for radius in (low_mm, high_mm):
         distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)
-        asked = _asked(model, radius, directions, distance)
+        asked = _levels_about(model, radius, directions, distance)
         off = np.abs(asked - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
         margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
     return margin

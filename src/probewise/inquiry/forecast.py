@@ -136,7 +136,7 @@ def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
     bounds = CullingBounds.of(model, theta, plan)
     if bounds is not None:
         out = np.full((len(theta), len(plan)), bounds.outside)
-        for rows, shown in bounds.parts(plan):
+        for rows, shown in bounds.tiles(plan):
             if shown.size:
                 out[np.ix_(shown, rows)] = model.predict(theta[shown], plan.take(rows))
         return out

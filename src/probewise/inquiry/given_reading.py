@@ -15,7 +15,7 @@ _LEAST = 1e-12
 
 
 class GivenReading:
-    """Sums over the hypotheses given each cell of a reading.
+    """Sums over hypotheses, weighted by their probability of each cell of a reading.
 
     Hypotheses with nearly equal predictions are summed first, so that the noise is applied to some hundred levels
     instead of every hypothesis.
@@ -44,7 +44,7 @@ class GivenReading:
         return np.maximum(self.sum_by_cell(np.ones(len(self._weight))), _LEAST)
 
     def sum_by_cell(self, values: FloatArray) -> FloatArray:
-        """Sum weight times value, (n,), over the hypotheses in each cell, (n_designs, n_cells)."""
+        """Sum weight times value, each with the probability of the cell: values (n,) -> (n_designs, n_cells)."""
         return np.asarray(by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
 
     def joint(self, design: int) -> FloatArray:

@@ -82,7 +82,7 @@ class Spans:
         span[int(count[:n].sum()) :] -= n
         return Ring(span, column, column + whole(self.row * self.grid.n_x)[span])
 
-    def weigh(
+    def histogram(
         self, weight: FloatArray, ring: Ring, level: IntArray, ends: tuple[int, int], n_levels: int
     ) -> FloatArray:
         """Return the weighted histogram of levels at every place of the rows.

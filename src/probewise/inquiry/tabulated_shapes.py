@@ -116,7 +116,7 @@ class TabulatedShapes:
                 seen = crossed.seen(ring.span, single(grid.x_mm)[ring.column])
                 level = whole(lowest + per_share * seen + 0.5)
                 block = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
-                mass[block] += spans.weigh(own, ring, level, ends, n_levels)
+                mass[block] += spans.histogram(own, ring, level, ends, n_levels)
         return mass
 
 

@@ -71,7 +71,7 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
         block = slice(start, start + _BLOCK)
         mixed = np.zeros((len(bits[block]), chance.shape[1]))
         for rival, answer in zip(rivals, answers, strict=True):
-            own = _shares(answer[:, block], levels) @ chance
+            own = _level_distribution(answer[:, block], levels) @ chance
             share = rival.probability / total
             mixed += share * own
             bits[block] -= share * entropy_bits(own)
@@ -79,7 +79,7 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
     return np.maximum(bits, 0.0)
 
 
-def _shares(answers: FloatArray, levels: FloatArray) -> FloatArray:
+def _level_distribution(answers: FloatArray, levels: FloatArray) -> FloatArray:
     """Return the share of samples that predict each level, (n_samples, n_points) -> (n_points, n_levels)."""
     n_samples, n_points = answers.shape
     index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)

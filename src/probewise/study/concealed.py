@@ -26,7 +26,7 @@ from probewise.recordings import Disc
 from probewise.study.circles import FIELD, POPULATIONS
 from probewise.study.rows import REFERENCE
 from probewise.study.table import WRONG_MM, Estimate, share_within
-from probewise.study.trial import BRIGHT, DARK, SEED, experiment_of, judged, reached, spot_of, timed_steps
+from probewise.study.trial import BRIGHT, DARK, SEED, accuracy_of, experiment_of, reached, spot_of, timed_steps
 from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
 from probewise.world.concealed import (
     AlbedoGradient,
@@ -141,7 +141,7 @@ class ConcealedTrial:
 
     @property
     def key(self) -> str:
-        """Name it in the campaign's file."""
+        """Key of the run in the campaign's file."""
         return f"{self.effect or CLEAN} / {self.size} / {self.circle} / {self.trust:g}"
 
 
@@ -164,7 +164,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     return {
         "known": reached(last, experiment),
         "readings": last.number,
-        **judged(last, experiment, trial.truth),
+        **accuracy_of(last, experiment, trial.truth),
         "p_truth": round(left_out.probability.get(trial.name, 0.0), 4),
         "credible": list(left_out.credible_set),
         "noticed": bool(last.p_value < experiment.doubt_p or left_out.leading != CLEAN),

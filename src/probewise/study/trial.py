@@ -56,7 +56,7 @@ class Trial:
 
     @property
     def key(self) -> str:
-        """Name it in the campaign's file."""
+        """Key of the run in the campaign's file."""
         return f"{self.row.name} / {self.circle}"
 
     @property
@@ -131,7 +131,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         "first_white": first_white,
         "bits": round(last.bits, 3),
         "bits_at_white": bits_at_white,
-        **judged(last, experiment, trial.truth),
+        **accuracy_of(last, experiment, trial.truth),
         "arm_s": round(last.reading.time_s, 2),
         "cpu_s": round(float(np.median(cpu)), 4),
         "widest_mm": widest,
@@ -160,7 +160,7 @@ def reached(last: Step, experiment: Experiment) -> bool:
     return bool(last.p_value >= experiment.doubt_p and known)
 
 
-def judged(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
+def accuracy_of(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
     """Compare the last posterior of the shape with the truth, (3,)."""
     columns = experiment.shape_columns
     theta, weight = last.posterior.theta[:, columns], last.posterior.weight

@@ -1,8 +1,8 @@
 """Choose the next setting of any instrument, given a model of its readings, a prior, its settings and its noise.
 
 The paper's machine learning system without a field of shapes: readings update the posterior (`posterior`), and the next
-setting maximises an acquisition function (`worth`): expected information (Lindley 1956) or, near a goal, the expected
-decrease of the posterior sds towards it.
+setting maximises an acquisition function (`Inquiry.utility`): expected information (Lindley 1956) or, near a goal, the
+expected decrease of the posterior sds towards it.
 """
 
 from probewise.inquiry.any_settings.acquisition import Predictive

@@ -193,8 +193,8 @@ class Inquiry(ShowsItself):
             If no hypothesis could have given these readings. The posterior is unchanged.
         """
         value = require_finite_number("reading", reading, "a finite number; leave out a missing reading")
-        at = self._settings.one(self.next() if setting is None else setting)
-        readings = _with(self._readings, self._model, at, value)
+        at = self._settings.parsed(self.next() if setting is None else setting)
+        readings = _appended(self._readings, self._model, at, value)
         theta = self._posterior.theta
         log_density = self._model.log_density(theta, at, np.array([value]))[:, 0]
         self._posterior = updated(self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng)
@@ -289,7 +289,7 @@ def _goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str,
     return dict(goal)
 
 
-def _with(readings: Readings | None, model: Model, at: Settings, value: float) -> Readings:
+def _appended(readings: Readings | None, model: Model, at: Settings, value: float) -> Readings:
     """Append a reading; settings that were read before are not listed again."""
     if readings is None:
         return Readings(model, at, np.array([0]), np.array([value]))

@@ -106,7 +106,7 @@ class Model:
 class Readings:
     """Readings with their settings, as a problem for nested sampling.
 
-    `settings` are the distinct ones, `row` says which of them each reading was taken at.
+    `settings` holds each distinct setting once, `row` the setting's index for each reading, (n_readings,).
     """
 
     model: Model

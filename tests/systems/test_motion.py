@@ -75,6 +75,21 @@ def test_a_body_at_rest_sticks_until_the_force_is_larger_than_its_friction():
     assert found[-1] == pytest.approx(0.5 * 2.0**2, abs=0.05)
 
 
+def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction():
+    """Closed form: a force of 2 t exceeds a friction of 1 at 0.5, amid the first step, and v = (t - 0.5)^2 after it."""
+    law = Law({"v": 0.0}, lambda s, p, u: {"v": 2 * u["t_s"] + 0 * s["v"]})
+    table = _table(np.linspace(0, 4, 6))
+    found = _states(Motion(law).with_friction("v", np.full((1, 1), 1.0)), table, {}, 0.8)["v"]
+    np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
+
+
+def test_friction_that_vanishes_holds_nothing_at_rest():
+    law = Law({"x": 0.0, "v": 0.0}, lambda s, p, u: {"x": 1 - s["x"], "v": s["x"] - s["v"]})
+    table = _table(np.linspace(0, 5, 11))
+    held = _states(Motion(law).with_friction("v", np.full((1, 1), 1e-9)), table, {}, 0.5)["v"]
+    np.testing.assert_allclose(held, _states(law, table, {}, 0.5)["v"], atol=1e-8)
+
+
 def test_a_tank_that_overflows_stays_full_and_empties_at_once_when_the_inflow_ends():
     law = Law({"level": 0.0}, lambda s, p, u: {"level": u["inflow"] - 0.5 * s["level"]})
     times = np.linspace(0, 10, 201)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
@@ -279,23 +279,54 @@ def starts_of(
 def stepped(
     motion: Motion, s: dict[str, Any], between: Callable[[Any], Pair], gap: FloatArray, begin: Any, length: Any
 ) -> dict[str, Any]:
-    """Advance by a share `length` of a gap; split the step where friction brings a state to rest.
+    """Advance by a share `length` of a gap; split the step where friction brings a state to rest or lets it go.
 
     `begin` and `length` are numbers, or arrays of as many as there are columns of states.
     """
     ways = motion.ways(s, *between(begin))
     after = _runge_kutta(motion, s, between, gap, begin, length, ways)
-    for state, way in ways.items():
-        crossed = way * after[state] < 0
-        if not crossed.any():
+    for state in ways:
+        way = ways[state]
+        stopped = way * after[state] < 0
+        loose, until = _breaking_loose(motion, state, way, s, after, between, begin, length)
+        if not (stopped.any() or loose.any()):
             continue
-        ran_out = np.where(crossed, s[state] / np.where(crossed, s[state] - after[state], 1.0), 1.0) * length
-        at_rest = _runge_kutta(motion, s, between, gap, begin, ran_out, ways)
-        at_rest[state] = np.where(crossed, 0.0, at_rest[state])
-        anew = motion.ways(at_rest, *between(begin + ran_out))
-        after = _runge_kutta(motion, at_rest, between, gap, begin + ran_out, length - ran_out, anew)
+        ran_out = np.where(stopped, s[state] / np.where(stopped, s[state] - after[state], 1.0), until) * length
+        there = _runge_kutta(motion, s, between, gap, begin, ran_out, ways)
+        there[state] = np.where(stopped, 0.0, there[state])
+        anew = motion.ways(there, *between(begin + ran_out))
+        free = motion.rates(after, *between(begin + length), {})[state]
+        anew[state] = np.where(loose, np.sign(free), anew[state])
+        after = _runge_kutta(motion, there, between, gap, begin + ran_out, length - ran_out, anew)
         ways = anew
     return motion.at_end_of_step(ways, after) if ways or motion.limits else after
+
+
+def _breaking_loose(
+    motion: Motion,
+    state: str,
+    way: FloatArray,
+    s: Mapping[str, Any],
+    after: Mapping[str, Any],
+    between: Callable[[Any], Pair],
+    begin: Any,
+    length: Any,
+) -> tuple[BoolArray, FloatArray]:
+    """Return where a state at rest breaks loose during a step, and the share of the step until then, 1 elsewhere.
+
+    A state that starts at rest is held by any friction, however small, until the other terms of its rate exceed it.
+    """
+    held = way == 0
+    if not held.any():
+        return held, np.ones(held.shape)
+    size = motion.friction[state]
+    first, last = (
+        motion.rates(at, *between(share), {})[state] for at, share in ((s, begin), (after, begin + length))
+    )
+    loose = held & (np.abs(last) > size)
+    rise = np.where(loose, np.abs(last) - first * np.sign(last), 1.0)
+    until = np.where(loose, (size - first * np.sign(last)) / rise, 1.0)
+    return loose, np.clip(until, 0.0, 1.0)
 
 
 def _runge_kutta(

@@ -21,11 +21,12 @@ class PriorOdds:
     Mean: `clean_mean`, `unknown`, and the rest divided among combinations by size, then equally; `unknown_beside` is
     the share of those with an additional unknown effect. The share `out_of_vocabulary` of the unknown is divided among
     the effects of `UNNAMED`; the rest has no formula. Noise: `white`, and the rest divided among noise models by size,
-    then equally. `complexity_penalty` (nats) is the prior penalty of an effect per Gaussian of the SSF that it makes
-    superfluous, since physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is the same for an unknown
-    effect, which can imitate any shape. `twofold` are the effects that may occur twice;
-    `twice` is the probability that one of them does, given that it occurs. A second cycle beside a first is more
-    plausible than any other second effect. None: a second copy has the prior of any other second effect.
+    then equally; beside a complete mean they have together the probability `not_white_alone`, by default the same as
+    beside an effect. `complexity_penalty` (nats) is the prior penalty of an effect per Gaussian of the SSF that it
+    makes superfluous, since physics rarely imitates an SSF's shape; `unknown_complexity_penalty` is the same for an
+    unknown effect, which can imitate any shape. `twofold` are the effects that may occur twice; `twice` is the
+    probability that one of them does, given that it occurs. A second cycle beside a first is more plausible than any
+    other second effect. None: a second copy has the prior of any other second effect.
     """
 
     n_named: int = 24
@@ -38,6 +39,7 @@ class PriorOdds:
     unknown_beside: float = 0.01
     white: float = 0.94
     noise_by_size: tuple[float, ...] = (0.057, 0.0028, 0.0002)
+    not_white_alone: float | None = None
     complexity_penalty: float = 8.0
     unknown_complexity_penalty: float = 24.0
     unknown_explains_most: bool = False
@@ -93,8 +95,15 @@ class PriorOdds:
         total = sum(believed.values())
         return {(mean, noise): p / total for mean, p in believed.items()}
 
-    def log_noise(self, names: Names) -> float:
-        """Return the log prior of a noise model; `names` are those of its effects that are not certain."""
+    def log_noise(self, names: Names, *, alone: bool = False) -> float:
+        """Return the log prior of a noise model; `names` are those of its effects that are not certain.
+
+        `alone`: beside a complete mean.
+        """
+        not_white = 1 - self.white
+        if alone and self.not_white_alone is not None:
+            not_white = self.not_white_alone
         if not names:
-            return math.log(self.white)
-        return math.log(self.noise_by_size[len(names) - 1] / math.comb(self.n_noises, len(names)))
+            return math.log1p(-not_white)
+        share = self.noise_by_size[len(names) - 1] / (1 - self.white)
+        return math.log(not_white * share / math.comb(self.n_noises, len(names)))

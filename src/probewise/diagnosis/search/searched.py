@@ -157,7 +157,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
         log_p[names, noise] = value + prior.log_mean(names)
     for names, noise in log_p:
         uncertain = tuple(n for n in noise if n not in certain)
-        log_p[names, noise] += -math.log(n_forms) + prior.log_noise(uncertain)
+        log_p[names, noise] += -math.log(n_forms) + prior.log_noise(uncertain, alone=not names)
     total = float(logsumexp(list(log_p.values())))
     nulls = {n: fit for (n, names), fit in evidences.fits.items() if not names}
     clean_by_order = {n: float(logsumexp([e.log_z for e in fit.evidence.values()])) for n, fit in nulls.items()}

@@ -54,6 +54,9 @@ _N_BLOCKS = 5
 # calibrated sensor does: no less likely than one beside a fault of the noise, of which a walk takes up much of what a
 # second effect does.
 _BY_SIZE = (0.318, 0.02, 0.002)
+# Probability that the noise is not white where the law is complete: one departure of a recording, of its law or of its
+# noise, is more likely than one of each.
+_NOT_WHITE_ALONE = 0.2
 _TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often have another one
 
 
@@ -126,7 +129,13 @@ class SimulatorApparatus:
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Divide the prior odds among these effects."""
-        return replace(PriorOdds.over(effects), by_size=_BY_SIZE, twice=_TWICE, unknown_explains_most=True)
+        return replace(
+            PriorOdds.over(effects),
+            by_size=_BY_SIZE,
+            not_white_alone=_NOT_WHITE_ALONE,
+            twice=_TWICE,
+            unknown_explains_most=True,
+        )
 
     def null_forms(self, recording: Recording) -> Any:
         """Raise an error: the only null is the simulator."""

@@ -320,9 +320,7 @@ def _breaking_loose(
     if not held.any():
         return held, np.ones(held.shape)
     size = motion.friction[state]
-    first, last = (
-        motion.rates(at, *between(share), {})[state] for at, share in ((s, begin), (after, begin + length))
-    )
+    first, last = (motion.rates(at, *between(share), {})[state] for at, share in ((s, begin), (after, begin + length)))
     loose = held & (np.abs(last) > size)
     rise = np.where(loose, np.abs(last) - first * np.sign(last), 1.0)
     until = np.where(loose, (size - first * np.sign(last)) / rise, 1.0)

@@ -145,10 +145,11 @@ def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES,
 
 
 def wave_joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
-    """Convert the amounts of sine and cosine to amplitude and phase; the wave number is unchanged."""
-    size = entry[0, 0]
-    sine, cosine = amounts[0] * size, amounts[1] * size
-    return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])
+    """Convert the amounts of sine and cosine to amplitude, first, and phase, last; the rest of the entry stays."""
+    setting = entry[0].copy()
+    sine, cosine = amounts[0] * setting[0], amounts[1] * setting[0]
+    setting[0], setting[-1] = np.hypot(sine, cosine), np.arctan2(cosine, sine)
+    return np.asarray(setting)
 
 
 def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation:

@@ -14,20 +14,18 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Act, ChangePoints, Form, with_unit
-from probewise.systems.forms.modulations import wave_numbers
+from probewise.systems.forms.proposals_in_time import proposals_in_time
 from probewise.systems.motion import Motion
 from probewise.systems.table import RunTable
 
 __all__ = ["proposals"]
 
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
-_MOST_SQUARE_WAVES = 160  # periods of a square wave that are tried
-_ROWS_OF_A_SQUARE_WAVE = 6  # least rows per period: with fewer it is not told from a sinusoid
-_SOFT = 0.5  # steepness of its edges to begin with: at 1 it is nearly a sinusoid
+_THRESHOLDS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of a state beyond which a term may act
 _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter one is kept
 
 
@@ -69,9 +67,10 @@ def proposals(about: About) -> Iterator[Form]:
     for name in _columns(about):
         yield from _switch(about, name)
     if about.table.has_time:
-        yield from _square_wave(about)
+        yield from proposals_in_time(about)
     for state in about.states:
         yield from _of_rate(about, state)
+        yield from _one_sided(about, state)
 
 
 def _terms(atoms: list[_Atom]) -> Iterator[_Term]:
@@ -163,45 +162,39 @@ def _switch(about: About, name: str) -> Iterator[Form]:
     )
 
 
-def _square_wave(about: About) -> Iterator[Form]:
-    """Shift the reading during a share of every period: a wave with flat tops and edges of unknown steepness."""
-    own, table = about.system.simulator, about.table
-    waves = wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_SQUARE_WAVE)
-
-    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
-        a, hz, phase, share, edge = (theta[:, k : k + 1] for k in range(5))
-        inside = np.cos(2 * np.pi * (hz * rows.time_s + phase)) - np.cos(np.pi * share)
-        return np.asarray(value + 0.5 * a * (1 + np.tanh(inside / edge)))
-
-    phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
-    grid = np.meshgrid(about.sd, waves, phases, shares, _SOFT, indexing="ij")
-    entries = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
-    typical = about.typical(Stage.OFFSET, act, entries, about.sd)
-    if typical is None:
+def _one_sided(about: About, state: str) -> Iterator[Form]:
+    """Act on the rate of a state beyond a threshold of it, in proportion to how far beyond: a stop, a second spring."""
+    values = about.states[state]
+    low, high = float(values.min()), float(values.max())
+    if not low < high:
         return
-    entries[:, :, 0] = typical
-    text = f"while |({table.time} / period + phase) mod 1| < share / 2"
-    yield Form(
-        f"formula:reading:{own.reading}:{text}",
-        Stage.OFFSET,
-        {
-            "a": about.amplitude(typical),
-            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
-            "phase": Uniform(-1.0, 1.0),
-            "share": Uniform(0.03, 0.97),
-            "edge": LogUniform(0.03, 1.0),
-        },
-        (own.unit, f"1/{about.time_unit}", "1", "1", "1"),
-        ("time",),
-        act,
-        entries,
-        (0,),
-        lambda mean, sd: (
-            f"{own.reading} shifts by {with_unit(mean[0], sd[0], own.unit)} during {with_unit(mean[3], sd[3], '')} of "
-            f"every {1 / mean[1]:.4g} {about.time_unit}: a proposal, not a known effect"
-        ),
-        expression=f"a {text}",
-    )
+    for sign, text in ((1.0, f"max({state} - at, 0)"), (-1.0, f"max(at - {state}, 0)")):
+
+        def act(value: Motion, theta: FloatArray, table: RunTable, sign: float = sign) -> Motion:
+            a, at = theta[:, :1], theta[:, 1:2]
+            return value.with_term(state, lambda s, p, u: a * np.maximum(sign * (s[state] - at), 0.0))
+
+        def says(mean: FloatArray, sd: FloatArray, text: str = text) -> str:
+            sizes = f"a = {with_unit(mean[0], sd[0], '')}, at = {with_unit(mean[1], sd[1], '')}"
+            return f"the rate of {state} lacks a {text}, {sizes}: a proposal, not a known effect"
+
+        entries = np.array([[[1e-6, at]] for at in np.quantile(values, _THRESHOLDS)])
+        typical = about.typical(Stage.RATE, act, entries, 1e-6)
+        if typical is None or not np.isfinite(typical):
+            continue
+        entries[:, :, 0] = typical
+        yield Form(
+            f"formula:rate:{state}:{text}",
+            Stage.RATE,
+            {"a": about.amplitude(typical), "at": Uniform(low, high)},
+            ("", state),
+            (f"state:{state}", "time"),
+            act,
+            entries,
+            (0,),
+            says,
+            expression=f"a {text}",
+        )
 
 
 def _of_rate(about: About, state: str) -> Iterator[Form]:

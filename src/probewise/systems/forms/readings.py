@@ -103,13 +103,18 @@ def since_start_of_run(table: RunTable) -> FloatArray:
     return np.asarray(table.time_s - first[table.scan])
 
 
+def settling_times(about: About) -> LogUniform:
+    """Return the prior of a time constant of settling: from half a gap between rows to twice the longest run."""
+    longest = float(since_start_of_run(about.table).max()) or 1.0
+    return LogUniform(min(0.5 * about.gap, 0.01 * longest), 2 * longest)
+
+
 def _settling(about: About) -> Iterator[Form]:
     def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
         return np.asarray(value + theta[:, :1] * np.exp(-since_start_of_run(table) / theta[:, 1:2]))
 
-    longest = float(since_start_of_run(about.table).max()) or 1.0
-    shortest = min(0.5 * about.gap, 0.01 * longest)
-    taus = np.geomspace(shortest * 1.5, longest, _N_SIZES)
+    prior = settling_times(about)
+    taus = np.geomspace(prior.low * 1.5, 0.5 * prior.high, _N_SIZES)
     entries = np.stack([np.full(_N_SIZES, 1.0), taus], axis=-1)[:, None, :]
     typical = about.typical(Stage.OFFSET, act, entries, 1.0)
     if typical is None:
@@ -119,7 +124,7 @@ def _settling(about: About) -> Iterator[Form]:
     yield Form(
         "settling",
         Stage.OFFSET,
-        {"a": about.amplitude(typical), "tau_s": LogUniform(shortest, 2 * longest)},
+        {"a": about.amplitude(typical), "tau_s": prior},
         (unit, time_unit),
         ("time", "run"),
         act,

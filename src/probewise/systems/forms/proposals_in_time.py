@@ -1,0 +1,160 @@
+"""Proposals in time: a square wave, a wave whose frequency changes, two settlings. They count as out of vocabulary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.priors import LogUniform, Uniform
+from probewise.sensor import Stage
+from probewise.systems.forms.about import About
+from probewise.systems.forms.form import Form, with_unit
+from probewise.systems.forms.modulations import wave_joined, wave_numbers
+from probewise.systems.forms.readings import settling_times, since_start_of_run
+from probewise.systems.table import RunTable
+
+_MOST_SQUARE_WAVES = 160  # periods of a square wave that are tried
+_ROWS_OF_A_WAVE = 6  # least rows per period: with fewer a square wave is not told from a sinusoid
+_SOFT = 0.5  # steepness of its edges to begin with: at 1 it is nearly a sinusoid
+_MOST_SWEPT = 80  # mean frequencies of a wave whose frequency changes, up to 40 waves in the recording
+_SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the recording: phases to within a radian
+_N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart they are in the row of those
+
+
+def proposals_in_time(about: About) -> Iterator[Form]:
+    """Yield what could be added to the reading along time."""
+    yield from _square_wave(about)
+    yield from _swept_wave(about)
+    yield from _two_settlings(about)
+
+
+def _square_wave(about: About) -> Iterator[Form]:
+    """Shift the reading during a share of every period: a wave with flat tops and edges of unknown steepness."""
+    own, table = about.system.simulator, about.table
+    waves = wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
+
+    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+        a, hz, phase, share, edge = (theta[:, k : k + 1] for k in range(5))
+        inside = np.cos(2 * np.pi * (hz * rows.time_s + phase)) - np.cos(np.pi * share)
+        return np.asarray(value + 0.5 * a * (1 + np.tanh(inside / edge)))
+
+    phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
+    grid = np.meshgrid(about.sd, waves, phases, shares, _SOFT, indexing="ij")
+    entries = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
+    typical = about.typical(Stage.OFFSET, act, entries, about.sd)
+    if typical is None:
+        return
+    entries[:, :, 0] = typical
+    text = f"while |({table.time} / period + phase) mod 1| < share / 2"
+    yield Form(
+        f"formula:reading:{own.reading}:{text}",
+        Stage.OFFSET,
+        {
+            "a": about.amplitude(typical),
+            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+            "phase": Uniform(-1.0, 1.0),
+            "share": Uniform(0.03, 0.97),
+            "edge": LogUniform(0.03, 1.0),
+        },
+        (own.unit, f"1/{about.time_unit}", "1", "1", "1"),
+        ("time",),
+        act,
+        entries,
+        (0,),
+        lambda mean, sd: (
+            f"{own.reading} shifts by {with_unit(mean[0], sd[0], own.unit)} during {with_unit(mean[3], sd[3], '')} of "
+            f"every {1 / mean[1]:.4g} {about.time_unit}: a proposal, not a known effect"
+        ),
+        expression=f"a {text}",
+    )
+
+
+def _swept_wave(about: About) -> Iterator[Form]:
+    """Add a sinusoid whose frequency rises or falls steadily along the recording, by a machine that runs up, say."""
+    own, table = about.system.simulator, about.table
+    waves = wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
+    begin, end = float(table.time_s.min()), float(table.time_s.max())
+    middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
+
+    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+        a, hz, sweep, phase = (theta[:, k : k + 1] for k in range(4))
+        u = (rows.time_s - middle) / half
+        return np.asarray(value + a * np.sin(2 * np.pi * hz * half * (u + 0.5 * sweep * u**2) + phase))
+
+    settings = []
+    for hz in waves:
+        n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
+        settings += [(about.sd, hz, sweep, 0.0) for sweep in np.linspace(-1, 1, n)]
+    sine = np.array(settings)
+    entries = np.stack([sine, sine + np.array([0.0, 0.0, 0.0, 0.5 * np.pi])], axis=1)
+    typical = about.typical(Stage.OFFSET, act, entries, about.sd)
+    if typical is None:
+        return
+    entries[:, :, 0] = typical
+    text = f"sin(2 pi hz (u + sweep u^2 / (2 {half:.4g})) + phase), u = {table.time} - {middle:.4g}"
+    yield Form(
+        f"formula:reading:{own.reading}:{text}",
+        Stage.OFFSET,
+        {
+            "a": about.amplitude(typical, positive=True),
+            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+            "sweep": Uniform(-1.2, 1.2),
+            "phase": Uniform(-2 * np.pi, 2 * np.pi),
+        },
+        (own.unit, f"1/{about.time_unit}", "1", "rad"),
+        ("time",),
+        act,
+        entries,
+        (0,),
+        lambda mean, sd: (
+            f"{own.reading} oscillates with an amplitude of {with_unit(mean[0], sd[0], own.unit)} and a frequency that "
+            f"goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
+            "proposal, not a known effect"
+        ),
+        joined=wave_joined,
+        expression=f"a {text}",
+    )
+
+
+def _two_settlings(about: About) -> Iterator[Form]:
+    """Let the reading settle with two time constants at the start of each run."""
+    own = about.system.simulator
+
+    def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+        a, b, first, second = (theta[:, k : k + 1] for k in range(4))
+        since = since_start_of_run(rows)
+        return np.asarray(value + a * np.exp(-since / first) + b * np.exp(-since / second))
+
+    between = settling_times(about)
+    taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
+    entries = np.array(
+        [
+            [[1.0, 0.0, taus[i], taus[j]], [0.0, 1.0, taus[i], taus[j]]]
+            for i in range(_N_SETTLING)
+            for j in range(i + _APART, _N_SETTLING)
+        ]
+    )
+    typical = about.typical(Stage.OFFSET, act, entries, 1.0)
+    if typical is None:
+        return
+    entries[:, :, :2] *= typical
+    text = "a exp(-t / tau1) + b exp(-t / tau2), t since the start of the run"
+    yield Form(
+        f"formula:reading:{own.reading}:{text}",
+        Stage.OFFSET,
+        {"a": about.amplitude(typical), "b": about.amplitude(typical), "tau1": between, "tau2": between},
+        (own.unit, own.unit, about.time_unit, about.time_unit),
+        ("time", "run"),
+        act,
+        entries,
+        (0, 1),
+        lambda mean, sd: (
+            f"{own.reading} is off by {with_unit(mean[0], sd[0], own.unit)} and {with_unit(mean[1], sd[1], own.unit)} "
+            f"at the start of each run, which settle with time constants of "
+            f"{with_unit(mean[2], sd[2], about.time_unit)} and {with_unit(mean[3], sd[3], about.time_unit)}: a "
+            "proposal, not a known effect"
+        ),
+        expression=text,
+    )

@@ -229,6 +229,7 @@ def _known_json(known: Recorded) -> dict[str, Any]:
         "columns": {name: _column_json(values) for name, values in table.columns.items()},
         "predicted": known.predicted.tolist(),
         "states": {name: values.tolist() for name, values in known.states.items()},
+        "held": list(known.held),
     }
 
 
@@ -243,7 +244,10 @@ def _known(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
     columns = {name: _column(values) for name, values in document["columns"].items()}
     table = RunTable(columns, document["time"], document["run"])
     states = {name: np.array(values, dtype=np.float64) for name, values in document["states"].items()}
-    return Recorded(table, np.array(document["predicted"], dtype=np.float64), states)
+    held = document.get("held")  # a file of an earlier version has none: only a law's columns were held then
+    if held is None:
+        held = table.covariates if simulator.law is not None and simulator.law.hold == "previous" else ()
+    return Recorded(table, np.array(document["predicted"], dtype=np.float64), states, tuple(held))
 
 
 def _column(values: list[Any]) -> NDArray[Any]:

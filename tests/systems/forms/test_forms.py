@@ -251,3 +251,62 @@ def test_an_overflow_goes_to_waste_or_into_a_state_that_it_drives():
     np.testing.assert_allclose(np.diff(into_lower), 0.5 * over)
     assert "lower takes up 0.50" in taken.sentence(np.array([level, 0.5]), np.array([0.01, 0.01]))
     assert "takes up" not in wasted.sentence(np.array([level, 5e-10]), np.array([0.01, 3e-10]))
+
+
+def test_a_loop_that_holds_its_input_is_told_from_a_formula_of_the_row():
+    """Of x' = (u - x) / tau by hand, u held from row to row, the next reading is the first to depend on u."""
+
+    def simulate(p, u):
+        out = np.zeros(N_ROWS)
+        for k in range(1, N_ROWS):
+            stays = np.exp(-max(_T[k] - _T[k - 1], 0.0) / p["tau_s"])
+            out[k] = stays * out[k - 1] + (1 - stays) * u["drive"][k - 1]
+        return out
+
+    loop = _about(Simulator("y", "V", {"tau_s": (0.5, 2.0)}, simulate=simulate, time="t_s", noise=Noise(sd=SD)))
+    assert loop.holds("drive")
+    assert not loop.holds("room_c")
+    assert not ABOUT.holds("drive")
+
+
+def _proposed(ending, about=ABOUT):
+    (form,) = [form for form in proposals(about) if form.name.endswith(ending)]
+    return form
+
+
+def test_a_wave_whose_frequency_changes_is_begun_from_its_two_columns():
+    """Route two: the phase is the integral of the frequency, 2 pi hz (1 + sweep u / 3) over u = t - 3 s, by steps."""
+    form = _proposed("u = t_s - 3")
+    entry = form.bank()[40]
+    setting = form.start(entry, np.array([0.6, 0.8]))
+    assert setting[0] == pytest.approx(entry[0, 0])
+    assert setting[3] == pytest.approx(np.arctan2(0.8, 0.6))
+    a, hz, sweep, phase = setting
+    fine = np.linspace(-3, 3, 60_001)
+    turned = np.concatenate([[0.0], np.cumsum(2 * np.pi * hz * (1 + sweep * fine / 3) * np.diff(fine)[0])[:-1]])
+    expected = a * np.sin(np.interp(_T - 3, fine, turned - np.interp(0.0, fine, turned)) + phase)
+    found = form.apply(np.zeros((1, N_ROWS)), setting[None, :], TABLE)[0]
+    np.testing.assert_allclose(found, expected, atol=0.01 * a)
+
+
+def test_two_settlings_add_up_at_the_start_of_each_run():
+    form = _proposed("since the start of the run")
+    found = form.apply(np.zeros((1, N_ROWS)), np.array([[0.5, -0.8, 0.2, 2.0]]), TABLE)[0]
+    np.testing.assert_allclose(found, 0.5 * np.exp(-_T / 0.2) - 0.8 * np.exp(-_T / 2.0))
+    setting = form.start(form.bank()[0], np.array([2.0, -3.0]))
+    typical = form.bank()[0, 0, 0]
+    np.testing.assert_allclose(setting[:2], [2 * typical, -3 * typical])
+
+
+def test_a_term_on_one_side_acts_beyond_its_threshold_alone():
+    """Closed form: x' = 1 from 0, and x' = 1 - a (x - 2) above 2, goes as 2 + (1 - exp(-a (t - 2))) / a."""
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"rate": (0.0, 2.0)},
+        law=Law({"x": 0.0}, lambda s, p, u: {"x": p["rate"] + 0 * s["x"]}, max_step_s=0.02),
+        time="t_s", run="run", noise=Noise(sd=SD),
+    )  # fmt: skip
+    about = _about(simulator)
+    form = _proposed("max(x - at, 0)", about)
+    found = _read(form.name, -0.5, 2.0, about=about, forms={form.name: form})
+    beyond = np.maximum(_T - 2.0, 0.0)
+    np.testing.assert_allclose(found, np.minimum(_T, 2.0) + (1 - np.exp(-0.5 * beyond)) / 0.5, atol=1e-3)

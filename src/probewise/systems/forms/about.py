@@ -105,8 +105,24 @@ class About:
         gaps = gaps[gaps > 0]
         return float(np.median(gaps)) if gaps.size else 1.0
 
+    def holds(self, column: str) -> bool:
+        """Return whether the model holds a column from row to row: a reading depends on it at earlier rows alone."""
+        if self.system.simulator.law is not None:
+            return self.system.simulator.law.hold == "previous"
+        rows = max(self.table.rows_by_scan(), key=len)
+        there = np.zeros(len(self.table))
+        there[rows[len(rows) // 2]] = _NUDGE * float(np.nanstd(self.table.covariates[column]))
+        change = self.change(
+            Stage.INPUT, lambda value, theta, table: {**value, column: value[column] + theta * there}, np.ones((1, 1))
+        )[0]
+        return bool(np.any(change[rows] != 0) and not np.any(change[there > 0]))
+
     def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the rms change of the readings by each setting (n_settings, n_params), in sds; NaN if not finite."""
+        return np.asarray(np.sqrt(np.mean(self.change(stage, act, settings) ** 2, axis=1)) / self.sd)
+
+    def change(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+        """Return the change of the readings by each setting (n_settings, n_params): (n_settings, n_points)."""
         trial = Form(
             "trial",
             stage,
@@ -120,8 +136,7 @@ class About:
         )
         chain = replace(self.system.chain(self.table, ()), effects=(trial,))
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
-        change = chain.predict(theta, self.table) - self.predicted
-        return np.asarray(np.sqrt(np.mean(change**2, axis=1)) / self.sd)
+        return np.asarray(chain.predict(theta, self.table) - self.predicted)
 
     def typical(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
         """Find the amplitude at which the readings change by one sd; None if they do not change.

@@ -48,8 +48,7 @@ def driving_columns(about: About) -> list[str]:
 
 def forms_on_inputs(about: About) -> Iterator[Form]:
     """Yield the possible errors of each column that drives the simulator, and of the clock."""
-    table, time, law = about.table, about.table.time, about.system.simulator.law
-    holds = law is not None and law.hold == "previous"
+    table, time = about.table, about.table.time
     for name in driving_columns(about):
         values = table.covariates[name]
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
@@ -75,7 +74,7 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
                 about,
                 f"input_delay:{name}",
                 "tau_s",
-                _on(name, delayed_while_held if holds else delayed),
+                _on(name, delayed_while_held if about.holds(name) else delayed),
                 about.duration,
                 about.time_unit,
                 says,

@@ -26,11 +26,15 @@ _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_r
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """What rebinding needs of a reference fit: its table, and its predicted readings and states, (n_points,)."""
+    """What rebinding needs of a reference fit: its table, and its predicted readings and states, (n_points,).
+
+    `held` are the columns that the model holds from row to row.
+    """
 
     table: RunTable
     predicted: FloatArray
     states: Mapping[str, FloatArray] = field(default_factory=dict)
+    held: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +57,10 @@ class _AsRecorded(About):
     def tells_runs_apart(self) -> bool:
         return len(self.table.scan_names) > 1
 
+    def holds(self, column: str) -> bool:
+        assert self.known is not None
+        return column in self.known.held
+
     def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         return np.ones(len(settings))
 
@@ -65,7 +73,8 @@ class _AsRecorded(About):
 
 def recorded(about: About) -> Recorded:
     """Extract from a reference fit what rebinding its forms needs."""
-    return Recorded(about.table, about.predicted, about.states)
+    held = tuple(name for name in about.table.covariates if about.holds(name))
+    return Recorded(about.table, about.predicted, about.states, held)
 
 
 def rebind_forms(
@@ -97,7 +106,8 @@ def rebind_forms(
     if longer is not known.table:
         system = System(simulator, longer.scan_names)
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
-        beyond = Recorded(longer, known.predicted[rows], {name: values[rows] for name, values in known.states.items()})
+        states = {name: values[rows] for name, values in known.states.items()}
+        beyond = Recorded(longer, known.predicted[rows], states, known.held)
         again = forms_of(_AsRecorded(system, longer, np.zeros(system.n_params), 1.0, beyond))
         found |= {name: form for name, form in again.items() if has_value_per_run(name)}
     if any(name.startswith(PROPOSAL) for name in wanted):

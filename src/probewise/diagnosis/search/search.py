@@ -7,7 +7,7 @@ unknown effect. Templates screen them; a beam of the best is refitted jointly an
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -112,14 +112,7 @@ def search(
     eliminate_backward(state)
     # With a form of the SSF that the readings reject, an unknown effect would only stand in for the form.
     unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
-    for k in range(MOST_REFITTED_LATE):
-        progress("refitting what screening believes in", k, MOST_REFITTED_LATE)
-        by_mean = posterior().by_mean
-        settled = {(), ("unknown",)} | state.undetected | state.refitted
-        names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
-        if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
-            break
-        state.reach(names)
+    _refit_late(state, posterior, progress)
     if prepared.null is None:
         at_other_orders(state, posterior().by_mean)
     state.candidates, state.pruned = prune(state.candidates, noises)
@@ -138,6 +131,26 @@ def search(
         evidences=evidences(),
         posterior=posterior(),
     )
+
+
+def _refit_late(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:
+    """Refit what screening believes in; if it is still ahead then, correct it by the least that the refits fell short.
+
+    Screening is linear: where an effect gains hundreds of nats, the gain of another one beside it may be wrong by a
+    hundred.
+    """
+    shortfalls: list[float] = []
+    for k in range(MOST_REFITTED_LATE):
+        progress("refitting what screening believes in", k, MOST_REFITTED_LATE)
+        by_mean = posterior().by_mean
+        settled = {(), ("unknown",)} | state.undetected | state.refitted
+        names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
+        if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
+            return
+        promised = state.log_evidence(names)
+        state.reach(names)
+        shortfalls.append(promised - state.log_evidence(names))
+    state.optimism = max(min(shortfalls), 0.0)
 
 
 def _refit_null(state: SearchState) -> None:

@@ -76,6 +76,8 @@ class SearchState:
     """Refits done: candidate and added effect."""
     pruned: set[Names] = field(default_factory=set)
     """Combinations out of vocabulary that are aliased with named ones."""
+    optimism: float = 0.0
+    """Nats by which screening promises too much at least."""
 
     @property
     def nulls(self) -> list[WeighedFit]:
@@ -199,7 +201,16 @@ class SearchState:
             ]
             out[names, noise] = value + max(gains, key=abs, default=0.0) if np.all(np.isfinite(gains)) else value
         out |= self.about_parts
-        return {key: value for key, value in out.items() if key[0] not in refitted | self.pruned}
+        return {
+            key: value if key[0] in self.undetected else value - self.optimism
+            for key, value in out.items()
+            if key[0] not in refitted | self.pruned
+        }
+
+    def log_evidence(self, names: Names) -> float:
+        """Return the largest log evidence of a combination: of its refit or, without one, by screening."""
+        screened = (value for (own, _), value in self.screened().items() if own == names)
+        return max([c.log_z for c in self.of(names)] or screened, default=-np.inf)
 
 
 def rivals_of(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.effects import PROPOSAL
 from probewise.errors import ParameterError
 from probewise.sensor import Stage
-from probewise.systems.forms import forms_of
+from probewise.systems.forms import driving_columns, forms_of
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.forms.proposals import proposals
@@ -73,7 +73,7 @@ class _AsRecorded(About):
 
 def recorded(about: About) -> Recorded:
     """Extract from a reference fit what rebinding its forms needs."""
-    held = tuple(name for name in about.table.covariates if about.holds(name))
+    held = tuple(name for name in driving_columns(about) if about.holds(name))
     return Recorded(about.table, about.predicted, about.states, held)
 
 

@@ -83,10 +83,19 @@ def test_a_body_breaks_loose_within_a_step_when_the_force_exceeds_its_friction()
     np.testing.assert_allclose(found, np.maximum(table.time_s - 0.5, 0) ** 2, atol=1e-12)
 
 
-def test_friction_that_vanishes_holds_nothing_at_rest():
+def test_a_coarse_step_is_split_where_friction_brings_a_damped_body_to_rest():
+    """Closed form: of v' = -v - 0.5 from 1, v is 0 at ln 3, and the way is 1 - 0.5 ln 3."""
+    law = Law({"x": 0.0, "v": 1.0}, lambda s, p, u: {"x": s["v"], "v": -s["v"]})
+    table = _table(np.linspace(0, 2, 5))
+    found = _states(Motion(law).with_friction("v", np.full((1, 1), 0.5)), table, {}, 0.5)["x"]
+    assert found[-1] == pytest.approx(1 - 0.5 * np.log(3), abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9])
+def test_friction_that_vanishes_holds_nothing_at_rest(size):
     law = Law({"x": 0.0, "v": 0.0}, lambda s, p, u: {"x": 1 - s["x"], "v": s["x"] - s["v"]})
     table = _table(np.linspace(0, 5, 11))
-    held = _states(Motion(law).with_friction("v", np.full((1, 1), 1e-9)), table, {}, 0.5)["v"]
+    held = _states(Motion(law).with_friction("v", np.full((1, 1), size)), table, {}, 0.5)["v"]
     np.testing.assert_allclose(held, _states(law, table, {}, 0.5)["v"], atol=1e-8)
 
 

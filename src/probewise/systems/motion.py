@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
@@ -285,46 +285,42 @@ def stepped(
     """
     ways = motion.ways(s, *between(begin))
     after = _runge_kutta(motion, s, between, gap, begin, length, ways)
-    for state in ways:
-        way = ways[state]
-        stopped = way * after[state] < 0
-        loose, until = _breaking_loose(motion, state, way, s, after, between, begin, length)
-        if not (stopped.any() or loose.any()):
+    for state, way in ways.items():
+        at_rest = way == 0
+
+        def margin(
+            at: Mapping[str, Any], share: Any, state: str = state, way: Any = way, at_rest: Any = at_rest
+        ) -> Any:
+            """Return how much is left until the state comes to rest or breaks loose."""
+            moving = way * at[state]
+            if not at_rest.any():
+                return moving
+            free = motion.rates(at, *between(share), {})[state]
+            return np.where(at_rest, motion.friction[state] - np.abs(free), moving)
+
+        first, last = margin(s, begin), margin(after, begin + length)
+        ends = last < 0
+        if not ends.any():
             continue
-        ran_out = np.where(stopped, s[state] / np.where(stopped, s[state] - after[state], 1.0), until) * length
-        there = _runge_kutta(motion, s, between, gap, begin, ran_out, ways)
-        there[state] = np.where(stopped, 0.0, there[state])
-        anew = motion.ways(there, *between(begin + ran_out))
+        until = np.where(ends, _zero_between(0.0, first, 1.0, last), 1.0)
+        there = _runge_kutta(motion, s, between, gap, begin, until * length, ways)
+        left = margin(there, begin + until * length)
+        closer = np.where(left > 0, _zero_between(until, left, 1.0, last), _zero_between(0.0, first, until, left))
+        until = np.where(ends, closer, 1.0)
+        there = _runge_kutta(motion, s, between, gap, begin, until * length, ways)
+        there[state] = np.where(ends, 0.0, there[state])
+        anew = motion.ways(there, *between(begin + until * length))
         free = motion.rates(after, *between(begin + length), {})[state]
-        anew[state] = np.where(loose, np.sign(free), anew[state])
-        after = _runge_kutta(motion, there, between, gap, begin + ran_out, length - ran_out, anew)
+        anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
+        after = _runge_kutta(motion, there, between, gap, begin + until * length, (1 - until) * length, anew)
         ways = anew
     return motion.at_end_of_step(ways, after) if ways or motion.limits else after
 
 
-def _breaking_loose(
-    motion: Motion,
-    state: str,
-    way: FloatArray,
-    s: Mapping[str, Any],
-    after: Mapping[str, Any],
-    between: Callable[[Any], Pair],
-    begin: Any,
-    length: Any,
-) -> tuple[BoolArray, FloatArray]:
-    """Return where a state at rest breaks loose during a step, and the share of the step until then, 1 elsewhere.
-
-    A state that starts at rest is held by any friction, however small, until the other terms of its rate exceed it.
-    """
-    held = way == 0
-    if not held.any():
-        return held, np.ones(held.shape)
-    size = motion.friction[state]
-    first, last = (motion.rates(at, *between(share), {})[state] for at, share in ((s, begin), (after, begin + length)))
-    loose = held & (np.abs(last) > size)
-    rise = np.where(loose, np.abs(last) - first * np.sign(last), 1.0)
-    until = np.where(loose, (size - first * np.sign(last)) / rise, 1.0)
-    return loose, np.clip(until, 0.0, 1.0)
+def _zero_between(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:
+    """Return where a straight line between two values of opposite sign is zero; `low` if both are equal."""
+    apart = at_low - at_high
+    return low + (high - low) * np.where(apart > 0, at_low / np.where(apart > 0, apart, 1.0), 0.0)
 
 
 def _runge_kutta(

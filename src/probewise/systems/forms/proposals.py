@@ -203,6 +203,8 @@ def _of_rate(about: About, state: str) -> Iterator[Form]:
     atoms += [_atom(name, values, name, centred=True) for name, values in _columns(about).items()]
     known: list[FloatArray] = []
     for term in _terms(atoms):
+        if term.text == f"sign({state})":
+            continue  # dry friction, which has a name
 
         def act(value: Motion, theta: FloatArray, table: RunTable, term: _Term = term) -> Motion:
             a = theta[:, :1]

@@ -9,7 +9,8 @@ import pytest
 from nested_sampling import hard, problems
 
 from probewise.nested import check
-from probewise.nested.beyond import NOTHING, Beyond, look_beyond
+from probewise.nested.beyond import Beyond
+from probewise.nested.missing import NOTHING_MISSING, Missing, look_for_missing
 from probewise.nested.moves import SliceMove
 from probewise.nested.sampler import least_live, search
 
@@ -23,7 +24,7 @@ def test_a_spike_that_no_live_point_met_is_found_and_weighed() -> None:
         rng = np.random.default_rng([seed, 20])
         run = search(known, rng=rng, n_live=300)
         assert run.log_z < known.log_z - 3  # not met by the run
-        found.append(look_beyond(run, known, max_calls=run.n_calls, rng=rng).log_z)
+        found.append(look_for_missing(run, known, max_calls=run.n_calls, rng=rng).above.log_z)
     assert any(abs(log_z - known.log_z) < 1.5 for log_z in found)
 
 
@@ -31,7 +32,7 @@ def test_a_spike_that_no_live_point_met_is_found_and_weighed() -> None:
 def test_where_there_is_no_higher_peak_nothing_is_found_for_a_fifth_of_the_cost(name: str) -> None:
     known = problems.problem(name)
     run = search(known, rng=np.random.default_rng(1), n_live=100)
-    above = look_beyond(run, known, max_calls=10 * run.n_calls, rng=np.random.default_rng(2))
+    above = look_for_missing(run, known, max_calls=10 * run.n_calls, rng=np.random.default_rng(2)).above
     assert above.log_z == -math.inf
     assert above.n_calls <= run.n_calls / 5
 
@@ -39,7 +40,7 @@ def test_where_there_is_no_higher_peak_nothing_is_found_for_a_fifth_of_the_cost(
 def test_without_evaluations_left_nothing_is_evaluated() -> None:
     known = problems.problem("Gaussian 4-D")
     run = search(known, rng=np.random.default_rng(1), n_live=100)
-    assert look_beyond(run, known, max_calls=10, rng=np.random.default_rng(2)) == NOTHING
+    assert look_for_missing(run, known, max_calls=10, rng=np.random.default_rng(2)).n_calls == 0
 
 
 @pytest.mark.parametrize(("above_it", "doubted"), [(3.0, True), (-6.0, False)])
@@ -48,7 +49,8 @@ def test_a_peak_that_holds_much_of_the_evidence_is_a_doubt(
 ) -> None:
     known = problems.problem("Gaussian 4-D")
     run = search(known, rng=np.random.default_rng(1), n_live=100)
-    monkeypatch.setattr(check, "look_beyond", lambda *_, **__: Beyond(run.log_z + above_it, 77))
+    missing = Missing(NOTHING_MISSING.lost, Beyond(run.log_z + above_it, 77), 77)
+    monkeypatch.setattr(check, "look_for_missing", lambda *_, **__: missing)
     result = check.checked(
         run,
         known,

@@ -2,10 +2,9 @@
 
 A run ends where its live points can no longer raise log Z, if the likelihood goes on as it did. A narrow peak on a
 broad one (a change of phase, Skilling 2006) can hold most of the posterior and begin tens of nats further up, where no
-live point has been. Draws from ever narrower normal distributions about the last live points cost no chains and reach
-the top of the broad peak. There most draws are spent: where the broad peak is level, a direction towards a narrow one
-suffices to meet it. A draw that lies higher than the top belongs to another peak, whose mass is estimated in the same
-way.
+live point has been. Draws from normal distributions at the top of the broad peak (`ascent`) cost no chains: where that
+peak is level, a direction towards a narrow one suffices to meet it. A draw that lies higher than the top belongs to
+another peak, which ever narrower normal distributions climb; their draws give its mass.
 """
 
 from __future__ import annotations
@@ -17,23 +16,20 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.nested.evaluate import Evaluator, Points, Samplable
-from probewise.nested.repartition import principal_root
+from probewise.nested.ascent import Top
+from probewise.nested.evaluate import Evaluator, Points
 from probewise.nested.result import NestedResult
 from probewise.nested.space import is_within
 
 __all__ = ["NOTHING", "Beyond", "look_beyond"]
 
 _FLAT = 0.2  # nats between the best draw and the worst of the best tenth: the top of a peak
-_NARROWER = 0.8  # sd of a distribution over that of the one before
-_NARROWER_BEYOND = 0.87  # about another peak: with 0.8 a tenth of them were weighed too low by a nat or more
-_PER_LIVE = 5  # draws of a distribution on the way to the top of the known peak
-_PER_LIVE_BEYOND = 20  # on the way to that of another
-_AT_TOP = (1.25, 1.0, 0.8)  # scales of those at the top, which get as many draws a live point as there are parameters
+_NARROWER = 0.87  # sd of a distribution over that of the one before: with 0.8 a tenth of peaks were a nat too low
+_PER_LIVE = 20  # draws of a distribution on the way to the top of another peak
+_AT_TOP = (1.25, 1.0, 0.8)  # scales of those at the known top, with as many draws a live point as there are parameters
 _SHARE = 1 / 8  # of the run's evaluations, spent where there is no higher peak
 _MOST_LEVELS = 60
 _MOST_PEAKS = 5
-_LEVELS_TO_MEET = 3  # after which the draws must lie where the live points do: they do not about a curved ridge
 
 
 @dataclass(frozen=True)
@@ -66,53 +62,55 @@ class _Level:
         return float(self.points.log_likelihood.max(initial=-math.inf))
 
 
-def look_beyond(first: NestedResult, problem: Samplable, *, max_calls: int, rng: np.random.Generator) -> Beyond:
+def look_beyond(
+    first: NestedResult, top: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
+) -> Beyond:
     """Look for a peak above the end of a run and estimate its evidence, by order of magnitude.
 
     Parameters
     ----------
     first
         The run.
-    problem
+    top
+        Top of the peak on which it ended.
+    evaluate
         Its problem, whose prior has `to_unit_cube` or coordinates of its own.
     max_calls
         Limit of evaluations; without a higher peak at most an eighth of the run's are used.
     rng
         Source of randomness.
     """
-    evaluate = Evaluator(problem)
-    most = min(max_calls, int(_SHARE * first.n_calls))
-    if most < _PER_LIVE * first.n_live:
+    n_before = evaluate.n_calls
+    n_draws = int(min(first.n_live * len(evaluate.names), min(max_calls, _SHARE * first.n_calls) / len(_AT_TOP)))
+    if n_draws < first.n_live:
         return NOTHING
-    u = evaluate.space.enter(first.theta[-first.n_live :])
-    root, centre, scale, log_z = principal_root(u), u.mean(axis=0), 1.0, -math.inf
-    lowest = float(first.log_likelihood[-first.n_live])
-    known = -math.inf
-    for peak in range(_MOST_PEAKS):
-        n_draws = first.n_live * (_PER_LIVE_BEYOND if peak else _PER_LIVE)
-        limit = max_calls if peak else most
-        levels = _climb(evaluate, centre, scale, root, (lowest, known), n_draws=n_draws, max_calls=limit, rng=rng)
-        top = levels[-1]
-        if peak:
-            log_z = max(log_z, _evidence(levels, root))
-        else:
-            n_draws = int(min(first.n_live * len(evaluate.names), (most - evaluate.n_calls) / len(_AT_TOP)))
-            levels += [_drawn(evaluate, top.centre, wide * top.scale, root, n_draws, rng) for wide in _AT_TOP]
+    levels = [_drawn(evaluate, top.centre, scale, top.root, n_draws, rng) for scale in _AT_TOP]
+    # Of several peaks of about one height the climb took one, and the run knows the others.
+    log_z, known = -math.inf, max(top.height, float(first.log_likelihood.max())) + _FLAT
+    for _ in range(_MOST_PEAKS):
         highest = max(levels, key=lambda level: level.top)
-        # Of several peaks of about one height the draws climb one, and the run knows the others.
-        known = max(top.top, float(first.log_likelihood.max())) + _FLAT
         if not highest.top > known:
             break
-        centre, scale = highest.points.u[int(highest.points.log_likelihood.argmax())], highest.scale
-    return Beyond(log_z, evaluate.n_calls)
+        levels = _climbed(
+            evaluate,
+            highest.points.u[int(highest.points.log_likelihood.argmax())],
+            highest.scale,
+            top.root,
+            known,
+            n_draws=first.n_live * _PER_LIVE,
+            max_calls=n_before + max_calls,
+            rng=rng,
+        )
+        log_z, known = max(log_z, _evidence(levels, top.root)), max(known, levels[-1].top + _FLAT)
+    return Beyond(log_z, evaluate.n_calls - n_before)
 
 
-def _climb(
+def _climbed(
     evaluate: Evaluator,
     centre: FloatArray,
     scale: float,
     root: FloatArray,
-    heights: tuple[float, float],
+    known: float,
     *,
     n_draws: int,
     max_calls: int,
@@ -120,11 +118,9 @@ def _climb(
 ) -> list[_Level]:
     """Draw from ever narrower distributions, each about the best tenth of the one before, until these are level.
 
-    `heights` are log likelihoods: of the worst live point, and of the top of the peaks that are known. Only draws above
-    that top count among the best: near a narrow peak most belong to the broad one.
+    Only draws above the log likelihood `known`, the top of the other peaks, count among the best: near a narrow peak
+    most belong to a broad one.
     """
-    lowest, known = heights
-    narrower = _NARROWER if known == -math.inf else _NARROWER_BEYOND
     levels = list[_Level]()
     while True:
         levels.append(_drawn(evaluate, centre, scale, root, n_draws, rng))
@@ -134,12 +130,10 @@ def _climb(
         above = height > known
         if not len(best) or (above.all() and float(np.ptp(height)) < _FLAT):
             return levels
-        if len(levels) >= _LEVELS_TO_MEET and float(np.median(height)) < lowest:
-            return levels
         if len(levels) == _MOST_LEVELS or evaluate.n_calls + n_draws > max_calls:
             return levels
         centre = found.u[best[above]].mean(axis=0) if above.any() else centre
-        scale *= narrower
+        scale *= _NARROWER
 
 
 def _drawn(

@@ -7,36 +7,31 @@ posterior that the first run found (`repartition`). Where the posterior fills so
 nothing, a small run of the same problem is used. The jump distance of the chains, in units of the live points' spread,
 is no substitute: it is smallest for many modes or a thin shell, where the evidence is right.
 
-Neither estimate sees a narrow peak that begins above where both end, which `beyond` looks for, or a mode that died out
-among the live points, which `lost` looks for: where it holds a part of the evidence that matters, the run is repeated
-with hops between the modes that are then known.
+Neither estimate sees a narrow peak that begins above where both end, or a part of the posterior without live points,
+both of which `missing` looks for. Where a part without live points holds evidence that matters, the run is repeated
+with hops between the parts that are then known.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested.beyond import NOTHING, Beyond, look_beyond
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
 from probewise.nested.hops import HoppingMove
-from probewise.nested.lost import NOTHING_LOST, Lost, look_for_lost
+from probewise.nested.lost import Lost
+from probewise.nested.missing import DISAGREE, NOTHING_MISSING, look_for_missing, raised
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, groups_of, repartitioned
 from probewise.nested.result import Check, NestedResult, few_lineages, few_possible
 from probewise.nested.space import space_of
-
-__all__ = ["DISAGREE", "SingleRun", "checked", "weighted_mean"]
-
-DISAGREE = 2.5
-"""Difference of the two estimates, in combined standard errors, above which they disagree."""
 
 # Above this many errors the second estimate is repeated with more live points.
 _APART = 2.0
@@ -51,9 +46,6 @@ _ALIKE = 2.0  # errors within which two runs agree, against a second pass that l
 _SHARE = 0.1  # of the first run's live points times nats, spent on the second estimate
 _LEAST_LIVE = 40
 _MATTERS = 0.25  # errors by which a lost mode raises log Z, above which the run is repeated
-_MISSING = 1.0  # errors by which a mode that is still lost raises log Z, above which it is a doubt
-
-_Part = TypeVar("_Part", Lost, Beyond)
 
 
 class SingleRun(Protocol):
@@ -99,6 +91,69 @@ class _Route:
         return math.ceil(self.n_live * (1 + n_steps * self.chain.target))
 
 
+@dataclass
+class _Purse:
+    """Runs second estimates while fewer than `budget` evaluations are `spent`."""
+
+    search: SingleRun
+    budget: float
+    spent: int
+    rng: np.random.Generator
+
+    @property
+    def left(self) -> int:
+        return int(self.budget - self.spent)
+
+    def run(self, route: _Route) -> NestedResult | None:
+        """Run a second estimate; None where it exceeds the budget."""
+        left = int(min(self.budget - self.spent, route.most_calls))
+        if left < route.least_calls:
+            return None
+        found = self.search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=self.rng)
+        self.spent += found.n_calls
+        return found if found.complete else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Second:
+    """A second estimate of the evidence: the runs of a route.
+
+    `curved`: whether a route about the clusters of the posterior, tried before, has found another posterior.
+    """
+
+    route: _Route
+    runs: tuple[NestedResult, ...]
+    curved: bool
+
+    @property
+    def log_z(self) -> tuple[float, float]:
+        """Weighted mean of the runs' log Z and its error."""
+        return weighted_mean([a.log_z for a in self.runs], [a.log_z_error for a in self.runs])
+
+    @property
+    def n_calls(self) -> int:
+        return sum(each.n_calls for each in self.runs)
+
+    def distance(self, run: NestedResult) -> float:
+        """How far a run's log Z lies above this one, in combined standard errors."""
+        log_z, error = self.log_z
+        return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
+
+    def disputes(self, run: NestedResult, most: float) -> bool:
+        """Whether the distance exceeds `most`, or this estimate is itself doubtful."""
+        return abs(self.distance(run)) > most or bool(self.runs[-1].warnings)
+
+    def overlooks(self, first: NestedResult, longer: NestedResult) -> bool:
+        """Whether it lies, about a curved posterior, below two runs that agree, one with chains twice as long.
+
+        Along a curve its prior is thin where the posterior is not: it overlooks a part and is then low. Chains that are
+        too short bias two runs differently.
+        """
+        below = min(self.distance(run) for run in (first, longer))
+        alike = abs(_Second(self.route, (longer,), self.curved).distance(first)) < _ALIKE
+        return self.curved and below > _APART and alike and not first.warnings
+
+
 def checked(
     first: NestedResult,
     problem: Samplable,
@@ -136,85 +191,42 @@ def checked(
         estimate. A warning is added if the two still disagree, or if the second does not end within the limits.
     """
     budget = max_cost * first.n_calls
-    if max_calls is not None:
-        budget = min(budget, max_calls)
-    spent = first.n_calls
-
-    def estimated(route: _Route) -> NestedResult | None:
-        """Run a second estimate; None where it exceeds the budget."""
-        nonlocal spent
-        left = int(min(budget - spent, route.most_calls))
-        if left < route.least_calls:
-            return None
-        try:
-            found = search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=rng)
-        except NotConvergedError as error:
-            # It may evaluate hypotheses that the first run never met; the error is reported as a warning.
-            raise _FailedError(str(error)) from error
-        spent += found.n_calls
-        return found if found.complete else None
-
-    now, lost, above, estimates, modes = first, NOTHING_LOST, NOTHING, list[NestedResult](), None
+    purse = _Purse(search, budget if max_calls is None else min(budget, max_calls), first.n_calls, rng)
+    now, missing = first, NOTHING_MISSING
     try:
-        lost = _missing_part(look_for_lost, NOTHING_LOST, first, problem, int(budget - spent), rng)
-        spent += lost.n_calls
-        if _raised(first, lost.not_in(first)) > _MATTERS:
-            modes = _modes(first, lost, problem, rng)
+        missing = look_for_missing(first, problem, max_calls=purse.left, rng=rng)
+        purse.spent += missing.n_calls
+        modes = None
+        if raised(first, missing.lost.not_in(first)) > _MATTERS:
+            modes = _modes(first, missing.lost, problem, rng)
             chain = move if isinstance(move, SliceMove) else SliceMove()
-            again = estimated(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
-            now = first if again is None else again
-        above = _missing_part(look_beyond, NOTHING, now, problem, int(budget - spent), rng)
-        spent += above.n_calls
-        curved = False
-        for route in _second_routes(now, problem, move, least_live, rng):
-            estimates = [] if (found := estimated(route)) is None else [found]
-            if found is not None and route.confirmed(found):
-                break
-            curved = route.expected is not None
-        if not estimates:
+            again = purse.run(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
+            if again is not None:
+                now = again
+                more = look_for_missing(now, problem, max_calls=purse.left, rng=rng, lost=missing.lost)
+                purse.spent += more.n_calls
+                missing = replace(more, n_calls=missing.n_calls + more.n_calls)
+        route, second = _second_estimate(now, problem, move, least_live, purse)
+        if second is None:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
             note = (
                 f"{route.name}, which checks the evidence, did not end within max_cost and max_calls "
-                f"({int(budget)} evaluations in all); use a greater limit, or max_cost=1 for no check"
+                f"({int(purse.budget)} evaluations in all); use a greater limit, or max_cost=1 for no check"
             )
-            return _with_peaks(replace(now, n_calls=spent, warnings=(*now.warnings, note)), lost, above)
-        name = route.name
-        if _is_suspicious(now, estimates, _APART):
-            left, again_costs = budget - spent, _AGAIN * first.n_calls
-            room = left - again_costs if left > again_costs else left
-            n_live = int(min(max(route.n_live, now.n_live), room / estimates[0].n_calls * route.n_live))
-            sharper = replace(route, n_live=n_live, most_calls=math.inf)
-            if n_live > route.n_live and (found := estimated(sharper)) is not None:
-                estimates = [found] if estimates[0].warnings else [*estimates, found]
-        n_check = sum(each.n_calls for each in estimates) + lost.n_calls + above.n_calls
-        if _is_suspicious(now, estimates, DISAGREE):
-            again = estimated(_Route(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes))
-            if again is not None and not again.warnings:
-                if not _is_suspicious(again, estimates, DISAGREE):
-                    now = again
-                elif curved and _overlooks(estimates, now, again):
-                    now, estimates, name = again, [now], "the same run with shorter chains"
-    except _FailedError as error:
-        note = f"the second pass, which checks the evidence, failed: {error}"
-        return _with_peaks(replace(now, n_calls=spent, warnings=(*now.warnings, note)), lost, above)
-    return _with_peaks(_with_check(now, name, estimates, n_check, spent), lost, above)
-
-
-def _missing_part(
-    look: Callable[..., _Part],
-    nothing: _Part,
-    run: NestedResult,
-    problem: Samplable,
-    max_calls: int,
-    rng: np.random.Generator,
-) -> _Part:
-    """Look for a part of the posterior that a run missed, where the prior's coordinates allow it."""
-    if not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
-        return nothing
-    try:
-        return look(run, problem, max_calls=max_calls, rng=rng)
+        else:
+            if second.disputes(now, _APART):
+                second = _sharper(second, now, first, purse)
+            n_check = second.n_calls + missing.n_calls
+            if second.disputes(now, DISAGREE):
+                again = purse.run(_Route(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes))
+                now, second = _settled(second, now, again)
+            now = _with_check(now, second, n_check)
+            note = None
     except NotConvergedError as error:
-        raise _FailedError(str(error)) from error
+        # A second estimate may evaluate hypotheses that the first run never met.
+        note = f"the second pass, which checks the evidence, failed: {error}"
+    notes = () if note is None else (note,)
+    return replace(now, n_calls=purse.spent, warnings=(*now.warnings, *notes, *missing.doubts(now)))
 
 
 def _modes(first: NestedResult, lost: Lost, problem: Samplable, rng: np.random.Generator) -> Clusters:
@@ -224,31 +236,46 @@ def _modes(first: NestedResult, lost: Lost, problem: Samplable, rng: np.random.G
     return Clusters.of([*met, *(space.enter(hill.theta) for hill in lost.hills)])
 
 
-def _raised(run: NestedResult, log_z: float) -> float:
-    """By how many errors the evidence of a part that the run has not met raises log Z."""
-    return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / max(run.log_z_error, 1e-12)
+def _second_estimate(
+    now: NestedResult, problem: Samplable, move: Move, least_live: int, purse: _Purse
+) -> tuple[_Route, _Second | None]:
+    """Make the second estimate by the first route that is confirmed, else the last one; None if it did not end."""
+    curved, second = False, None
+    for route in _second_routes(now, problem, move, least_live, purse.rng):
+        found = purse.run(route)
+        second = None if found is None else _Second(route, (found,), curved)
+        if found is not None and route.confirmed(found):
+            break
+        curved = route.expected is not None
+    return route, second
 
 
-def _with_peaks(run: NestedResult, lost: Lost, above: Beyond) -> NestedResult:
-    """Add a warning for each part of the posterior that is known to be missing and matters."""
-    notes, log_z = list[str](), lost.not_in(run)
-    mine = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}"
-    if _raised(run, log_z) > _MISSING:
-        notes.append(
-            f"a mode that died out among the live points has a log Z of about {log_z:.2f}, {mine}; "
-            "use more n_live or a greater max_cost"
-        )
-    # By more errors than two right estimates would differ: the evidence of a peak above the end is a rough estimate.
-    if _raised(run, above.log_z) > DISAGREE:
-        notes.append(
-            f"a narrow peak that no live point met lies above the run's end: its log Z is about {above.log_z:.1f}, "
-            f"{mine}; use more n_live or a prior about the peak"
-        )
-    return replace(run, warnings=(*run.warnings, *notes))
+def _sharper(second: _Second, now: NestedResult, first: NestedResult, purse: _Purse) -> _Second:
+    """Repeat a second estimate with more live points, as many as the run's where the budget allows it."""
+    route, left, again_costs = second.route, purse.budget - purse.spent, _AGAIN * first.n_calls
+    room = left - again_costs if left > again_costs else left
+    n_live = int(min(max(route.n_live, now.n_live), room / second.runs[0].n_calls * route.n_live))
+    if n_live <= route.n_live:
+        return second
+    found = purse.run(replace(route, n_live=n_live, most_calls=math.inf))
+    if found is None:
+        return second
+    return replace(second, runs=(found,) if second.runs[0].warnings else (*second.runs, found))
 
 
-class _FailedError(Exception):
-    """The likelihood failed during a second estimate."""
+def _settled(second: _Second, now: NestedResult, again: NestedResult | None) -> tuple[NestedResult, _Second]:
+    """Settle a disagreement by a repetition of the run with longer chains: return the run and the estimate that agree.
+
+    Where they do not, return them as they were.
+    """
+    if again is None or again.warnings:
+        return now, second
+    if not second.disputes(again, DISAGREE):
+        return again, second
+    if second.overlooks(now, again):
+        shorter = replace(second.route, name="the same run with shorter chains")
+        return again, _Second(shorter, (now,), second.curved)
+    return now, second
 
 
 def _second_routes(
@@ -317,35 +344,9 @@ def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def _combined(estimates: list[NestedResult]) -> tuple[float, float]:
-    return weighted_mean([a.log_z for a in estimates], [a.log_z_error for a in estimates])
-
-
-def _distance(run: NestedResult, estimates: list[NestedResult]) -> float:
-    """Difference of the two estimates in combined standard errors."""
-    log_z, error = _combined(estimates)
-    return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
-
-
-def _is_suspicious(run: NestedResult, estimates: list[NestedResult], most: float) -> bool:
-    return abs(_distance(run, estimates)) > most or bool(estimates[-1].warnings)
-
-
-def _overlooks(estimates: list[NestedResult], first: NestedResult, longer: NestedResult) -> bool:
-    """Whether a second pass about a curved posterior lies below two runs that agree, one with chains twice as long.
-
-    Along a curve its prior is thin where the posterior is not: it overlooks a part and is then low. Chains that are too
-    short bias two runs differently.
-    """
-    below = min(_distance(run, estimates) for run in (first, longer))
-    return below > _APART and abs(_distance(first, [longer])) < _ALIKE and not first.warnings
-
-
-def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_check: int, spent: int) -> NestedResult:
+def _with_check(now: NestedResult, second: _Second, n_check: int) -> NestedResult:
     """Store the check in the result, with a warning where the estimates disagree."""
-    log_z, error = _combined(estimates)
-    distance = _distance(now, estimates)
-    check = Check(name, log_z, error, distance, n_check)
+    (log_z, error), distance, name = second.log_z, second.distance(now), second.route.name
     warnings = now.warnings
     if abs(distance) > DISAGREE:
         warnings = (
@@ -354,8 +355,8 @@ def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_c
             f"{abs(distance):.1f} errors apart; chains are too short or a part of the posterior was lost; "
             "use a greater steps_per_param, more n_live, or a greater max_cost",
         )
-    elif estimates[-1].warnings:
-        why = estimates[-1].warnings[0]
+    elif second.runs[-1].warnings:
+        why = second.runs[-1].warnings[0]
         warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
         # A poorly known share of possible hypotheses, or error, no longer matters once a second estimate agrees.
@@ -363,4 +364,4 @@ def _with_check(now: NestedResult, name: str, estimates: list[NestedResult], n_c
         if error < now.log_z_error:
             settled.append(few_lineages(now.memory))
         warnings = tuple(note for note in warnings if note not in settled)
-    return replace(now, n_calls=spent, check=check, warnings=warnings)
+    return replace(now, check=Check(name, log_z, error, distance, n_check), warnings=warnings)

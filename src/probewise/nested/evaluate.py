@@ -76,6 +76,11 @@ class Points:
         return np.lexsort((self.label, self.log_likelihood))
 
     @staticmethod
+    def empty(n_params: int) -> Points:
+        """Return no points."""
+        return Points(np.empty((0, n_params)), np.empty((0, n_params)), np.empty(0), np.empty(0), np.empty(0))
+
+    @staticmethod
     def join(*parts: Points) -> Points:
         """Concatenate points."""
         return Points(

@@ -1,4 +1,4 @@
-"""Look for a mode of the posterior that died out among the live points before its evidence counted.
+"""Look for a part of the posterior without live points: a mode that died out among them, or a top they never climbed.
 
 Two modes shrink at the same rate until their tops are near, over tens of nats, and all that while the number of live
 points in each drifts. A narrow mode that begins with a few of them may lose them all: neither the run nor anything that
@@ -6,6 +6,10 @@ starts from its posterior can know of it. But points in it are among those that 
 dip on the straight line from an early dead point to the nearest sample of the posterior, the point lies apart. Few
 points of a problem with one mode do. Some of those that do climb, and the hills that they end on are weighed by
 importance sampling, and held against the share of the run's posterior at the same place.
+
+A run may also have ended beside the bulk of its posterior, with nothing between: on the arm of a heavy tail along which
+its chains hardly moved. There the top to which the last live points climb lies far above all points of the run, and is
+weighed in the same way.
 """
 
 from __future__ import annotations
@@ -17,8 +21,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
+from probewise.nested.ascent import Top
 from probewise.nested.clusters import Clusters
-from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
+from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.importance import HeldOut, Weighted, weigh_draws
 from probewise.nested.mixture import single
 from probewise.nested.moves import SliceMove
@@ -44,6 +49,8 @@ _MOST_HILLS = 8
 _SWEEPS = 12  # of a climb
 _FROM_TOP = 3.0  # nats a parameter: a climb ends as near to the top
 _NEAREST = 3
+# Nats a parameter by which a top lies above all points of a run: of a normal posterior it is below half of that.
+_ABOVE = 0.5
 _ROUNDS = 6
 _SETTLED = 0.5  # nats
 _PER_PARAM, _DRAWS_PER_PARAM = 4, 40
@@ -104,53 +111,80 @@ NOTHING_LOST = Lost((), 0)
 """No lost mode, nothing evaluated."""
 
 
-def look_for_lost(first: NestedResult, problem: Samplable, *, max_calls: int, rng: np.random.Generator) -> Lost:
-    """Look for lost modes of a run, and estimate their evidence.
+def look_for_lost(
+    first: NestedResult, top: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
+) -> Lost:
+    """Look for lost parts of a run's posterior, and estimate their evidence.
 
     Parameters
     ----------
     first
         The run.
-    problem
+    top
+        Top of the peak on which it ended.
+    evaluate
         Its problem, whose prior has `to_unit_cube` or coordinates of its own.
     max_calls
         Limit of evaluations for the lines; hills that are found take some more, up to a sixth of the run's in all.
     rng
         Source of randomness.
     """
-    evaluate = Evaluator(problem)
+    n_before, n_params = evaluate.n_calls, len(evaluate.names)
+    few = _apart_from_posterior(first, evaluate, max_calls=max_calls, rng=rng)
+    if top.height > float(first.log_likelihood.max()) + _ABOVE * n_params and max_calls > _hill_calls(n_params):
+        few = _Climbers(top.highest, top.root[None], np.ones(1)).joined(few)
+    scale, space, hills = _scale(first, evaluate.space), unbounded(evaluate.problem.prior), list[Hill]()
+    most = n_before + _MOST_SHARE * first.n_calls
+    while len(few) and evaluate.n_calls + _hill_calls(n_params) < most:
+        best = int(few.now.log_likelihood.argmax())
+        settled = _settled(few.now.take(slice(best, best + 1)), few.root[best] * few.scale[best], evaluate, rng)
+        few = few.take(np.delete(np.arange(len(few)), best))
+        few = few.take(np.flatnonzero(_apart(few.now, settled, scale, 1, evaluate, rng)))
+        drawn = _weighed(space.enter(settled.theta), space, evaluate, rng)
+        if drawn is not None:
+            hill = Hill.of(drawn, space, rng)
+            hills += [] if hill.is_met_by(first) else [hill]
+    return Lost(tuple(hills), evaluate.n_calls - n_before)
+
+
+def _early(run: NestedResult) -> int:
+    """Count the dead points before the posterior's bulk."""
+    return int(np.searchsorted(np.cumsum(run.weight), _BULK))
+
+
+def _scale(run: NestedResult, space: Space) -> FloatArray:
+    """Sds of the points that died where the posterior's bulk begins, (n_params,)."""
+    last = _early(run)
+    return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
+
+
+def _apart_from_posterior(
+    first: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
+) -> _Climbers:
+    """Let early dead points climb that lie apart from the posterior; return those that end high, and still apart."""
+    n_params = len(evaluate.names)
     n_starts = int(min(max_calls, _SHARE * first.n_calls) / len(_ON_LINE))
-    last = int(np.searchsorted(np.cumsum(first.weight), _BULK))
+    last = _early(first)
+    nothing = _Climbers(Points.empty(n_params), np.empty((0, n_params, n_params)), np.empty(0))
     if n_starts < 2 or last < first.n_live:
-        return NOTHING_LOST
+        return nothing
     # Denser in the beginning: a mode that dies out late has points there, too.
     rows = np.unique((last * np.linspace(0.0, 1.0, n_starts) ** 3).astype(np.int64))
     start = evaluate.known(first.theta[rows], first.log_likelihood[rows], first.label[rows])
     samples = np.unique(first.rows(_N_KNOWN, rng=rng))
     known = evaluate.known(first.theta[samples], first.log_likelihood[samples], first.label[samples])
     u = evaluate.space.enter(first.theta[: last + _BLOCK])
-    scale = np.maximum(u[last:].std(axis=0), 1e-300)
+    scale = _scale(first, evaluate.space)
     apart = np.flatnonzero(_apart(start, known, scale, 1, evaluate, rng))
     if not apart.size:
-        return Lost((), evaluate.n_calls)
+        return nothing
     chosen = apart[_far_from_each_other(start.u[apart] / scale, start.log_likelihood[apart])]
     roots = np.stack([principal_root(u[row : row + _BLOCK]) for row in rows[chosen]])
     few = _Climbers(start.take(chosen), roots, np.ones(len(chosen))).climbed(evaluate, rng)
     # Of the evidence below a level a lost mode holds no more than its share of live points there.
-    enough = first.log_likelihood[last] - _FROM_TOP * len(evaluate.names)
+    enough = first.log_likelihood[last] - _FROM_TOP * n_params
     few = few.take(np.flatnonzero(few.now.log_likelihood > enough))
-    few = few.take(np.flatnonzero(_apart(few.now, known, scale, _NEAREST, evaluate, rng)))
-    space, hills = unbounded(problem.prior), list[Hill]()
-    while len(few) and evaluate.n_calls + _hill_calls(len(evaluate.names)) < _MOST_SHARE * first.n_calls:
-        best = int(few.now.log_likelihood.argmax())
-        top = _settled(few.now.take(slice(best, best + 1)), few.root[best] * few.scale[best], evaluate, rng)
-        few = few.take(np.delete(np.arange(len(few)), best))
-        few = few.take(np.flatnonzero(_apart(few.now, top, scale, 1, evaluate, rng)))
-        drawn = _weighed(space.enter(top.theta), space, evaluate, rng)
-        if drawn is not None:
-            hill = Hill.of(drawn, space, rng)
-            hills += [] if hill.is_met_by(first) else [hill]
-    return Lost(tuple(hills), evaluate.n_calls)
+    return few.take(np.flatnonzero(_apart(few.now, known, scale, _NEAREST, evaluate, rng)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,6 +200,10 @@ class _Climbers:
 
     def take(self, rows: IntArray) -> _Climbers:
         return _Climbers(self.now.take(rows), self.root[rows], self.scale[rows])
+
+    def joined(self, others: _Climbers) -> _Climbers:
+        now = Points.join(self.now, others.now)
+        return _Climbers(now, np.concatenate([self.root, others.root]), np.concatenate([self.scale, others.scale]))
 
     def climbed(self, evaluate: Evaluator, rng: np.random.Generator) -> _Climbers:
         """Move to higher places on random lines; steps grow where they succeed and shrink where they fail."""

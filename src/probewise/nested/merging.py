@@ -13,8 +13,9 @@ from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested.check import DISAGREE, weighted_mean
+from probewise.nested.check import weighted_mean
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
+from probewise.nested.missing import DISAGREE
 from probewise.nested.result import Agreement, Check, NestedResult, versions
 
 __all__ = ["JoinedRecord", "agreement_of", "alive_at_death", "combined_p_value", "merge", "seeds_of"]

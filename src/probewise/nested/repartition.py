@@ -229,11 +229,16 @@ def groups_of(x: FloatArray) -> list[FloatArray]:
 
 
 def principal_root(x: FloatArray, scale: float = 1.0) -> FloatArray:
-    """Return a root of the covariance of points (n, n_params): principal axes as columns, times sd and `scale`.
+    """Return a root of the covariance of points (n, n_params), times `scale`; see `root_of_covariance`."""
+    return root_of_covariance(np.atleast_2d(np.cov(x, rowvar=False)), scale)
 
-    Axes along which the points do not vary keep a millionth of the greatest sd, so that the root can be inverted.
+
+def root_of_covariance(covariance: FloatArray, scale: float = 1.0) -> FloatArray:
+    """Return a root of a covariance, (n_params, n_params): the principal axes as columns, times sd and `scale`.
+
+    Axes without variance keep a millionth of the greatest sd, so that the root can be inverted.
     """
-    variance, axes = np.linalg.eigh(np.atleast_2d(np.cov(x, rowvar=False)))
+    variance, axes = np.linalg.eigh(covariance)
     sd = np.sqrt(np.maximum(variance, _FLATTEST * max(float(variance[-1]), 1e-300)))
     return np.asarray(scale * axes * sd)
 

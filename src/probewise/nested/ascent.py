@@ -1,4 +1,4 @@
-"""Climb from the end of a run to the top of the peak on which its last live points are.
+"""Climb to the top of a peak, such as that on which the last live points of a run are.
 
 Every generation is drawn from a normal distribution. The best quarter of it gives the mean of the next one, and its
 scatter about the old mean the covariance (as in CMA-ES, Hansen & Ostermeier 2001): the distribution stretches along a
@@ -15,13 +15,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.nested.evaluate import Evaluator, Points
-from probewise.nested.repartition import root_of_covariance
+from probewise.nested.repartition import principal_root, root_of_covariance
 from probewise.nested.result import NestedResult
 from probewise.nested.space import is_within
 
 _PER_PARAM, _LEAST_DRAWS = 10, 60  # draws of a generation
-_BEST = 0.25  # of them
-_LEARNT = 0.5  # share of the covariance that a generation replaces
+_BEST, _FEWEST_BEST = 0.25, 2  # of them
+_LEARNT = 0.3  # share of the covariance that a generation replaces
 _MOST_GENERATIONS = 80
 _LEVEL = 0.02  # nats between the best draws at the top: a gentle slope is followed, too
 _AS_DRAWN = 0.2  # nats between the best draws of the distribution that is returned
@@ -29,15 +29,18 @@ _AS_DRAWN = 0.2  # nats between the best draws of the distribution that is retur
 
 @dataclass(frozen=True, eq=False)
 class Top:
-    """The top of a peak: its highest point, and a normal distribution about it of `centre` (n_params,) and `root`.
+    """A place on a peak: its highest point, and a normal distribution of `centre` (n_params,) and `root`.
 
-    `root` is a root of the covariance, (n_params, n_params); where the top is rounded, the best quarter of draws lies
-    within 0.2 nats. All in the sampling coordinates.
+    `met`: the highest point met on the way there, maybe on another peak.
+
+    `root` is a root of the covariance, (n_params, n_params); at a rounded top that `climb` has found, the best quarter
+    of draws lies within 0.2 nats. All in the sampling coordinates.
     """
 
     highest: Points
     centre: FloatArray
     root: FloatArray
+    met: Points | None = None
 
     @property
     def height(self) -> float:
@@ -45,12 +48,16 @@ class Top:
         return float(self.highest.log_likelihood[0])
 
 
-def climb_from_end(run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator) -> Top:
-    """Climb from the last live points of a run for `max_calls` evaluations at most, counted by `evaluate`."""
-    last = slice(-run.n_live, None)
-    start = evaluate.known(run.theta[last], run.log_likelihood[last], run.label[last])
-    n_params, highest = start.u.shape[1], start.take(start.order()[-1:])
-    centre, covariance = start.u.mean(axis=0), np.atleast_2d(np.cov(start.u, rowvar=False))
+def climb(
+    start: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator, known: float = -math.inf
+) -> Top:
+    """Climb from a distribution to the top for `max_calls` evaluations at most, counted by `evaluate`.
+
+    Only draws above the log likelihood `known` count, those of another peak than a known one.
+    """
+    highest, centre, covariance = start.highest, start.centre, start.root @ start.root.T
+    met = highest
+    n_params = len(centre)
     n_draws, spread = max(_PER_PARAM * n_params, _LEAST_DRAWS), math.inf
     n_best, most = int(_BEST * n_draws), evaluate.n_calls + max_calls
     for _ in range(_MOST_GENERATIONS):
@@ -59,15 +66,23 @@ def climb_from_end(run: NestedResult, evaluate: Evaluator, *, max_calls: int, rn
         tried = centre + rng.standard_normal((n_draws, n_params)) @ root_of_covariance(covariance).T
         drawn = evaluate(tried[is_within(evaluate.space, tried)], rng)
         best = drawn.take(drawn.order()[::-1][:n_best])
-        if not len(best) or best.log_likelihood[-1] == -math.inf:
+        best = best.take(best.log_likelihood > known)
+        if len(best) < _FEWEST_BEST:
             covariance = _BEST * covariance
             continue
         off = best.u - centre
         covariance = (1 - _LEARNT) * covariance + _LEARNT * off.T @ off / len(best)
         centre = best.u.mean(axis=0)
         spread = float(np.ptp(best.log_likelihood))
-        if best.log_likelihood[0] > highest.log_likelihood[0]:
-            highest = best.take(slice(1))
+        highest = best.take(slice(1))
+        met = max(met, highest, key=lambda one: float(one.log_likelihood[0]))
     # About a rounded top heights spread as the covariance.
     wider = _AS_DRAWN / spread if 0 < spread < _AS_DRAWN else 1.0
-    return Top(highest, centre, root_of_covariance(wider * covariance))
+    return Top(highest, centre, root_of_covariance(wider * covariance), met)
+
+
+def end_of(run: NestedResult, evaluate: Evaluator) -> Top:
+    """Return the highest of the last live points of a run, their mean and a root of their covariance."""
+    last = slice(-run.n_live, None)
+    live = evaluate.known(run.theta[last], run.log_likelihood[last], run.label[last])
+    return Top(live.take(live.order()[-1:]), live.u.mean(axis=0), principal_root(live.u))

@@ -15,7 +15,7 @@ with hops between the parts that are then known.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -25,9 +25,9 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
+from probewise.nested.hills import Hill, evidence_not_met
 from probewise.nested.hops import HoppingMove
-from probewise.nested.lost import Lost
-from probewise.nested.missing import DISAGREE, NOTHING_MISSING, look_for_missing, raised
+from probewise.nested.missing import DISAGREE, Missing, look_for_missing, raised
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, groups_of, repartitioned
 from probewise.nested.result import Check, NestedResult, few_lineages, few_possible
@@ -192,12 +192,12 @@ def checked(
     """
     budget = max_cost * first.n_calls
     purse = _Purse(search, budget if max_calls is None else min(budget, max_calls), first.n_calls, rng)
-    now, missing = first, NOTHING_MISSING
+    now, missing = first, Missing()
     try:
         missing = look_for_missing(first, problem, max_calls=purse.left, rng=rng)
         purse.spent += missing.n_calls
         modes = None
-        if raised(first, missing.lost.not_in(first)) > _MATTERS:
+        if raised(first, evidence_not_met(missing.lost, first)) > _MATTERS:
             modes = _modes(first, missing.lost, problem, rng)
             chain = move if isinstance(move, SliceMove) else SliceMove()
             again = purse.run(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
@@ -229,11 +229,11 @@ def checked(
     return replace(now, n_calls=purse.spent, warnings=(*now.warnings, *notes, *missing.doubts(now)))
 
 
-def _modes(first: NestedResult, lost: Lost, problem: Samplable, rng: np.random.Generator) -> Clusters:
+def _modes(first: NestedResult, lost: Iterable[Hill], problem: Samplable, rng: np.random.Generator) -> Clusters:
     """Return the clusters of a run's posterior and the modes it lost, in the sampling coordinates."""
     space = space_of(problem.prior, getattr(problem, "periodic", ()))
     met = groups_of(space.enter(first.samples(_N_SAMPLES, rng=rng)))
-    return Clusters.of([*met, *(space.enter(hill.theta) for hill in lost.hills)])
+    return Clusters.of([*met, *(space.enter(hill.theta) for hill in lost)])
 
 
 def _second_estimate(

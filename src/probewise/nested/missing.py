@@ -1,55 +1,63 @@
-"""Look for parts of the posterior that a run has missed, from its last live points and its dead ones."""
+"""Look for parts of the posterior that a run has missed, from its last live points and its dead ones.
+
+Three ways lead to tops of which the run may know nothing. Early dead points climb to modes that died out (`lost`).
+Draws from the last live points climb to the top of their peak (`ascent`): where that lies far above all points of the
+run, it ended beside the bulk of its posterior, on the arm of a heavy tail along which its chains hardly moved. And
+draws at that top meet narrow peaks above the end (`beyond`). Each hill is weighed by importance sampling, and held
+against the share of the run's posterior at the same place (`hills`).
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
-from probewise.nested.ascent import climb_from_end
-from probewise.nested.beyond import NOTHING, Beyond, look_beyond
-from probewise.nested.evaluate import Evaluator, Samplable
-from probewise.nested.lost import NOTHING_LOST, Lost, look_for_lost
+from probewise.nested.ascent import Top, climb, end_of
+from probewise.nested.beyond import peaks_above
+from probewise.nested.evaluate import Evaluator, Points, Samplable
+from probewise.nested.hills import Hill, calls_to_weigh, evidence_not_met, settled_on, weighed
+from probewise.nested.lost import are_apart, climb_from_early, scale_of_bulk
 from probewise.nested.result import NestedResult
 
 DISAGREE = 2.5
 """Difference of two estimates of log Z, in combined standard errors, above which they disagree."""
 
 _ASCENT_SHARE = 1 / 20  # of a run's evaluations, at most
+_WEIGHING_SHARE = 1 / 6  # up to which another hill is weighed
+# Nats a parameter by which a top lies above all points of a run: of a normal posterior it is below half of that.
+_FAR_ABOVE = 0.5
 _MISSING = 1.0  # errors by which a part that has no live points raises log Z, above which it is a doubt
 
 
 @dataclass(frozen=True, eq=False)
 class Missing:
-    """Parts of the posterior that a run has missed: parts without live points, and a peak above its end.
+    """Hills that a run has missed: parts `lost` by its live points, and narrow peaks `above` its end.
 
     `n_calls`: evaluations that were used to look for them.
     """
 
-    lost: Lost
-    above: Beyond
-    n_calls: int
+    lost: tuple[Hill, ...] = ()
+    above: tuple[Hill, ...] = ()
+    n_calls: int = 0
 
     def doubts(self, run: NestedResult) -> tuple[str, ...]:
-        """Return a doubt in words for each part that matters for a run and that it has not met either."""
-        log_z, mine = self.lost.not_in(run), f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}"
-        notes = list[str]()
-        if raised(run, log_z) > _MISSING:
+        """Return a doubt in words for each kind that matters for a run and that it has not met either."""
+        lost, above = (evidence_not_met(hills, run) for hills in (self.lost, self.above))
+        mine, notes = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}", list[str]()
+        if raised(run, lost) > _MISSING:
             notes.append(
-                f"a mode that died out among the live points has a log Z of about {log_z:.2f}, {mine}; "
+                f"a mode that died out among the live points has a log Z of about {lost:.2f}, {mine}; "
                 "use more n_live or a greater max_cost"
             )
-        # By more errors than two right estimates would differ: the evidence of a peak above the end is a rough one.
-        if raised(run, self.above.log_z) > DISAGREE:
+        if raised(run, above) > DISAGREE:
             notes.append(
-                f"a narrow peak that no live point met lies above the run's end: its log Z is about "
-                f"{self.above.log_z:.1f}, {mine}; use more n_live or a prior about the peak"
+                f"a narrow peak that no live point met lies above the run's end: its log Z is about {above:.1f}, "
+                f"{mine}; use more n_live or a prior about the peak"
             )
         return tuple(notes)
-
-
-NOTHING_MISSING = Missing(NOTHING_LOST, NOTHING, 0)
-"""Nothing missing, nothing evaluated."""
 
 
 def raised(run: NestedResult, log_z: float) -> float:
@@ -58,7 +66,12 @@ def raised(run: NestedResult, log_z: float) -> float:
 
 
 def look_for_missing(
-    run: NestedResult, problem: Samplable, *, max_calls: float, rng: np.random.Generator, lost: Lost | None = None
+    run: NestedResult,
+    problem: Samplable,
+    *,
+    max_calls: float,
+    rng: np.random.Generator,
+    lost: tuple[Hill, ...] | None = None,
 ) -> Missing:
     """Look for what a run has missed, where the prior's coordinates allow it.
 
@@ -79,10 +92,35 @@ def look_for_missing(
         If the likelihood fails.
     """
     if not run.names or not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
-        return NOTHING_MISSING
+        return Missing()
     evaluate = Evaluator(problem)
-    top = climb_from_end(run, evaluate, max_calls=int(min(max_calls, _ASCENT_SHARE * run.n_calls)), rng=rng)
+
+    def left(share: float = math.inf) -> int:
+        return int(min(max_calls - evaluate.n_calls, share * run.n_calls))
+
+    top = climb(end_of(run, evaluate), evaluate, max_calls=left(_ASCENT_SHARE), rng=rng)
     if lost is None:
-        lost = look_for_lost(run, top, evaluate, max_calls=int(max_calls) - evaluate.n_calls, rng=rng)
-    above = look_beyond(run, top, evaluate, max_calls=int(max_calls) - evaluate.n_calls, rng=rng)
+        tops = climb_from_early(run, evaluate, max_calls=left(), rng=rng)
+        if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
+            tops.append(top)
+        lost = _hills_not_met(tops, run, evaluate, max_calls=left(_WEIGHING_SHARE), rng=rng)
+    peaks = peaks_above(run, top, evaluate, max_calls=left(), rng=rng)
+    above = _hills_not_met(peaks, run, evaluate, max_calls=left(), rng=rng)
     return Missing(lost, above, evaluate.n_calls)
+
+
+def _hills_not_met(
+    tops: Iterable[Top], run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
+) -> tuple[Hill, ...]:
+    """Weigh the hills of some tops, the highest first and each once, and return those that a run has not met."""
+    hills, most = list[Hill](), evaluate.n_calls + max_calls
+    rest = sorted(tops, key=lambda top: top.height)
+    while rest and evaluate.n_calls + calls_to_weigh(len(run.names)) < most:
+        settled = settled_on(rest.pop(), evaluate, rng)
+        if rest:
+            points = Points.join(*(top.highest for top in rest))
+            apart = are_apart(points, settled, scale_of_bulk(run, evaluate.space), 1, evaluate, rng)
+            rest = [top for top, is_apart in zip(rest, apart, strict=True) if is_apart]
+        hill = weighed(settled, evaluate, rng)
+        hills += [] if hill is None or hill.is_met_by(run) else [hill]
+    return tuple(hills)

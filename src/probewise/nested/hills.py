@@ -1,0 +1,127 @@
+"""Weigh a hill of the posterior by importance sampling, and ask whether a run has met it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import logsumexp
+
+from probewise._arrays import FloatArray
+from probewise.nested.ascent import Top
+from probewise.nested.clusters import Clusters
+from probewise.nested.evaluate import Bound, Evaluator, Points
+from probewise.nested.importance import HeldOut, Weighted, weigh_draws
+from probewise.nested.mixture import single
+from probewise.nested.moves import SliceMove
+from probewise.nested.repartition import principal_root
+from probewise.nested.result import NestedResult
+from probewise.nested.space import Space, unbounded
+from probewise.nested.weights import n_effective
+
+_N_SAMPLES = 1000  # of a hill
+_ROUNDS = 6
+_SETTLED = 0.5  # nats
+_FEWEST_STEPS = 6
+_PER_PARAM, _DRAWS_PER_PARAM = 4, 40
+_FITS, _ENOUGH = 6, 4.0  # effective samples a parameter
+_POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.15, 0.1)
+_WIDER = 1.2  # the sds of the Student t than those of the points it is fitted to
+_INSIDE = 0.9  # of the weight of a hill, within the ellipsoid in which the run's own weight is counted
+_MET = 0.5  # of the evidence of a hill: with more, the run has met it
+
+
+@dataclass(frozen=True, eq=False)
+class Hill:
+    """A hill of the posterior and the log of its evidence.
+
+    `theta`: samples of it, (n, n_params). The ellipsoid of `shape`, a single cluster in coordinates of `space`, holds
+    most of it within `radius` sds.
+    """
+
+    log_z: float
+    theta: FloatArray
+    space: Space
+    shape: Clusters
+    radius: float
+
+    @classmethod
+    def of(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> Hill:
+        """Take the shape of weighted draws."""
+        theta = drawn.samples(_N_SAMPLES, rng=rng)
+        x = space.enter(theta)
+        shape = Clusters.of([x])
+        return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance(x, shape), _INSIDE)))
+
+    def is_met_by(self, run: NestedResult) -> bool:
+        """Whether a run has at least half of this evidence at the same place."""
+        inside = _distance(self.space.enter(run.theta), self.shape) <= self.radius
+        near = float(run.weight[inside].sum())
+        return near > 0 and run.log_z + math.log(near) > self.log_z + math.log(_MET * _INSIDE)
+
+
+def _distance(x: FloatArray, shape: Clusters) -> FloatArray:
+    """Distance of points (n, n_params) from the middle of a cluster, sds, (n,)."""
+    return np.asarray(np.linalg.norm((x - shape.mean[0]) @ shape.inverse_root[0].T, axis=1))
+
+
+def evidence_not_met(hills: Iterable[Hill], run: NestedResult) -> float:
+    """Log of the evidence of those hills that a run has not met; -inf where it met all."""
+    return float(logsumexp([-math.inf, *(hill.log_z for hill in hills if not hill.is_met_by(run))]))
+
+
+def _points_on_hill(n_params: int) -> int:
+    return max(_PER_PARAM * n_params, 20)
+
+
+def calls_to_weigh(n_params: int) -> float:
+    """About as many evaluations as it takes to weigh a hill: two or three rounds of chains."""
+    return 2.5 * _points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
+
+
+def settled_on(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Points:
+    """Draw points uniformly from the top of a hill, down to where they have the covariance of a normal posterior."""
+    n_params = top.root.shape[0]
+    n = _points_on_hill(n_params)
+    below = (n_params + 2) / 2
+    move = SliceMove(hops=0)
+    live = top.highest.u + rng.standard_normal((n, n_params)) @ top.root.T
+    starts = top.highest.take(np.zeros(n, dtype=np.int64))
+    highest, log_volume = top.height, -math.inf
+    for _ in range(_ROUNDS):
+        drawn, _ = move.draw(starts, Bound(highest - below, 1.0), live, evaluate, rng)
+        last, log_volume = log_volume, float(np.linalg.slogdet(principal_root(drawn.u))[1])
+        rise = max(float(drawn.log_likelihood.max()) - highest, 0.0)
+        if rise < _SETTLED and abs(log_volume - last) < _SETTLED * math.sqrt(n_params):
+            break
+        highest += rise
+        live = drawn.u
+        starts = drawn.take((drawn.log_likelihood > highest - below).nonzero()[0])
+        starts = starts.take(rng.integers(len(starts), size=n))
+    return drawn
+
+
+def weighed(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
+    """Weigh a hill by draws from a Student t about points on it, fitted anew if need be; None where none fits."""
+    space = unbounded(evaluate.problem.prior)
+    x, n_params = space.enter(settled.theta), settled.theta.shape[1]
+    mean, covariance = x.mean(axis=0), np.atleast_2d(np.cov(x, rowvar=False))
+    n_draws, enough = max(_DRAWS_PER_PARAM * n_params, 200), _ENOUGH * n_params
+    for _ in range(_FITS):
+        proposal = single(mean, _WIDER**2 * covariance)
+        drawn = weigh_draws(proposal, 0.0, HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
+        if drawn.n_eff > enough:
+            return Hill.of(drawn, space, rng)
+        if not drawn.n_eff > 1:
+            return None
+        # A power of the weights that leaves enough of them for a covariance.
+        power = next((p for p in _POWERS if n_effective(p * drawn.log_weight) > enough), None)
+        if power is None:
+            return None
+        weight, x = np.exp(power * drawn.log_weight), space.enter(drawn.theta)
+        weight /= weight.sum()
+        mean = weight @ x
+        covariance = (x - mean).T @ ((x - mean) * weight[:, None])
+    return None

@@ -10,7 +10,7 @@ import pytest
 from nested_sampling import problems
 from scipy.special import logsumexp
 
-from probewise.nested import NestedResult, SliceMove
+from probewise.nested import NestedResult, SliceMove, refine
 from probewise.nested.check import checked
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Samplable
@@ -66,6 +66,17 @@ def test_a_mode_without_live_points_is_found_and_weighed(robbed: NestedResult) -
     assert missing.n_calls < robbed.n_calls / 3
 
 
+def test_a_refinement_of_a_run_that_was_not_checked_looks_for_lost_modes_itself(robbed: NestedResult) -> None:
+    """The look leaves the refined evidence as it was."""
+    found, without = (
+        refine(robbed, Two(), rng=np.random.default_rng(8), n_draws=1000, look=look) for look in (True, False)
+    )
+    assert found.log_z == without.log_z
+    assert without.sound
+    assert "a part of the posterior that the live points have lost has a log Z of about" in found.doubts[-1]
+    assert 0 < found.n_calls - without.n_calls < robbed.n_calls / 2
+
+
 def check(robbed: NestedResult, max_cost: float) -> NestedResult:
     return checked(
         robbed,
@@ -91,7 +102,10 @@ def test_a_lost_mode_is_won_back_by_hops_to_it(robbed: NestedResult) -> None:
 def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed: NestedResult) -> None:
     result = check(robbed, 1.5)
     assert result.log_z == robbed.log_z
-    assert any("a mode that died out among the live points has a log Z of about" in note for note in result.warnings)
+    assert any(
+        "a part of the posterior that the live points have lost has a log Z of about" in note
+        for note in result.warnings
+    )
     assert result.n_calls <= 1.5 * robbed.n_calls
 
 

@@ -59,7 +59,7 @@ def search_order(
     if not refined:
         note = f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}"
         return Found(result, None, (note,))
-    more_precise = refine(result, problem, rng=rng, n_draws=_N_DRAWS)
+    more_precise = refine(result, problem, rng=rng, n_draws=_N_DRAWS, look=False)
     return Found(result, more_precise, _disagreement(n_gaussians, result, more_precise))
 
 

@@ -10,11 +10,12 @@ from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.dynamic import Goal, intensified
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.genealogy import chain_memory
-from probewise.nested.importance import Weighted, pareto_k, refine, update
+from probewise.nested.importance import Weighted, pareto_k, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.pose import Posed, pose
+from probewise.nested.refine import refine
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run

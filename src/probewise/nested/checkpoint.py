@@ -23,8 +23,6 @@ from probewise.nested.moves import Move
 from probewise.nested.stop import StopRule
 from probewise.recordings.atomic import write_bytes_atomically
 
-__all__ = ["Dead", "Keeper", "Live", "Origin", "Run", "settings_of"]
-
 _FORMAT = "nested-checkpoint/3"
 _ROUNDING = 1e-6
 _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")

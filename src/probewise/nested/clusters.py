@@ -8,8 +8,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["Clusters", "find_clusters"]
-
 _MOST_CLUSTERS = 32
 _N_REFINEMENTS = 4
 

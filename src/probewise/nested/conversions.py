@@ -14,8 +14,6 @@ from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.nested.dead_points import DeadPoints
 
-__all__ = ["to_anesthetic", "to_arviz"]
-
 
 def to_anesthetic(result: DeadPoints) -> Any:
     """Convert to `anesthetic.NestedSamples`: parameters, `logL` and `logL_birth` of every dead point.

@@ -12,8 +12,6 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evidence import log_volumes
 from probewise.nested.weighted_samples import WeightedSamples
 
-__all__ = ["COUNTS", "PER_POINT", "DeadPoints", "of_length"]
-
 PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label")
 COUNTS = ("parent", "n_at_death")
 

@@ -13,8 +13,6 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.priors import require_prior
 
-__all__ = ["DiversifyTally", "diversify"]
-
 _N_PRIOR_DRAWS = 200
 _BLOCK = 100
 

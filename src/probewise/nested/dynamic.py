@@ -28,8 +28,6 @@ from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, versions
 from probewise.nested.sampler import least_live, move_at, plain_state, step
 
-__all__ = ["Goal", "intensified"]
-
 Goal: TypeAlias = Literal["posterior", "evidence"]
 
 _BULK = 0.95  # central share of the posterior's mass, in order of death, that a thread for the posterior spans

@@ -15,8 +15,6 @@ from probewise.errors import NotConvergedError
 from probewise.nested.space import Space, space_of
 from probewise.priors import Prior, require_prior
 
-__all__ = ["Bound", "Evaluator", "Points", "Samplable"]
-
 
 class Samplable(Protocol):
     """A problem as the sampler needs it: `probewise.inference.Problem`, or anything with the same attributes."""
@@ -150,10 +148,12 @@ class Evaluator:
             If the likelihood raises, or returns the wrong shape, NaN or +inf; -inf (impossible) is allowed.
         """
         theta, log_density = self.space.leave(u)
-        return self.weigh(u, theta, log_density, rng)
+        return self.evaluate_mapped(u, theta, log_density, rng)
 
-    def weigh(self, u: FloatArray, theta: FloatArray, log_density: FloatArray, rng: np.random.Generator) -> Points:
-        """Evaluate points given the result of `space.leave(u)`, and give every point a new label.
+    def evaluate_mapped(
+        self, u: FloatArray, theta: FloatArray, log_density: FloatArray, rng: np.random.Generator
+    ) -> Points:
+        """Evaluate points whose parameters and prior density, `space.leave(u)`, are known; give each a new label.
 
         Where the prior's density is zero the likelihood is not evaluated and the point counts as impossible.
         """
@@ -164,6 +164,8 @@ class Evaluator:
         if possible.any():
             log_likelihood[possible] = self.log_likelihood(theta[possible])
         return Points(u, theta, log_density, log_likelihood, rng.random(len(u)))
+
+    weigh = evaluate_mapped  # its earlier name
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Evaluate the likelihood of hypotheses, (n, n_params) -> (n,), with the checks described above."""

@@ -10,8 +10,6 @@ from scipy.special import kolmogorov, logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["DOUBTFUL_P_VALUE", "Evidence", "insertion_p_value", "integrate", "log_volumes"]
-
 DOUBTFUL_P_VALUE = 1e-4
 """p value of the insertion ranks below which a result is doubtful: one false alarm in 10,000 runs."""
 

@@ -16,8 +16,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["chain_memory"]
-
 _MOST_WINDOWS = 32
 _LEAST_LAG = 4
 

@@ -13,11 +13,10 @@ from probewise._arrays import FloatArray
 from probewise.nested.ascent import Top
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
-from probewise.nested.importance import HeldOut, Weighted, weigh_draws
+from probewise.nested.importance import HeldOut, Posterior, Weighted, weigh_draws
 from probewise.nested.mixture import single
 from probewise.nested.moves import SliceMove
 from probewise.nested.repartition import principal_root
-from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded
 from probewise.nested.weights import n_effective
 
@@ -55,7 +54,7 @@ class Hill:
         shape = Clusters.of([x])
         return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance(x, shape), _INSIDE)))
 
-    def is_met_by(self, run: NestedResult) -> bool:
+    def is_met_by(self, run: Posterior) -> bool:
         """Whether a run has at least half of this evidence at the same place."""
         inside = _distance(self.space.enter(run.theta), self.shape) <= self.radius
         near = float(run.weight[inside].sum())
@@ -67,7 +66,7 @@ def _distance(x: FloatArray, shape: Clusters) -> FloatArray:
     return np.asarray(np.linalg.norm((x - shape.mean[0]) @ shape.inverse_root[0].T, axis=1))
 
 
-def evidence_not_met(hills: Iterable[Hill], run: NestedResult) -> float:
+def evidence_not_met(hills: Iterable[Hill], run: Posterior) -> float:
     """Log of the evidence of those hills that a run has not met; -inf where it met all."""
     return float(logsumexp([-math.inf, *(hill.log_z for hill in hills if not hill.is_met_by(run))]))
 

@@ -12,8 +12,6 @@ from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.moves import SliceMove, Tally
 from probewise.nested.space import is_within
 
-__all__ = ["HoppingMove"]
-
 _HOPS = 3
 
 
@@ -54,7 +52,7 @@ class HoppingMove:
         theta, log_density = space.leave(u[rows])
         dense = (log_density >= level[rows]).nonzero()[0]
         rows = rows[dense]
-        tried = evaluate.weigh(u[rows], theta[dense], log_density[dense], rng)
+        tried = evaluate.evaluate_mapped(u[rows], theta[dense], log_density[dense], rng)
         won = bound.admits(tried.log_likelihood, tried.label).nonzero()[0]
         now.put(rows[won], tried, won)
 

@@ -21,20 +21,17 @@ from probewise._arrays import FloatArray, frozen
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
-from probewise.nested.proposal import Proposal, find_parts, fit_proposals, joined
+from probewise.nested.proposal import Proposal, find_parts, fit_proposals
 from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded
 from probewise.nested.weighted_samples import WeightedSamples
 from probewise.nested.weights import n_effective, resampled
-
-__all__ = ["Weighted", "pareto_k", "refine", "update"]
 
 # Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
 _MOST_K = 0.7
 _FEW_EFFECTIVE = 100.0
 _MOST_FITTED = 2000
 _SURPRISED = 0.01
-_FIRST = 0.75
 _MOST_LOST = 0.2
 _HELD_OUT = 1 / 3
 _MOST_HELD = 1000
@@ -134,74 +131,6 @@ class Weighted(WeightedSamples):
 
 
 Posterior: TypeAlias = NestedResult | Weighted
-
-
-def refine(
-    result: Posterior, problem: Samplable, *, rng: np.random.Generator, n_draws: int = 5000, n_pilots: int = 2
-) -> Weighted:
-    """Reduce the error of a run's evidence and posterior by importance sampling.
-
-    Two forms of proposal density are fitted to two thirds of the run's posterior samples. In each pilot
-    round a few draws of each are weighted; the form with the larger effective sample size gets the larger
-    share of the mixture, and its weighted draws are added to the samples for the next fit. Finally
-    `n_draws` points are drawn. Only these count, so they are independent.
-
-    The error includes three corrections. The held-out third of the samples is combined with the draws by
-    bridge sampling (Meng & Wong 1996), which estimates the share of the posterior that the proposal
-    misses. A heavy tail of the weights, which slows the convergence of their mean, increases the error. And
-    the run may have lost a part of the posterior: with n_live points and information H it knows the
-    shares of the posterior's parts as precisely as n_live / H independent samples, so a part of share
-    s is lost with probability exp(-s n_live / H); the sum of s times that over the parts found is added.
-
-    Parameters
-    ----------
-    result
-        A run of the same problem.
-    problem
-        Prior and likelihood.
-    rng
-        Source of randomness.
-    n_draws
-        Number of final draws; every pilot round takes a quarter of that in addition.
-    n_pilots
-        Number of pilot rounds, 1 or more.
-
-    Returns
-    -------
-    Weighted
-        Check `sound` before using it instead of the run's evidence.
-
-    Raises
-    ------
-    ParameterError
-        If an option is out of range or the run has other parameters.
-    """
-    evaluate = Evaluator(problem)
-    if result.names != evaluate.names:
-        raise ParameterError("result.names", result.names, f"the problem's names {evaluate.names}")
-    if n_draws < 100:
-        raise ParameterError("n_draws", n_draws, "100 or more")
-    if n_pilots < 1:
-        raise ParameterError("n_pilots", n_pilots, "1 or more")
-    space = unbounded(problem.prior)
-    n_lineages = count_lineages(result)
-    fitted, held = split_off(result, n_lineages, space, rng)
-    known = [fitted]
-    for _ in range(n_pilots):
-        proposals = fit_proposals(np.concatenate(known), rng=rng)
-        pilots = [
-            weigh_draws(p, 0.0, HeldOut.nothing(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
-            for p in proposals
-        ]
-        first = int(np.argmax([pilot.n_eff for pilot in pilots]))
-        better = pilots[first]
-        # The other form keeps a share: it may cover what the better one does not.
-        others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
-        best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
-        if better.n_eff > 2 * len(evaluate.names):
-            known.append(resampled_for_fit(better.theta, better.log_weight, space, rng))
-    found = with_lost(weigh_draws(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng)
-    return replace(found, inherited=inherited_doubts(found, result))
 
 
 def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:

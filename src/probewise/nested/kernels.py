@@ -19,8 +19,6 @@ from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.moves import SliceMove, Tally
 from probewise.priors import require_prior
 
-__all__ = ["KernelMove", "Kernels", "diversify_by_kernels"]
-
 _BLOCK = 4096  # proposals evaluated at a time: their predictions stay in the cache
 _DENSITY_BLOCK = 1024
 

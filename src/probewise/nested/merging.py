@@ -18,8 +18,6 @@ from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
 from probewise.nested.missing import DISAGREE
 from probewise.nested.result import Agreement, Check, NestedResult, versions
 
-__all__ = ["JoinedRecord", "agreement_of", "alive_at_death", "combined_p_value", "merge", "seeds_of"]
-
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
 
@@ -67,22 +65,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     agreement = agreement_of(parts)
     check = _joined_checks(parts, evidence.log_z, evidence.error(remembered))
     p_value = combined_p_value([r.insertion_p_value for r in parts])
-    doubts, error = [], evidence.error(remembered)
-    if agreement.p_value < _DISAGREE:
-        doubts.append(
-            f"the {agreement.n_runs} runs disagree more than their errors: ln Z from {min(agreement.log_z):.2f} to "
-            f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
-            "the error is widened to their scatter; use more n_live or longer chains"
-        )
-        error = max(error, agreement.scatter)
-    if p_value < DOUBTFUL_P_VALUE:
-        doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
-    if check is not None and abs(check.distance) > DISAGREE:
-        doubts.append(
-            f"{check.route} gives log Z = {check.log_z:.2f} ± {check.log_z_error:.2f}, the runs together "
-            f"{evidence.log_z:.2f} ± {error:.2f}: {abs(check.distance):.1f} errors apart; a bias shared by all runs "
-            "does not average out; use longer chains"
-        )
+    error, doubts = _doubts(agreement, check, p_value, evidence.log_z, evidence.error(remembered))
     for doubt in doubts:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     said = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
@@ -116,6 +99,29 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         agreement=agreement,
         check=check,
     )
+
+
+def _doubts(
+    agreement: Agreement, check: Check | None, p_value: float, log_z: float, error: float
+) -> tuple[float, list[str]]:
+    """Return the error of the runs together, widened where they disagree, and the doubts about them in words."""
+    doubts = list[str]()
+    if agreement.p_value < _DISAGREE:
+        doubts.append(
+            f"the {agreement.n_runs} runs disagree more than their errors: ln Z from {min(agreement.log_z):.2f} to "
+            f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
+            "the error is widened to their scatter; use more n_live or longer chains"
+        )
+        error = max(error, agreement.scatter)
+    if p_value < DOUBTFUL_P_VALUE:
+        doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
+    if check is not None and abs(check.distance) > DISAGREE:
+        doubts.append(
+            f"{check.route} gives log Z = {check.log_z:.2f} ± {check.log_z_error:.2f}, the runs together "
+            f"{log_z:.2f} ± {error:.2f}: {abs(check.distance):.1f} errors apart; a bias shared by all runs "
+            "does not average out; use longer chains"
+        )
+    return error, doubts
 
 
 def agreement_of(results: Iterable[NestedResult]) -> Agreement:

@@ -19,6 +19,7 @@ from probewise.nested.ascent import Top, climb, end_of
 from probewise.nested.beyond import peaks_above
 from probewise.nested.evaluate import Evaluator, Points, Samplable
 from probewise.nested.hills import Hill, calls_to_weigh, evidence_not_met, settled_on, weighed
+from probewise.nested.importance import Posterior
 from probewise.nested.lost import are_apart, climb_from_early, scale_of_bulk
 from probewise.nested.result import NestedResult
 
@@ -43,13 +44,13 @@ class Missing:
     above: tuple[Hill, ...] = ()
     n_calls: int = 0
 
-    def doubts(self, run: NestedResult) -> tuple[str, ...]:
+    def doubts(self, run: Posterior) -> tuple[str, ...]:
         """Return a doubt in words for each kind that matters for a run and that it has not met either."""
         lost, above = (evidence_not_met(hills, run) for hills in (self.lost, self.above))
         mine, notes = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}", list[str]()
         if raised(run, lost) > _MISSING:
             notes.append(
-                f"a mode that died out among the live points has a log Z of about {lost:.2f}, {mine}; "
+                f"a part of the posterior that the live points have lost has a log Z of about {lost:.2f}, {mine}; "
                 "use more n_live or a greater max_cost"
             )
         if raised(run, above) > DISAGREE:
@@ -60,7 +61,7 @@ class Missing:
         return tuple(notes)
 
 
-def raised(run: NestedResult, log_z: float) -> float:
+def raised(run: Posterior, log_z: float) -> float:
     """By how many errors the evidence of a part that a run has not met raises log Z."""
     return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / max(run.log_z_error, 1e-12)
 

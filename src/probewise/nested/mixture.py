@@ -8,8 +8,6 @@ from probewise._arrays import FloatArray
 from probewise.nested.clusters import Clusters
 from probewise.nested.proposal import DEGREES_OF_FREEDOM, Proposal
 
-__all__ = ["fit_mixture", "single"]
-
 _NUMBERS = (1, 2, 3, 5, 8, 12, 18, 27, 40)
 _TO_CHOOSE, _TO_FIT = 12, 30  # iterations
 _LLOYD = 8

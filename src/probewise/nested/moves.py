@@ -14,8 +14,6 @@ from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.space import Space
 
-__all__ = ["Move", "PriorRejection", "SliceMove", "Tally"]
-
 # Candidates drawn ahead of their rejection, where few chains are left.
 _MOST_AHEAD = 4
 # With three steps in three dimensions the chains stay correlated: ln Z scattered by 1.3 of its claimed errors.
@@ -251,7 +249,7 @@ class SliceMove:
                 pending = pending[above_level]
                 ok[:] = False
             if pending.size:
-                tried = evaluate.weigh(candidate.take(pending, axis=0), theta, log_density, rng)
+                tried = evaluate.evaluate_mapped(candidate.take(pending, axis=0), theta, log_density, rng)
                 ok[pending] = bound.admits(tried.log_likelihood, tried.label)
                 n_evaluated += pending.size
             n_needed, delivered = _needed(ok.reshape(-1, n_ahead))

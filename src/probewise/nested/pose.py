@@ -15,8 +15,6 @@ from probewise.errors import ParameterError
 from probewise.nested.evaluate import Samplable
 from probewise.priors import Marginal, Prior, Product, Uniform
 
-__all__ = ["AnyPrior", "Posed", "as_problem", "pose"]
-
 AnyPrior: TypeAlias = "Prior | Mapping[str, Any] | Sequence[Any] | Callable[[FloatArray], Any]"
 
 _ALLOWED_PRIOR = (
@@ -163,16 +161,11 @@ def _named(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Pr
     if isinstance(prior, type):
         raise ParameterError("prior", prior, _ALLOWED_PRIOR)
     if isinstance(prior, Mapping):
-        made: Prior = Product({str(name): _marginal(f"prior[{name!r}]", one) for name, one in prior.items()})
+        made: Prior = Product({str(name): _as_marginal(f"prior[{name!r}]", one) for name, one in prior.items()})
     elif isinstance(prior, Prior) or (hasattr(prior, "names") and hasattr(prior, "from_unit_cube")):
         made = prior  # type: ignore[assignment]
     elif isinstance(prior, Sequence) and not isinstance(prior, str | bytes):
-        own = given if given is not None else tuple(f"p{i}" for i in range(len(prior)))
-        if len(own) != len(prior):
-            raise ParameterError("names", names, f"{len(prior)} names, one for each distribution")
-        made = Product({n: _marginal(f"prior[{i}]", one) for i, (n, one) in enumerate(zip(own, prior, strict=True))})
-        if len(made.names) != len(prior):
-            raise ParameterError("names", names, "each name once")
+        made = _product_of(prior, given, names)
     elif callable(prior) and not hasattr(prior, "logpdf"):
         if given is None:
             allowed = "the names of the parameters, since the prior is a function: names=['x', 'y']"
@@ -185,13 +178,24 @@ def _named(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Pr
     return made
 
 
-def _marginal(name: str, one: Any) -> Marginal:
+def _product_of(prior: Sequence[Any], given: tuple[str, ...] | None, names: Sequence[str] | None) -> Product:
+    """Make a prior of a list of distributions; without names they are p0, p1, ..."""
+    own = given if given is not None else tuple(f"p{i}" for i in range(len(prior)))
+    if len(own) != len(prior):
+        raise ParameterError("names", names, f"{len(prior)} names, one for each distribution")
+    made = Product({n: _as_marginal(f"prior[{i}]", one) for i, (n, one) in enumerate(zip(own, prior, strict=True))})
+    if len(made.names) != len(prior):
+        raise ParameterError("names", names, "each name once")
+    return made
+
+
+def _as_marginal(name: str, one: Any) -> Marginal:
+    """Convert a distribution in any of its forms to a marginal; `name` says in errors where it was given."""
     if isinstance(one, tuple | list) and len(one) == 2 and all(isinstance(end, Real) for end in one):
         return Uniform(float(one[0]), float(one[1]))
     if all(hasattr(one, method) for method in ("from_unit", "to_unit", "log_prob")):
         return one  # type: ignore[no-any-return]
-    quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
-    if quantile and hasattr(one, "cdf") and hasattr(one, "logpdf") and not isinstance(one, type):
+    if _is_scipy(one):
         if hasattr(one, "freeze"):
             raise ParameterError(name, one, "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)")
         return _Scipy(one)
@@ -201,6 +205,12 @@ def _marginal(name: str, one: Any) -> Marginal:
         "Uniform(low, high) or a pair (low, high), LogUniform(low, high), Normal(mean, sd), or a frozen continuous "
         "scipy.stats one",
     )
+
+
+def _is_scipy(one: Any) -> bool:
+    """Whether a value has the methods of a continuous distribution of scipy.stats."""
+    quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
+    return quantile and hasattr(one, "cdf") and hasattr(one, "logpdf") and not isinstance(one, type)
 
 
 def as_problem(

@@ -12,8 +12,6 @@ from scipy.special import gammaln, logsumexp
 from probewise._arrays import FloatArray
 from probewise.nested.clusters import Clusters, find_clusters
 
-__all__ = ["DEGREES_OF_FREEDOM", "Proposal", "find_parts", "fit_proposals", "joined"]
-
 # Heavier tails than a Gaussian's keep the weights bounded where the fit is too narrow.
 DEGREES_OF_FREEDOM = 8.0
 _MOST_KERNELS = 400

@@ -25,8 +25,6 @@ from probewise.nested.evaluate import Samplable
 from probewise.nested.space import Space, unbounded
 from probewise.priors import Prior
 
-__all__ = ["Repartitioned", "groups_of", "principal_root", "repartitioned"]
-
 _DEGREES_OF_FREEDOM = 5.0
 _FLATTEST = 1e-12  # least variance along an axis, relative to the greatest
 _SAMPLES_IN_CLUSTER = 20  # samples per parameter in each cluster: with fewer, repeated samples look like a cluster

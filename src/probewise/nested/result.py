@@ -23,8 +23,6 @@ from probewise.nested import conversions
 from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, of_length
 from probewise.recordings.atomic import write_bytes_atomically
 
-__all__ = ["Agreement", "Check", "NestedResult", "few_lineages", "few_possible", "versions"]
-
 _FORMAT = "nested-result/4"
 # Lineage variance above which the run descends from too few lineages to estimate its own error.
 _MOST_MEMORY = 10.0

@@ -22,8 +22,6 @@ from probewise.nested.result import NestedResult
 from probewise.nested.sampler import least_live, search
 from probewise.nested.stop import RoundSummary, StopRule
 
-__all__ = ["run"]
-
 
 def run(
     problem: Samplable | Callable[..., Any],

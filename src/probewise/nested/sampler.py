@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -31,8 +31,6 @@ from probewise.nested.genealogy import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import NestedResult, few_lineages, few_possible, versions
 from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
-
-__all__ = ["LIVE_PER_PARAM", "Dead", "Live", "least_live", "move_at", "plain_state", "search", "step"]
 
 LIVE_PER_PARAM = 2
 """Least number of live points per parameter."""
@@ -143,56 +141,70 @@ def search(
     now = _first_live_points(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)
-
-    def save() -> None:
-        if keeper is not None:
-            keeper.save(now)
-
-    def finish(reason: str, *more_notes: str) -> NestedResult:
-        save()
-        noted = replace(now, notes=(*now.notes, *more_notes))
-        # Depends only on the state after the last round: not on where in a round an interruption came, nor on
-        # the generator's seed sequence, which its state does not include.
-        rng.bit_generator.state = now.rng_state
-        summing = np.random.default_rng(rng.integers(2**63, size=4))
-        return _result(evaluate, noted, n_live, reason, seed_state, summing)
-
+    under_way = _Search(evaluate, rng, n_live, n_replaced, rule, seed_state, keeper, now)
     try:
-        while True:
-            if now.ended is not None:
-                result = finish(now.ended)
-                break
-            # A round can cost twice the last one: the volume halves while points are drawn from the prior.
-            if max_calls is not None and evaluate.n_calls + 2 * now.last_cost > max_calls:
-                reason = f"stopped at {evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
-                result = finish(reason, f"{reason}; log Z lacks what a full run would have found")
-                break
-            after, state = _round(now, evaluate, n_replaced, rng)
-            # One assignment, so that an interruption leaves a round either complete or not begun.
-            now = replace(after, ended=rule(state))
-            if progress is not None:
-                progress(state)
-            if keeper is not None:
-                keeper.save_if_due(now)
+        return under_way.to_end(max_calls, progress)
     except NotConvergedError as error:
-        if now.dead:
-            error.partial = finish("the likelihood failed", f"the likelihood failed: {error}")
+        if under_way.now.dead:
+            error.partial = under_way.finish("the likelihood failed", f"the likelihood failed: {error}")
         else:
-            save()
+            under_way.save()
         raise
     except KeyboardInterrupt:
-        if not now.dead or not return_interrupted:
-            save()
+        if not under_way.now.dead or not return_interrupted:
+            under_way.save()
             raise
-        if now.ended is not None:
-            result = finish(now.ended)
-        else:
-            result = finish("interrupted", "interrupted; log Z lacks what a full run would have found")
+        if under_way.now.ended is not None:
+            return under_way.finish(under_way.now.ended)
+        return under_way.finish("interrupted", "interrupted; log Z lacks what a full run would have found")
     except BaseException:
         # `progress`, `stop` or a signal handler raised.
-        save()
+        under_way.save()
         raise
-    return result
+
+
+@dataclass
+class _Search:
+    """A run of nested sampling under way; `now` is its state after the last whole round."""
+
+    evaluate: Evaluator
+    rng: np.random.Generator
+    n_live: int
+    n_replaced: int
+    rule: StopRule
+    seed_state: str
+    keeper: Keeper | None
+    now: Run
+
+    def save(self) -> None:
+        if self.keeper is not None:
+            self.keeper.save(self.now)
+
+    def finish(self, reason: str, *more_notes: str) -> NestedResult:
+        """Save the state and compute the result from it."""
+        self.save()
+        noted = replace(self.now, notes=(*self.now.notes, *more_notes))
+        # Depends only on the state after the last round: not on where in a round an interruption came, nor on
+        # the generator's seed sequence, which its state does not include.
+        self.rng.bit_generator.state = self.now.rng_state
+        summing = np.random.default_rng(self.rng.integers(2**63, size=4))
+        return _result(self.evaluate, noted, self.n_live, reason, self.seed_state, summing)
+
+    def to_end(self, max_calls: int | None, progress: Callable[[RoundSummary], None] | None) -> NestedResult:
+        """Do rounds until the rule ends them, or the next one might exceed `max_calls` evaluations."""
+        while self.now.ended is None:
+            # A round can cost twice the last one: the volume halves while points are drawn from the prior.
+            if max_calls is not None and self.evaluate.n_calls + 2 * self.now.last_cost > max_calls:
+                reason = f"stopped at {self.evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
+                return self.finish(reason, f"{reason}; log Z lacks what a full run would have found")
+            after, state = _round(self.now, self.evaluate, self.n_replaced, self.rng)
+            # One assignment, so that an interruption leaves a round either complete or not begun.
+            self.now = replace(after, ended=self.rule(state))
+            if progress is not None:
+                progress(state)
+            if self.keeper is not None:
+                self.keeper.save_if_due(self.now)
+        return self.finish(self.now.ended)
 
 
 def _require_counts(n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int) -> tuple[int, int]:

@@ -13,8 +13,6 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.errors import ParameterError
 from probewise.priors import Coordinates, Prior, require_prior
 
-__all__ = ["Space", "is_within", "space_of", "unbounded"]
-
 _EDGE = 1e-15
 
 

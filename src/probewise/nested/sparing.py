@@ -45,8 +45,6 @@ from probewise.nested.sampler import least_live, search
 from probewise.nested.space import Space, unbounded
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["run_slow"]
-
 _LEAST_CALLS = 5000
 # In more dimensions draws fill the space too thinly. On a curved ridge in five (Rosenbrock's) they missed up to a fifth
 # of the posterior without a sign, so no smaller error is claimed; and narrow parts are lost.

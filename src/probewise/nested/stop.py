@@ -9,8 +9,6 @@ from typing import Literal, TypeAlias
 
 from probewise.errors import ParameterError
 
-__all__ = ["NESTED_STOP", "EvidenceChange", "NestedStop", "RemainingEvidence", "RoundSummary", "StopRule"]
-
 
 @dataclass(frozen=True)
 class RoundSummary:

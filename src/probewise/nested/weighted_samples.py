@@ -12,8 +12,6 @@ from probewise._kinds import require_number, require_rng, require_whole
 from probewise.errors import ParameterError
 from probewise.nested.weights import resampled, weighted_quantiles
 
-__all__ = ["WeightedSamples"]
-
 
 class WeightedSamples(ShowsItself):
     """Base of results that hold `names`, `theta` (n, n_params) and `log_weight` (n,), whose weights sum to one."""

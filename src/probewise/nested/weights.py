@@ -9,8 +9,6 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 
-__all__ = ["n_effective", "resampled", "weighted_quantiles"]
-
 
 def n_effective(log_weight: FloatArray) -> float:
     """Kish's effective sample size of unnormalised log weights, (n,); 0 where all weights are zero."""

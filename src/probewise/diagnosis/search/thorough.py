@@ -220,7 +220,7 @@ def _evidence_near_posterior(
         nearer = nested.repartitioned(problem, theta)
         found = run(nearer)
         runs.append(found)
-        sharper = nested.refine(found, nearer, rng=rng)
+        sharper = nested.refine(found, nearer, rng=rng, look=False)
         if sharper.sound and sharper.log_z_error < found.log_z_error:
             return _Evidence(sharper.log_z, sharper.log_z_error)
         weights = np.array([1.0 / own.log_z_error**2 for own in runs])

@@ -135,8 +135,8 @@ def test_about_a_curve_two_runs_that_agree_outvote_a_second_pass_below_both(
             return dataclasses.replace(sound, log_z=sound.log_z + longer_by * sound.log_z_error)
         passes.append(problem)
         theta = sound.theta[sound.weight > 0]
-        made_up = problem.prior.made_up(theta)  # type: ignore[attr-defined]
-        mean = float(sound.weight[sound.weight > 0] @ (sound.log_likelihood[sound.weight > 0] + made_up))
+        log_prior_ratio = problem.prior.log_prior_ratio(theta)  # type: ignore[attr-defined]
+        mean = float(sound.weight[sound.weight > 0] @ (sound.log_likelihood[sound.weight > 0] + log_prior_ratio))
         log_z = sound.log_z - 8.0 * sound.log_z_error
         return dataclasses.replace(sound, log_z=log_z, information=mean - log_z + clusters_by, n_calls=1000)
 

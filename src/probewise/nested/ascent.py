@@ -51,9 +51,10 @@ class Top:
 def climb(
     start: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator, known: float = -math.inf
 ) -> Top:
-    """Climb from a distribution to the top for `max_calls` evaluations at most, counted by `evaluate`.
+    """Climb from a normal distribution to the top of a peak.
 
-    Only draws above the log likelihood `known` count, those of another peak than a known one.
+    At most `max_calls` evaluations are used, which `evaluate` counts. Only draws above the log likelihood `known` are
+    followed: those below it may belong to another peak.
     """
     highest, centre, covariance = start.highest, start.centre, start.root @ start.root.T
     met = highest
@@ -82,7 +83,7 @@ def climb(
 
 
 def end_of(run: NestedResult, evaluate: Evaluator) -> Top:
-    """Return the highest of the last live points of a run, their mean and a root of their covariance."""
+    """Describe the last live points of a run: the highest one, their mean and a root of their covariance."""
     last = slice(-run.n_live, None)
     live = evaluate.known(run.theta[last], run.log_likelihood[last], run.label[last])
     return Top(live.take(live.order()[-1:]), live.u.mean(axis=0), principal_root(live.u))

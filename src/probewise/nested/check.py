@@ -27,10 +27,10 @@ from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
 from probewise.nested.hills import Hill, evidence_not_met
 from probewise.nested.hops import HoppingMove
-from probewise.nested.missing import DISAGREE, Missing, look_for_missing, raised
+from probewise.nested.missing import DISAGREE, Missing, look_for_missing, raised_by
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, groups_of, repartitioned
-from probewise.nested.result import Check, NestedResult, few_lineages, few_possible
+from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible
 from probewise.nested.space import space_of
 
 # Above this many errors the second estimate is repeated with more live points.
@@ -60,7 +60,7 @@ class SingleRun(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class _Route:
-    """A second estimate of the evidence: a problem of the same evidence, the number of live points and the chains.
+    """A way to estimate the evidence again: a problem of the same evidence, the number of live points and the chains.
 
     Before each chain there are hops between `modes`, where they are given.
     It takes at most `most_calls` evaluations. Where the mean of its log likelihood over the posterior is not
@@ -77,11 +77,11 @@ class _Route:
 
     @property
     def move(self) -> Move:
-        """The move."""
+        """The chains, after hops where there are `modes`."""
         return self.chain if self.modes is None else HoppingMove(self.chain, self.modes)
 
     def confirmed(self, found: NestedResult) -> bool:
-        """Whether the estimate found the posterior that was expected; its information is the mean less log Z."""
+        """Return whether a run of this route found the expected posterior: its information plus log Z is the mean."""
         return self.expected is None or abs(found.information + found.log_z - self.expected) < _SAME_MEAN
 
     @property
@@ -92,21 +92,21 @@ class _Route:
 
 
 @dataclass
-class _Purse:
-    """Runs second estimates while fewer than `budget` evaluations are `spent`."""
+class _Budget:
+    """The evaluations that a check may use, those of the first run included: `limit` in all, `spent` so far."""
 
     search: SingleRun
-    budget: float
+    limit: float
     spent: int
     rng: np.random.Generator
 
     @property
     def left(self) -> int:
-        return int(self.budget - self.spent)
+        return int(self.limit - self.spent)
 
-    def run(self, route: _Route) -> NestedResult | None:
-        """Run a second estimate; None where it exceeds the budget."""
-        left = int(min(self.budget - self.spent, route.most_calls))
+    def run_by(self, route: _Route) -> NestedResult | None:
+        """Run nested sampling by a route; None where it exceeds the budget."""
+        left = int(min(self.limit - self.spent, route.most_calls))
         if left < route.least_calls:
             return None
         found = self.search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=self.rng)
@@ -115,10 +115,10 @@ class _Purse:
 
 
 @dataclass(frozen=True, eq=False)
-class _Second:
-    """A second estimate of the evidence: the runs of a route.
+class _SecondEstimate:
+    """A second estimate of the evidence: one or two runs of a route.
 
-    `curved`: whether a route about the clusters of the posterior, tried before, has found another posterior.
+    `curved`: whether the clusters of the posterior failed to describe it, as about a curve.
     """
 
     route: _Route
@@ -139,18 +139,18 @@ class _Second:
         log_z, error = self.log_z
         return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
-    def disputes(self, run: NestedResult, most: float) -> bool:
-        """Whether the distance exceeds `most`, or this estimate is itself doubtful."""
+    def contradicts(self, run: NestedResult, most: float) -> bool:
+        """Return whether a run is more than `most` errors away, or this estimate is itself doubtful."""
         return abs(self.distance(run)) > most or bool(self.runs[-1].warnings)
 
     def overlooks(self, first: NestedResult, longer: NestedResult) -> bool:
-        """Whether it lies, about a curved posterior, below two runs that agree, one with chains twice as long.
+        """Return whether this estimate is too low about a curved posterior, below two runs that agree.
 
-        Along a curve its prior is thin where the posterior is not: it overlooks a part and is then low. Chains that are
-        too short bias two runs differently.
+        Along a curve the prior of a second pass is thin where the posterior is not, so it can miss a part. Chains of
+        `longer` are twice as long: if those of `first` were too short, the two would differ.
         """
         below = min(self.distance(run) for run in (first, longer))
-        alike = abs(_Second(self.route, (longer,), self.curved).distance(first)) < _ALIKE
+        alike = abs(_SecondEstimate(self.route, (longer,), self.curved).distance(first)) < _ALIKE
         return self.curved and below > _APART and alike and not first.warnings
 
 
@@ -190,46 +190,48 @@ def checked(
         The first run, or one with longer chains if only that agrees with the second estimate. `check` holds the second
         estimate. A warning is added if the two still disagree, or if the second does not end within the limits.
     """
-    budget = max_cost * first.n_calls
-    purse = _Purse(search, budget if max_calls is None else min(budget, max_calls), first.n_calls, rng)
-    now, missing = first, Missing()
+    limit = max_cost * first.n_calls if max_calls is None else min(max_cost * first.n_calls, max_calls)
+    budget = _Budget(search, limit, first.n_calls, rng)
+    now, missing, notes = first, Missing(), tuple[str, ...]()
     try:
-        missing = look_for_missing(first, problem, max_calls=purse.left, rng=rng)
-        purse.spent += missing.n_calls
+        missing = look_for_missing(first, problem, max_calls=budget.left, rng=rng)
+        budget.spent += missing.n_calls
         modes = None
-        if raised(first, evidence_not_met(missing.lost, first)) > _MATTERS:
-            modes = _modes(first, missing.lost, problem, rng)
+        if raised_by(first, evidence_not_met(missing.lost, first)) > _MATTERS:
+            modes = _modes_with_lost(first, missing.lost, problem, rng)
             chain = move if isinstance(move, SliceMove) else SliceMove()
-            again = purse.run(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
+            again = budget.run_by(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
             if again is not None:
                 now = again
-                more = look_for_missing(now, problem, max_calls=purse.left, rng=rng, lost=missing.lost)
-                purse.spent += more.n_calls
+                more = look_for_missing(now, problem, max_calls=budget.left, rng=rng, lost=missing.lost)
+                budget.spent += more.n_calls
                 missing = replace(more, n_calls=missing.n_calls + more.n_calls)
-        route, second = _second_estimate(now, problem, move, least_live, purse)
+        route, second = _second_estimate(now, problem, move, least_live, budget)
         if second is None:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
-            note = (
+            notes = (
                 f"{route.name}, which checks the evidence, did not end within max_cost and max_calls "
-                f"({int(purse.budget)} evaluations in all); use a greater limit, or max_cost=1 for no check"
+                f"({int(budget.limit)} evaluations in all); use a greater limit, or max_cost=1 for no check",
             )
         else:
-            if second.disputes(now, _APART):
-                second = _sharper(second, now, first, purse)
+            if second.contradicts(now, _APART):
+                second = _with_sharper_estimate(second, now, first, budget)
             n_check = second.n_calls + missing.n_calls
-            if second.disputes(now, DISAGREE):
-                again = purse.run(_Route(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes))
-                now, second = _settled(second, now, again)
+            if second.contradicts(now, DISAGREE):
+                again = budget.run_by(
+                    _Route(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes)
+                )
+                now, second = _after_repetition(second, now, again)
             now = _with_check(now, second, n_check)
-            note = None
     except NotConvergedError as error:
         # A second estimate may evaluate hypotheses that the first run never met.
-        note = f"the second pass, which checks the evidence, failed: {error}"
-    notes = () if note is None else (note,)
-    return replace(now, n_calls=purse.spent, warnings=(*now.warnings, *notes, *missing.doubts(now)))
+        notes = (f"the second pass, which checks the evidence, failed: {error}",)
+    return replace(now, n_calls=budget.spent, warnings=(*now.warnings, *notes, *missing.doubts(now)))
 
 
-def _modes(first: NestedResult, lost: Iterable[Hill], problem: Samplable, rng: np.random.Generator) -> Clusters:
+def _modes_with_lost(
+    first: NestedResult, lost: Iterable[Hill], problem: Samplable, rng: np.random.Generator
+) -> Clusters:
     """Return the clusters of a run's posterior and the modes it lost, in the sampling coordinates."""
     space = space_of(problem.prior, getattr(problem, "periodic", ()))
     met = groups_of(space.enter(first.samples(_N_SAMPLES, rng=rng)))
@@ -237,44 +239,48 @@ def _modes(first: NestedResult, lost: Iterable[Hill], problem: Samplable, rng: n
 
 
 def _second_estimate(
-    now: NestedResult, problem: Samplable, move: Move, least_live: int, purse: _Purse
-) -> tuple[_Route, _Second | None]:
-    """Make the second estimate by the first route that is confirmed, else the last one; None if it did not end."""
+    now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _Budget
+) -> tuple[_Route, _SecondEstimate | None]:
+    """Estimate the evidence by the first route that is confirmed, else by the last; None if that did not end."""
     curved, second = False, None
-    for route in _second_routes(now, problem, move, least_live, purse.rng):
-        found = purse.run(route)
-        second = None if found is None else _Second(route, (found,), curved)
+    for route in _second_routes(now, problem, move, least_live, budget.rng):
+        found = budget.run_by(route)
+        second = None if found is None else _SecondEstimate(route, (found,), curved)
         if found is not None and route.confirmed(found):
             break
         curved = route.expected is not None
     return route, second
 
 
-def _sharper(second: _Second, now: NestedResult, first: NestedResult, purse: _Purse) -> _Second:
-    """Repeat a second estimate with more live points, as many as the run's where the budget allows it."""
-    route, left, again_costs = second.route, purse.budget - purse.spent, _AGAIN * first.n_calls
+def _with_sharper_estimate(
+    second: _SecondEstimate, now: NestedResult, first: NestedResult, budget: _Budget
+) -> _SecondEstimate:
+    """Add a run with more live points to a second estimate: as many as the first run has, if the budget allows it."""
+    route, left, again_costs = second.route, budget.left, _AGAIN * first.n_calls
     room = left - again_costs if left > again_costs else left
     n_live = int(min(max(route.n_live, now.n_live), room / second.runs[0].n_calls * route.n_live))
     if n_live <= route.n_live:
         return second
-    found = purse.run(replace(route, n_live=n_live, most_calls=math.inf))
+    found = budget.run_by(replace(route, n_live=n_live, most_calls=math.inf))
     if found is None:
         return second
     return replace(second, runs=(found,) if second.runs[0].warnings else (*second.runs, found))
 
 
-def _settled(second: _Second, now: NestedResult, again: NestedResult | None) -> tuple[NestedResult, _Second]:
-    """Settle a disagreement by a repetition of the run with longer chains: return the run and the estimate that agree.
+def _after_repetition(
+    second: _SecondEstimate, now: NestedResult, again: NestedResult | None
+) -> tuple[NestedResult, _SecondEstimate]:
+    """Return the run and the second estimate that agree, given a repetition of the run with longer chains.
 
-    Where they do not, return them as they were.
+    If none do, or there is no repetition, return them as they were.
     """
     if again is None or again.warnings:
         return now, second
-    if not second.disputes(again, DISAGREE):
+    if not second.contradicts(again, DISAGREE):
         return again, second
     if second.overlooks(now, again):
         shorter = replace(second.route, name="the same run with shorter chains")
-        return again, _Second(shorter, (now,), second.curved)
+        return again, _SecondEstimate(shorter, (now,), second.curved)
     return now, second
 
 
@@ -295,12 +301,15 @@ def _second_routes(
         clustered = _repartitioned_near(problem, theta, clustered=True)
         if clustered is not None and len(clustered.prior.parts) == 1:
             clustered = None  # the single prior below
-        if clustered is not None and (nats := _nats(first, clustered)) < _FEW_NATS < _GAIN * first.information:
+        if (
+            clustered is not None
+            and (nats := _information_near(first, clustered)) < _FEW_NATS < _GAIN * first.information
+        ):
             most, expected = _MOST_COST * first.n_calls, nats + first.log_z
             yield replace(from_near(clustered, nats), most_calls=most, expected=expected)
         single = _repartitioned_near(problem, theta, clustered=False)
         # With a log Z that is far too large the nats come out too few, or negative.
-        if single is not None and (nats := _nats(first, single)) < _GAIN * first.information:
+        if single is not None and (nats := _information_near(first, single)) < _GAIN * first.information:
             yield from_near(single, nats)
             return
     n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
@@ -318,11 +327,11 @@ def _repartitioned_near(problem: Samplable, theta: FloatArray, *, clustered: boo
         return None
 
 
-def _nats(first: NestedResult, near: Repartitioned) -> float:
+def _information_near(first: NestedResult, near: Repartitioned) -> float:
     """Return the information of a second pass, nats: the mean of its log likelihood over the posterior, less log Z."""
     possible = first.log_weight > -math.inf
-    made_up = near.prior.made_up(first.theta[possible])
-    return float(first.weight[possible] @ (first.log_likelihood[possible] + made_up)) - first.log_z
+    log_prior_ratio = near.prior.log_prior_ratio(first.theta[possible])
+    return float(first.weight[possible] @ (first.log_likelihood[possible] + log_prior_ratio)) - first.log_z
 
 
 def _with_longer_chains(move: Move) -> SliceMove:
@@ -344,7 +353,7 @@ def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def _with_check(now: NestedResult, second: _Second, n_check: int) -> NestedResult:
+def _with_check(now: NestedResult, second: _SecondEstimate, n_check: int) -> NestedResult:
     """Store the check in the result, with a warning where the estimates disagree."""
     (log_z, error), distance, name = second.log_z, second.distance(now), second.route.name
     warnings = now.warnings
@@ -360,8 +369,8 @@ def _with_check(now: NestedResult, second: _Second, n_check: int) -> NestedResul
         warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
         # A poorly known share of possible hypotheses, or error, no longer matters once a second estimate agrees.
-        settled = [few_possible(now.log_start, now.log_start_error, now.n_live)]
+        settled = [warning_of_few_possible(now.log_start, now.log_start_error, now.n_live)]
         if error < now.log_z_error:
-            settled.append(few_lineages(now.memory))
+            settled.append(warning_of_few_lineages(now.memory))
         warnings = tuple(note for note in warnings if note not in settled)
     return replace(now, check=Check(name, log_z, error, distance, n_check), warnings=warnings)

@@ -55,12 +55,12 @@ class Clusters:
         return moved, self.log_det[goal] - self.log_det[home]
 
     def joined(self, other: Clusters) -> Clusters:
-        """Return these clusters, then the others."""
+        """Return these clusters followed by the others."""
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Clusters(*map(np.concatenate, pairs))
 
     def without(self, u: FloatArray, home: IntArray) -> Clusters:
-        """Compute each point's cluster without the point itself.
+        """Return for each point the mean and covariance of its cluster without the point itself.
 
         Parameters
         ----------

@@ -16,13 +16,13 @@ PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label"
 COUNTS = ("parent", "n_at_death")
 
 
-def of_length(name: str, values: FloatArray | IntArray, n: int, one: str) -> FloatArray | IntArray:
-    """Return the values, (n,).
+def require_length(name: str, values: FloatArray | IntArray, n: int, one: str) -> FloatArray | IntArray:
+    """Return an array after checking that it has shape (n,); `name` and `one`, what a row is, are for the message.
 
     Raises
     ------
     ShapeError
-        If there are more or fewer; `one` says what each is of.
+        If it has another shape.
     """
     if values.shape != (n,):
         raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n},), one per {one}")
@@ -75,7 +75,7 @@ class DeadPoints(WeightedSamples):
             self._freeze(name, frozen_int(getattr(self, name)))
 
     def _freeze(self, name: str, values: FloatArray | IntArray) -> None:
-        object.__setattr__(self, name, of_length(name, values, self.n_dead, "row of theta"))
+        object.__setattr__(self, name, require_length(name, values, self.n_dead, "row of theta"))
 
     @property
     def n_dead(self) -> int:

@@ -115,7 +115,7 @@ class _Thread:
 
 
 def _require_same(result: NestedResult, evaluate: Evaluator) -> None:
-    """Raise unless the run is complete and of this problem."""
+    """Raise ParameterError unless a run is complete and of this problem."""
     if evaluate.names != result.names:
         raise ShapeError(f"the problem has the parameters {evaluate.names}; allowed: those of the run, {result.names}")
     if not result.names:

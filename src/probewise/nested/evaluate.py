@@ -237,18 +237,18 @@ class Evaluator:
 
     def _failure(self, error: Exception, theta: FloatArray) -> str:
         """Describe the failure of a batch, (n, n_params), and of which hypothesis in it."""
-        said = f"{type(error).__name__}: {error}"
-        if self.executor is not None and "pickle" in said.lower():
+        why = f"{type(error).__name__}: {error}"
+        if self.executor is not None and "pickle" in why.lower():
             return (
-                f"the problem cannot be sent to the executor's workers ({said}); allowed: one that pickles, so made of "
+                f"the problem cannot be sent to the executor's workers ({why}); allowed: one that pickles, so made of "
                 "functions and classes at the top level of a module, without lambdas; or take a ThreadPoolExecutor"
             )
         # A hypothesis that killed its worker could kill this process too.
         culprit = None if isinstance(error, BrokenExecutor) else self._failing_row(theta)
         if culprit is not None:
-            return f"the likelihood raised {said}; at {self._show(culprit)}"
+            return f"the likelihood raised {why}; at {self._show(culprit)}"
         batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
-        return f"the likelihood raised {said}; {batch}; {self._first_in_words(theta)}"
+        return f"the likelihood raised {why}; {batch}; {self._first_in_words(theta)}"
 
     def _failing_row(self, theta: FloatArray) -> FloatArray | None:
         """Find by bisection a hypothesis that fails by itself; None where only the batch as a whole fails."""

@@ -48,14 +48,14 @@ class Hill:
 
     @classmethod
     def of(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> Hill:
-        """Take the shape of weighted draws."""
+        """Make a hill of weighted draws on it."""
         theta = drawn.samples(_N_SAMPLES, rng=rng)
         x = space.enter(theta)
         shape = Clusters.of([x])
         return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance(x, shape), _INSIDE)))
 
     def is_met_by(self, run: Posterior) -> bool:
-        """Whether a run has at least half of this evidence at the same place."""
+        """Return whether a run has at least half of this hill's evidence within its ellipsoid."""
         inside = _distance(self.space.enter(run.theta), self.shape) <= self.radius
         near = float(run.weight[inside].sum())
         return near > 0 and run.log_z + math.log(near) > self.log_z + math.log(_MET * _INSIDE)
@@ -67,7 +67,7 @@ def _distance(x: FloatArray, shape: Clusters) -> FloatArray:
 
 
 def evidence_not_met(hills: Iterable[Hill], run: Posterior) -> float:
-    """Log of the evidence of those hills that a run has not met; -inf where it met all."""
+    """Return the log of the joint evidence of those hills that a run has not met; -inf where it met all."""
     return float(logsumexp([-math.inf, *(hill.log_z for hill in hills if not hill.is_met_by(run))]))
 
 
@@ -75,13 +75,13 @@ def _points_on_hill(n_params: int) -> int:
     return max(_PER_PARAM * n_params, 20)
 
 
-def calls_to_weigh(n_params: int) -> float:
-    """About as many evaluations as it takes to weigh a hill: two or three rounds of chains."""
+def calls_to_weigh_hill(n_params: int) -> float:
+    """Return about how many evaluations it takes to weigh a hill: two or three rounds of chains."""
     return 2.5 * _points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
 
 
-def settled_on(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Points:
-    """Draw points uniformly from the top of a hill, down to where they have the covariance of a normal posterior."""
+def drawn_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Points:
+    """Draw points uniformly from the upper part of a hill, whose covariance is that of a whole normal hill."""
     n_params = top.root.shape[0]
     n = _points_on_hill(n_params)
     below = (n_params + 2) / 2
@@ -102,7 +102,7 @@ def settled_on(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Point
     return drawn
 
 
-def weighed(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
+def weigh_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
     """Weigh a hill by draws from a Student t about points on it, fitted anew if need be; None where none fits."""
     space = unbounded(evaluate.problem.prior)
     x, n_params = space.enter(settled.theta), settled.theta.shape[1]

@@ -1,4 +1,4 @@
-"""Importance sampling: refine the evidence of a run, or update a posterior with new readings.
+"""Importance sampling: weighted draws for `refine`, and `update` of a posterior with new readings.
 
 Nested sampling locates the posterior; the error of its log evidence is sqrt(H / n_live). Importance
 sampling from a density fitted to its samples estimates the same evidence and posterior independently,
@@ -205,7 +205,7 @@ def update(
             resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
         )[-1]
         found = weigh_draws(proposal, prior_share, HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
-        found = with_lost(found, count_lineages(previous) * n_eff / len(rows), space, rng)
+        found = with_loss_in_error(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
         k = found.pareto_k
@@ -238,22 +238,22 @@ class HeldOut:
 
     @classmethod
     def nothing(cls) -> HeldOut:
-        """Hold out nothing."""
+        """Return an empty set, for plain importance sampling."""
         return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
 
 
-def count_lineages(found: Posterior) -> float:
-    """Effective number of independent samples for the shares of a posterior's parts.
+def effective_lineages(found: Posterior) -> float:
+    """Return to how many independent samples a run is equivalent for the shares of the posterior's parts.
 
     Many samples of a run descend from one live point: ln Z of a part followed by n live points has the error
     sqrt(H memory / n), where a share estimated from n independent samples has the relative error 1 / sqrt(n).
     """
     if isinstance(found, Weighted):
-        return found.n_eff if found.run is None else count_lineages(found.run)
+        return found.n_eff if found.run is None else effective_lineages(found.run)
     return found.n_live / max(found.information * found.memory, 1.0)
 
 
-def split_off(
+def split_samples(
     found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
 ) -> tuple[FloatArray, HeldOut]:
     """Split samples at random into those for fitting a density, (n, n_params), and held-out ones."""
@@ -278,7 +278,7 @@ def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, r
     return space.enter(theta[np.unique(np.concatenate(rows))])
 
 
-def with_lost(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
+def with_loss_in_error(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
     """Add to the error the share of the posterior that a run of `n_lineages` effective samples may have lost."""
     if not found.n_eff > 1:
         return found
@@ -300,11 +300,11 @@ def weigh_draws(
     rng: np.random.Generator,
     tail: float = 3.0,
 ) -> Weighted:
-    """Draw, evaluate and weight; `tail` as for `pareto_k`."""
+    """Draw from a proposal and the prior, evaluate, and weight the draws; `tail` as for `pareto_k`."""
     n_prior = round(prior_share * n_draws)
 
     def log_proposal(x: FloatArray, log_density: FloatArray) -> FloatArray:
-        """Log density of the mixture that the draws come from; `log_density` is the prior's."""
+        """Return the log density of the mixture from which the draws come; `log_density` is the prior's."""
         log_fitted = proposal.log_density(x)
         if not n_prior:
             return log_fitted
@@ -328,7 +328,7 @@ def weigh_draws(
     held_ratio = np.empty(0)
     if len(held.x):
         held_ratio = held.log_density + held.log_likelihood - log_proposal(held.x, held.log_density)
-    log_z, error, missed, log_weight = _bridged(log_ratio, n_draws, held_ratio, held.n_independent)
+    log_z, error, missed, log_weight = _bridge_sampled(log_ratio, n_draws, held_ratio, held.n_independent)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
     n_eff = n_effective(log_weight)
@@ -337,7 +337,7 @@ def weigh_draws(
     )
 
 
-def _bridged(
+def _bridge_sampled(
     log_ratio: FloatArray, n_draws: int, held_ratio: FloatArray, n_held: float
 ) -> tuple[float, float, float, FloatArray]:
     """Estimate the evidence from draws and posterior samples by bridge sampling (Meng & Wong 1996).

@@ -33,27 +33,27 @@ _FROM_TOP = 3.0  # nats a parameter: a climb ends as near to the top
 _NEAREST = 3
 
 
-def _early(run: NestedResult) -> int:
-    """Count the dead points before the posterior's bulk."""
+def _count_early(run: NestedResult) -> int:
+    """Count the dead points that hold the first tenth of the posterior's mass."""
     return int(np.searchsorted(np.cumsum(run.weight), _BULK))
 
 
 def scale_of_bulk(run: NestedResult, space: Space) -> FloatArray:
     """Sds of the points that died where the posterior's bulk begins, (n_params,)."""
-    last = _early(run)
+    last = _count_early(run)
     return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
 
 
-def climb_from_early(
+def tops_from_early_points(
     first: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> list[Top]:
-    """Let early dead points climb that lie apart from a run's posterior; return those that end high, and still apart.
+    """Climb from early dead points that a dip separates from the posterior; return the tops that are high and apart.
 
     At most `max_calls` evaluations, counted by `evaluate`, are used for lines to the posterior, and some for climbs.
     """
     n_params = len(evaluate.names)
     n_starts = int(min(max_calls, _SHARE * first.n_calls) / len(_ON_LINE))
-    last = _early(first)
+    last = _count_early(first)
     if n_starts < 2 or last < first.n_live:
         return []
     # Denser in the beginning: a mode that dies out late has points there, too.
@@ -63,7 +63,7 @@ def climb_from_early(
     known = evaluate.known(first.theta[samples], first.log_likelihood[samples], first.label[samples])
     u = evaluate.space.enter(first.theta[: last + _BLOCK])
     scale = scale_of_bulk(first, evaluate.space)
-    apart = np.flatnonzero(are_apart(start, known, scale, 1, evaluate, rng))
+    apart = np.flatnonzero(lie_apart(start, known, scale, 1, evaluate, rng))
     if not apart.size:
         return []
     chosen = apart[_far_from_each_other(start.u[apart] / scale, start.log_likelihood[apart])]
@@ -72,7 +72,7 @@ def climb_from_early(
     # Of the evidence below a level a lost mode holds no more than its share of live points there.
     enough = first.log_likelihood[last] - _FROM_TOP * n_params
     high = np.flatnonzero(now.log_likelihood > enough)
-    high = high[are_apart(now.take(high), known, scale, _NEAREST, evaluate, rng)]
+    high = high[lie_apart(now.take(high), known, scale, _NEAREST, evaluate, rng)]
     return [Top(now.take(slice(k, k + 1)), now.u[k], scales[k] * roots[k]) for k in high]
 
 
@@ -106,10 +106,10 @@ def _climbed(
     return now, scale
 
 
-def are_apart(
+def lie_apart(
     points: Points, known: Points, scale: FloatArray, n_nearest: int, evaluate: Evaluator, rng: np.random.Generator
 ) -> BoolArray:
-    """Mark the points from which the likelihood dips on the way to each of the nearest known points, (n,)."""
+    """Mark the points, (n,), that a dip of the likelihood separates from each of their nearest known points."""
     from scipy.spatial import cKDTree  # slow to import, and needed by runs only
 
     n, n_params = points.u.shape

@@ -52,7 +52,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         complete record of births and deaths.
     """
     parts = tuple(results)
-    seeds = _check(parts)
+    seeds = _require_mergeable(parts)
     record = JoinedRecord.of([(r.log_likelihood, r.label, r.log_birth, r.birth_label) for r in parts])
     first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
     parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
@@ -68,7 +68,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     error, doubts = _doubts(agreement, check, p_value, evidence.log_z, evidence.error(remembered))
     for doubt in doubts:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
-    said = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
+    inherited = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
     return NestedResult(
         names=parts[0].names,
         theta=np.concatenate([r.theta for r in parts])[record.order],
@@ -95,7 +95,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         insertion_p_value=p_value,
         seed_state=json.dumps(seeds),
         versions=versions(),
-        warnings=(*doubts, *said),
+        warnings=(*doubts, *inherited),
         agreement=agreement,
         check=check,
     )
@@ -206,7 +206,7 @@ def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) ->
     return Check(route, mean, mean_error, distance, sum(c.n_calls for c in checks))
 
 
-def _check(parts: Sequence[NestedResult]) -> list[object]:
+def _require_mergeable(parts: Sequence[NestedResult]) -> list[object]:
     """Raise ParameterError for runs that cannot be merged; return the seed states of all runs."""
     if len(parts) < 2:
         raise ParameterError("results", f"{len(parts)} runs", "two runs or more")

@@ -1,9 +1,9 @@
 """Look for parts of the posterior that a run has missed, from its last live points and its dead ones.
 
-Three ways lead to tops of which the run may know nothing. Early dead points climb to modes that died out (`lost`).
-Draws from the last live points climb to the top of their peak (`ascent`): where that lies far above all points of the
-run, it ended beside the bulk of its posterior, on the arm of a heavy tail along which its chains hardly moved. And
-draws at that top meet narrow peaks above the end (`beyond`). Each hill is weighed by importance sampling, and held
+Candidates come from three searches. Early dead points climb to modes that died out (`lost`). Draws about the last live
+points climb to the top of their peak (`ascent`): a top far above all points of the run means that the run ended beside
+the bulk of its posterior, on the arm of a heavy tail along which its chains hardly moved. Draws about that top meet
+narrow peaks above the end (`beyond`). Each hill is weighed by importance sampling, and held
 against the share of the run's posterior at the same place (`hills`).
 """
 
@@ -18,9 +18,9 @@ import numpy as np
 from probewise.nested.ascent import Top, climb, end_of
 from probewise.nested.beyond import peaks_above
 from probewise.nested.evaluate import Evaluator, Points, Samplable
-from probewise.nested.hills import Hill, calls_to_weigh, evidence_not_met, settled_on, weighed
+from probewise.nested.hills import Hill, calls_to_weigh_hill, drawn_from_hill, evidence_not_met, weigh_hill
 from probewise.nested.importance import Posterior
-from probewise.nested.lost import are_apart, climb_from_early, scale_of_bulk
+from probewise.nested.lost import lie_apart, scale_of_bulk, tops_from_early_points
 from probewise.nested.result import NestedResult
 
 DISAGREE = 2.5
@@ -45,15 +45,15 @@ class Missing:
     n_calls: int = 0
 
     def doubts(self, run: Posterior) -> tuple[str, ...]:
-        """Return a doubt in words for each kind that matters for a run and that it has not met either."""
+        """Return a doubt in words for each kind of hill that would change log Z and that `run` has not met."""
         lost, above = (evidence_not_met(hills, run) for hills in (self.lost, self.above))
         mine, notes = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}", list[str]()
-        if raised(run, lost) > _MISSING:
+        if raised_by(run, lost) > _MISSING:
             notes.append(
                 f"a part of the posterior that the live points have lost has a log Z of about {lost:.2f}, {mine}; "
                 "use more n_live or a greater max_cost"
             )
-        if raised(run, above) > DISAGREE:
+        if raised_by(run, above) > DISAGREE:
             notes.append(
                 f"a narrow peak that no live point met lies above the run's end: its log Z is about {above:.1f}, "
                 f"{mine}; use more n_live or a prior about the peak"
@@ -61,8 +61,8 @@ class Missing:
         return tuple(notes)
 
 
-def raised(run: Posterior, log_z: float) -> float:
-    """By how many errors the evidence of a part that a run has not met raises log Z."""
+def raised_by(run: Posterior, log_z: float) -> float:
+    """Return by how many of its errors a part of evidence `log_z` that a run has not met raises its log Z."""
     return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / max(run.log_z_error, 1e-12)
 
 
@@ -74,7 +74,7 @@ def look_for_missing(
     rng: np.random.Generator,
     lost: tuple[Hill, ...] | None = None,
 ) -> Missing:
-    """Look for what a run has missed, where the prior's coordinates allow it.
+    """Look for parts of the posterior that a run has missed; nothing is found for a prior without an inverse.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def look_for_missing(
 
     top = climb(end_of(run, evaluate), evaluate, max_calls=left(_ASCENT_SHARE), rng=rng)
     if lost is None:
-        tops = climb_from_early(run, evaluate, max_calls=left(), rng=rng)
+        tops = tops_from_early_points(run, evaluate, max_calls=left(), rng=rng)
         if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
             tops.append(top)
         lost = _hills_not_met(tops, run, evaluate, max_calls=left(_WEIGHING_SHARE), rng=rng)
@@ -113,15 +113,15 @@ def look_for_missing(
 def _hills_not_met(
     tops: Iterable[Top], run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> tuple[Hill, ...]:
-    """Weigh the hills of some tops, the highest first and each once, and return those that a run has not met."""
+    """Weigh the hills below these tops, each once and the highest first; return those that a run has not met."""
     hills, most = list[Hill](), evaluate.n_calls + max_calls
     rest = sorted(tops, key=lambda top: top.height)
-    while rest and evaluate.n_calls + calls_to_weigh(len(run.names)) < most:
-        settled = settled_on(rest.pop(), evaluate, rng)
+    while rest and evaluate.n_calls + calls_to_weigh_hill(len(run.names)) < most:
+        settled = drawn_from_hill(rest.pop(), evaluate, rng)
         if rest:
             points = Points.join(*(top.highest for top in rest))
-            apart = are_apart(points, settled, scale_of_bulk(run, evaluate.space), 1, evaluate, rng)
+            apart = lie_apart(points, settled, scale_of_bulk(run, evaluate.space), 1, evaluate, rng)
             rest = [top for top, is_apart in zip(rest, apart, strict=True) if is_apart]
-        hill = weighed(settled, evaluate, rng)
+        hill = weigh_hill(settled, evaluate, rng)
         hills += [] if hill is None or hill.is_met_by(run) else [hill]
     return tuple(hills)

@@ -24,7 +24,7 @@ _ALLOWED_PRIOR = (
 
 
 @dataclass(frozen=True)
-class _Scipy:
+class _ScipyMarginal:
     """A frozen continuous distribution of scipy.stats as a marginal."""
 
     distribution: Any
@@ -41,7 +41,7 @@ class _Scipy:
 
 
 @dataclass(frozen=True)
-class _Transform:
+class _TransformPrior:
     """A prior given only as a function from the unit cube, without density or inverse."""
 
     names: tuple[str, ...]
@@ -170,7 +170,7 @@ def _named(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Pr
         if given is None:
             allowed = "the names of the parameters, since the prior is a function: names=['x', 'y']"
             raise ParameterError("names", None, allowed)
-        return _Transform(given, prior, vectorized)  # type: ignore[return-value]
+        return _TransformPrior(given, prior, vectorized)  # type: ignore[return-value]
     else:
         raise ParameterError("prior", prior, _ALLOWED_PRIOR)
     if given is not None and given != made.names:
@@ -190,7 +190,7 @@ def _product_of(prior: Sequence[Any], given: tuple[str, ...] | None, names: Sequ
 
 
 def _as_marginal(name: str, one: Any) -> Marginal:
-    """Convert a distribution in any of its forms to a marginal; `name` says in errors where it was given."""
+    """Convert a distribution in any of its forms to a marginal; `name` is its name in error messages."""
     if isinstance(one, tuple | list) and len(one) == 2 and all(isinstance(end, Real) for end in one):
         return Uniform(float(one[0]), float(one[1]))
     if all(hasattr(one, method) for method in ("from_unit", "to_unit", "log_prob")):
@@ -198,7 +198,7 @@ def _as_marginal(name: str, one: Any) -> Marginal:
     if _is_scipy(one):
         if hasattr(one, "freeze"):
             raise ParameterError(name, one, "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)")
-        return _Scipy(one)
+        return _ScipyMarginal(one)
     raise ParameterError(
         name,
         one,

@@ -12,12 +12,12 @@ from probewise.nested.importance import (
     HeldOut,
     Posterior,
     Weighted,
-    count_lineages,
+    effective_lineages,
     inherited_doubts,
     resampled_for_fit,
-    split_off,
+    split_samples,
     weigh_draws,
-    with_lost,
+    with_loss_in_error,
 )
 from probewise.nested.missing import look_for_missing
 from probewise.nested.proposal import fit_proposals, joined
@@ -84,8 +84,8 @@ def refine(
     if n_pilots < 1:
         raise ParameterError("n_pilots", n_pilots, "1 or more")
     space = unbounded(problem.prior)
-    n_lineages = count_lineages(result)
-    fitted, held = split_off(result, n_lineages, space, rng)
+    n_lineages = effective_lineages(result)
+    fitted, held = split_samples(result, n_lineages, space, rng)
     known = [fitted]
     for _ in range(n_pilots):
         proposals = fit_proposals(np.concatenate(known), rng=rng)
@@ -100,7 +100,9 @@ def refine(
         best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if better.n_eff > 2 * len(evaluate.names):
             known.append(resampled_for_fit(better.theta, better.log_weight, space, rng))
-    found = with_lost(weigh_draws(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng)
+    found = with_loss_in_error(
+        weigh_draws(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng
+    )
     doubts = inherited_doubts(found, result)
     if look and isinstance(result, NestedResult) and result.check is None:
         # A generator of its own: the refined evidence is the same with and without the look.

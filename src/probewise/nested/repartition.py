@@ -58,22 +58,22 @@ class _Parts:
     def log_volume(self) -> FloatArray:
         return np.asarray(np.linalg.slogdet(self.root)[1])
 
-    def along(self, x: FloatArray, part: int) -> FloatArray:
-        """Return the coordinates along the axes of a part, (n, n_params) -> (n, n_params)."""
+    def to_axes(self, x: FloatArray, part: int) -> FloatArray:
+        """Map x to coordinates along the axes of a part, (n, n_params) -> (n, n_params)."""
         # A matrix product would depend, in the last bit, on the batch, which an executor divides.
         return np.asarray(np.einsum("nj,ij->ni", x - self.center[part], self.inverse_root[part]))
 
     def log_densities(self, x: FloatArray) -> FloatArray:
         """Return each part's log density times its share, (n, n_params) -> (n_parts, n)."""
-        own = [_log_student(self.along(x, part)) for part in range(len(self))]
+        own = [_log_student(self.to_axes(x, part)) for part in range(len(self))]
         return np.asarray(np.stack(own) + (np.log(self.share) - self.log_volume)[:, None])
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Return the log density of the mixture, (n, n_params) -> (n,)."""
         return np.asarray(np.logaddexp.reduce(self.log_densities(x), axis=0))
 
-    def placed(self, e: FloatArray, part: IntArray) -> FloatArray:
-        """Return x of coordinates along the axes of a part each, (n, n_params) and (n,) -> (n, n_params)."""
+    def from_axes(self, e: FloatArray, part: IntArray) -> FloatArray:
+        """Map coordinates along the axes of a part, one for each row, to x: (n, n_params) and (n,) -> (n, n_params)."""
         return np.asarray(self.center[part] + np.einsum("nij,nj->ni", self.root[part], e))
 
     @staticmethod
@@ -86,7 +86,7 @@ class _Parts:
 
 @dataclass(frozen=True, eq=False)
 class _Near:
-    """A prior near the posterior: the mixture `parts`.
+    """A prior near the posterior: the mixture `parts`; `plain` is the original one.
 
     Chains move in coordinates along the principal axes of `whole`, the one part that all samples give.
     """
@@ -113,7 +113,7 @@ class _Near:
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         part = rng.choice(len(self.parts), size=n, p=self.parts.share)
         e = rng.standard_t(_DEGREES_OF_FREEDOM, (n, len(self.names)))
-        return self.whole.along(self.parts.placed(e, part), 0)
+        return self.whole.to_axes(self.parts.from_axes(e, part), 0)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         # The first number also chooses the part: its place within the part's share is again uniform.
@@ -122,13 +122,13 @@ class _Near:
         within = u.copy()
         within[:, 0] = (u[:, 0] - (ladder - self.parts.share)[part]) / self.parts.share[part]
         e = np.asarray(stdtrit(_DEGREES_OF_FREEDOM, np.clip(within, 0.0, 1.0)), dtype=np.float64)
-        return self.space.leave(self.parts.placed(e, part))[0]
+        return self.space.leave(self.parts.from_axes(e, part))[0]
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Return the place in the cube that leads to theta by way of the part that is densest there."""
         x = self.space.enter(theta)
         part = np.argmax(self.parts.log_densities(x), axis=0)
-        e = np.stack([self.parts.along(x, k) for k in range(len(self.parts))])[part, np.arange(len(x))]
+        e = np.stack([self.parts.to_axes(x, k) for k in range(len(self.parts))])[part, np.arange(len(x))]
         u = np.asarray(stdtr(_DEGREES_OF_FREEDOM, e))
         u[:, 0] = (np.cumsum(self.parts.share) - self.parts.share)[part] + self.parts.share[part] * u[:, 0]
         return u
@@ -138,16 +138,16 @@ class _Near:
         out = np.full(len(theta), -np.inf)
         possible = np.isfinite(log_plain)
         if possible.any():
-            out[possible] = log_plain[possible] - self.made_up(theta[possible])
+            out[possible] = log_plain[possible] - self.log_prior_ratio(theta[possible])
         return out
 
-    def made_up(self, theta: FloatArray) -> FloatArray:
-        """Log of the original prior's density over this one's, (n,): the same ratio in theta and in x."""
+    def log_prior_ratio(self, theta: FloatArray) -> FloatArray:
+        """Return the log of the original prior's density over this one's, (n,): the same in theta and in x."""
         x = self.space.enter(theta)
         return np.asarray(self.space.leave(x)[1] - self.parts.log_density(x))
 
     def enter(self, theta: FloatArray) -> FloatArray:
-        return self.whole.along(self.space.enter(theta), 0)
+        return self.whole.to_axes(self.space.enter(theta), 0)
 
     def leave(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
         x = self.whole.center[0] + e @ self.whole.root[0].T
@@ -166,8 +166,8 @@ class Repartitioned:
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log likelihood plus the log ratio of the priors, (n, n_params) -> (n,)."""
         # The ratio first: a likelihood may modify its argument.
-        made_up = self.prior.made_up(theta)
-        return np.asarray(self.problem.log_likelihood(theta) + made_up)
+        log_prior_ratio = self.prior.log_prior_ratio(theta)
+        return np.asarray(self.problem.log_likelihood(theta) + log_prior_ratio)
 
 
 def repartitioned(

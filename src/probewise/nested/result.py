@@ -20,7 +20,7 @@ from probewise._kinds import require_path
 from probewise._version import __version__
 from probewise.errors import FileError
 from probewise.nested import conversions
-from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, of_length
+from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, require_length
 from probewise.recordings.atomic import write_bytes_atomically
 
 _FORMAT = "nested-result/4"
@@ -31,7 +31,7 @@ _ARRAYS = ("theta", *PER_POINT, *COUNTS, *_PER_INSERTION)
 
 
 def versions() -> dict[str, str]:
-    """Versions of the software that determines a run's numbers."""
+    """Return the versions of the software on which a run's numbers depend, by name."""
     return {
         "probewise": __version__,
         "numpy": np.__version__,
@@ -93,7 +93,7 @@ class Check:
     n_calls: int
 
 
-def few_possible(log_start: float, log_start_error: float, n_live: int) -> str | None:
+def warning_of_few_possible(log_start: float, log_start_error: float, n_live: int) -> str | None:
     """Return a warning if fewer possible hypotheses than live points were drawn from the prior, else None.
 
     A share s of the prior, estimated from m possible hypotheses, has the relative error sqrt((1 - s) / m).
@@ -107,7 +107,7 @@ def few_possible(log_start: float, log_start_error: float, n_live: int) -> str |
     return f"only {found} of {round(found / share)} hypotheses drawn from the prior are possible"
 
 
-def few_lineages(memory: float) -> str | None:
+def warning_of_few_lineages(memory: float) -> str | None:
     """Return a warning if a run's `memory` is so large that the error derived from it is uncertain, else None."""
     if memory <= _MOST_MEMORY:
         return None
@@ -180,7 +180,9 @@ class NestedResult(DeadPoints):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in _PER_INSERTION:
-            values = of_length(name, frozen_int(getattr(self, name)), np.size(self.insertion_rank), "inserted point")
+            values = require_length(
+                name, frozen_int(getattr(self, name)), np.size(self.insertion_rank), "inserted point"
+            )
             object.__setattr__(self, name, values)
 
     @property

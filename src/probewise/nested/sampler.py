@@ -29,7 +29,7 @@ from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import NestedResult, few_lineages, few_possible, versions
+from probewise.nested.result import NestedResult, versions, warning_of_few_lineages, warning_of_few_possible
 from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
 LIVE_PER_PARAM = 2
@@ -50,7 +50,7 @@ def least_live(n_params: int) -> int:
 
 
 def move_at(move: Move, log_volume: float) -> Move:
-    """Return the move for what is left of the prior: the move itself, or while that is much, draws from the prior."""
+    """Return draws from the whole prior while more than a twentieth of its volume is left, then the move itself."""
     volume = math.exp(log_volume)
     return move if volume <= _PRIOR_VOLUME else PriorRejection(volume)
 
@@ -252,7 +252,7 @@ def _require_options(
 
 
 def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, RoundSummary]:
-    """Replace points once and add the dead ones to the evidence; returns new values and changes none."""
+    """Replace the worst points once and add the dead ones to the evidence; return the new state and its summary."""
     live, moving = now.live, now.moving
     move = move_at(moving, live.log_volume)
     chains = move is moving
@@ -342,7 +342,7 @@ def _result(
     """Let the remaining live points die and compute the result."""
     live, dead, notes = now.live, now.dead, now.notes
     n_dead = sum(len(d.points) for d in dead)
-    few = few_possible(now.log_start, now.log_start_error, n_live)
+    few = warning_of_few_possible(now.log_start, now.log_start_error, n_live)
     if few is not None:
         notes = (*notes, few)
     if now.n_stuck > _STUCK_SHARE * n_dead:
@@ -369,7 +369,7 @@ def _result(
             f"insertion ranks are not uniform (p = {p_value:.1g}): chains are too short or a mode was lost; "
             "use more steps_per_param or more n_live",
         )
-    if (uncertain := few_lineages(remembered)) is not None:
+    if (uncertain := warning_of_few_lineages(remembered)) is not None:
         notes = (*notes, uncertain)
     if evidence.n_eff < _FEW_EFFECTIVE:
         notes = (*notes, f"only {evidence.n_eff:.0f} effective samples: use more n_live")

@@ -29,12 +29,12 @@ from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.importance import (
     HeldOut,
     Weighted,
-    count_lineages,
+    effective_lineages,
     inherited_doubts,
     resampled_for_fit,
-    split_off,
+    split_samples,
     weigh_draws,
-    with_lost,
+    with_loss_in_error,
 )
 from probewise.nested.mixture import fit_mixture, single
 from probewise.nested.pose import AnyPrior, as_problem
@@ -142,13 +142,13 @@ def run_slow(
         raise ParameterError("error", error, "greater than 0")
     max_calls = require_whole("max_calls", max_calls, least=_LEAST_CALLS)
     evaluate = Evaluator(posed, executor=executor, n_parts=n_workers or 1)
-    told = progress or (lambda n_calls: None)
+    report = progress or (lambda n_calls: None)
     n_params = len(evaluate.names)
     again = partial(search, rng=rng, executor=executor, n_workers=n_workers, return_interrupted=False)
     space = unbounded(posed.prior) if n_params else None
     explored = None
     if space is not None:
-        explored = _explore(evaluate, space, max_calls=max_calls // 2, told=told, rng=rng)
+        explored = _explore(evaluate, space, max_calls=max_calls // 2, report=report, rng=rng)
     if space is None or explored is None:
         n_live = max(least_live(n_params), _N_LIVE_ALONE)
         alone = again(posed, n_live=n_live, max_calls=max_calls - evaluate.n_calls)
@@ -157,14 +157,14 @@ def run_slow(
     near = repartitioned(posed, space.leave(explored.x[rows])[0])
     n_live = max(least_live(n_params), _N_LIVE)
     second = again(near, n_live=n_live, max_calls=max_calls - evaluate.n_calls)
-    original = replace(second, log_likelihood=second.log_likelihood - near.prior.made_up(second.theta))
-    told(evaluate.n_calls + second.n_calls)
+    original = replace(second, log_likelihood=second.log_likelihood - near.prior.log_prior_ratio(second.theta))
+    report(evaluate.n_calls + second.n_calls)
     wanted = error if n_params <= _DENSE else max(error, _LEAST_ERROR)
     found = _importance_sampled(
         explored, original, evaluate, space, wanted=wanted, max_calls=max_calls - second.n_calls, rng=rng
     )
     n_calls = evaluate.n_calls + second.n_calls
-    told(n_calls)
+    report(n_calls)
     thin = () if n_params <= _DENSE else (_THIN,)
     if found.doubts and not found.inherited:
         warned = replace(second, warnings=(*second.warnings, *thin))
@@ -202,7 +202,7 @@ def _importance_sampled(
 ) -> Weighted:
     """Draw from a density fitted to the explored draws and the second run's samples, until the error is as wanted."""
     n_params = len(evaluate.names)
-    fitted, held = split_off(second, count_lineages(second), space, rng)
+    fitted, held = split_samples(second, effective_lineages(second), space, rng)
     n_known = int(n_effective(explored.log_weight))
     known = [fitted, explored.x[np.unique(resampled(np.exp(explored.log_weight), n_known, rng))]]
     draw = partial(weigh_draws, prior_share=0.0, space=space, evaluate=evaluate, rng=rng)
@@ -218,7 +218,7 @@ def _importance_sampled(
         left = max_calls - evaluate.n_calls
         n_draws = int(min(max(1.3 * variance / wanted**2, 500 * n_params), max(left, 100)))
         found = draw(best, held=held, n_draws=n_draws, tail=_TAIL)
-        found = with_lost(found, _LIKE_INDEPENDENT * explored.least, space, rng)
+        found = with_loss_in_error(found, _LIKE_INDEPENDENT * explored.least, space, rng)
         if (not found.doubts and found.log_z_error < _MUCH * wanted) or left < 2 * n_draws or not found.n_eff > 1:
             break
         known.append(resampled_for_fit(found.theta, found.log_weight, space, rng))
@@ -235,7 +235,7 @@ def _variance(pilot: Weighted, drawn: Proposal, best: Proposal, space: Space) ->
 
 
 def _explore(
-    evaluate: Evaluator, space: Space, *, max_calls: int, told: Callable[[int], None], rng: np.random.Generator
+    evaluate: Evaluator, space: Space, *, max_calls: int, report: Callable[[int], None], rng: np.random.Generator
 ) -> _Explored | None:
     """Draw at rising powers of the likelihood until the draws weigh the posterior; None where the limit ends it."""
     n_params = len(evaluate.names)
@@ -244,7 +244,7 @@ def _explore(
     draws.add(space.draw(2 * n_draws, rng=rng), None)
     power, least, n_last, kept = 0.0, math.inf, 0, list[Proposal]()
     while True:
-        told(evaluate.n_calls)
+        report(evaluate.n_calls)
         last = power
         power, log_weight = draws.tempered(wanted)
         n_eff = n_effective(log_weight)

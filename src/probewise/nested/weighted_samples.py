@@ -1,4 +1,4 @@
-"""What any weighted samples of a posterior can say: equally weighted draws, spread, quantiles."""
+"""Weighted samples of a posterior: equally weighted draws, standard deviations, quantiles."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def peaks_above(
         drawn = Points.join(drawn, top.met)
     for _ in range(_MOST_PEAKS):
         best = drawn.take(drawn.order()[-1:])
-        if not len(best) or best.log_likelihood[0] < known + _HIGHER:
+        if not len(best) or not best.log_likelihood[0] > known + _HIGHER:
             break
         peak = climb(
             Top(best, best.u[0], top.root), evaluate, max_calls=most - evaluate.n_calls, rng=rng, known=known + _HIGHER

@@ -19,8 +19,8 @@ from probewise.nested.refine import refine
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
+from probewise.nested.run_slow import run_slow
 from probewise.nested.sampler import LIVE_PER_PARAM, least_live, step
-from probewise.nested.sparing import run_slow
 from probewise.nested.stop import (
     NESTED_STOP,
     EvidenceChange,

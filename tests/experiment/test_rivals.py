@@ -33,7 +33,14 @@ from probewise.experiment.acquisition import ArmOverGrid, inquire
 from probewise.experiment.arm_error import arm_error
 from probewise.experiment.checking import ENOUGH_BITS, NAMES, Outline, bits_of_names
 from probewise.experiment.method import from_scratch
-from probewise.experiment.noise_rivals import Correlated, Flickering, Lost, OnLattice, Tailed, WithSignal
+from probewise.experiment.noise_rivals import (
+    CorrelatedLaw,
+    FlickerLaw,
+    LatticeLaw,
+    LostReadingLaw,
+    OutlierLaw,
+    SignalDependentLaw,
+)
 from probewise.experiment.posterior import prior_posterior, reconsidered, updated
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
@@ -129,7 +136,7 @@ def laws(*kinds):
     return [rival.likelihood for rival in rivals() if isinstance(rival.likelihood, kinds)]
 
 
-@pytest.mark.parametrize("law", laws(Tailed, Correlated, Flickering))
+@pytest.mark.parametrize("law", laws(OutlierLaw, CorrelatedLaw, FlickerLaw))
 def test_laws_of_the_residual_alone_are_densities(law):
     """As the level goes over all levels, so does the residual; its density is one."""
     level = np.linspace(-600.0, 670.0, 60_001)
@@ -137,7 +144,7 @@ def test_laws_of_the_residual_alone_are_densities(law):
     assert np.trapezoid(density, level) == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("law", laws(Lost, WithSignal, OnLattice))
+@pytest.mark.parametrize("law", laws(LostReadingLaw, SignalDependentLaw, LatticeLaw))
 def test_laws_of_the_noise_are_densities(law):
     """The density of one reading over all readings is one."""
 
@@ -153,7 +160,7 @@ def test_laws_of_the_noise_are_densities(law):
 def test_rounded_laws_of_the_noise_are_probabilities_of_cells():
     cells = np.arange(-200.0, 271.0)
     shares, sizes = np.array([0.1]), np.array([3.0])
-    for law in (Tailed(1.5, 1.0, shares, sizes), Lost(1.5, 1.0, 10.0, 10.0, 60.0)):
+    for law in (OutlierLaw(1.5, 1.0, shares, sizes), LostReadingLaw(1.5, 1.0, 10.0, 10.0, 60.0)):
         total = sum(math.exp(law.log_prob(np.array([cell]), np.array([[35.3]]))[0]) for cell in cells)
         assert total == pytest.approx(1.0, abs=1e-3)
 
@@ -362,7 +369,7 @@ def test_rows_of_the_study_are_summed_up():
 
 def test_a_memory_of_the_noise_is_heard():
     """Errors that repeat each other are likelier under it, errors that do not under the plain noise."""
-    law, level = Correlated(1.0, 0.0), np.full((1, 12), 35.0)
+    law, level = CorrelatedLaw(1.0, 0.0), np.full((1, 12), 35.0)
     alike, apart = 35.0 + np.full(12, 1.5), 35.0 + 1.5 * np.tile([1.0, -1.0, -1.0, 1.0], 3)
     plain = experiment_of(REFERENCE).likelihood
     gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (alike, apart)]
@@ -371,7 +378,7 @@ def test_a_memory_of_the_noise_is_heard():
 
 
 def test_readings_on_a_lattice_are_no_chance():
-    law, level = OnLattice(1.0, 0.0), np.full((1, 8), 35.0)
+    law, level = LatticeLaw(1.0, 0.0), np.full((1, 8), 35.0)
     level[0, 4:] = 12.0
     plain = experiment_of(REFERENCE).likelihood
     coarse = np.array([35.0, 35.0, 40.0, 30.0, 10.0, 15.0, 10.0, 10.0])
@@ -384,7 +391,7 @@ def test_readings_on_a_lattice_are_no_chance():
 def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
     """Before a shape is seen all is black: readings of 10.0 and 5.0 are no lost ones, and places without a shape."""
     readings, level = np.array(read), np.full((1, len(read)), 9.0)
-    rounded, lost = OnLattice(1.0, 0.0), laws(Lost)[0]
+    rounded, lost = LatticeLaw(1.0, 0.0), laws(LostReadingLaw)[0]
     assert rounded.log_prob(readings, level)[0] > lost.log_prob(readings, level)[0] + 2.0
     shared = np.array([10.0, 9.31, 10.72, 8.4, 10.0])  # two were lost, the others were read
     level = np.full((1, 5), 9.6)
@@ -392,7 +399,7 @@ def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
 
 
 def test_readings_that_are_rounded_as_declared_recur_by_nature():
-    law, level = OnLattice(0.6, 1.0), np.full((1, 6), 10.2)
+    law, level = LatticeLaw(0.6, 1.0), np.full((1, 6), 10.2)
     plain = Rounded(sd=0.6, step=1.0, low=1.0, high=100.0)
     for read in ([10.0] * 6, [10.0, 11.0, 10.0, 10.0, 11.0, 10.0]):
         assert law.log_prob(np.array(read), level)[0] == pytest.approx(
@@ -401,7 +408,7 @@ def test_readings_that_are_rounded_as_declared_recur_by_nature():
 
 
 def test_noise_that_grows_with_the_light_is_heard():
-    law, level = WithSignal(1.0, 0.0, 10.0, 60.0), np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12)
+    law, level = SignalDependentLaw(1.0, 0.0, 10.0, 60.0), np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12)
     read = level[0] + np.where(level[0] > 50, 4.0, 0.5) * np.tile([1.0, -1.0], 6)
     plain = experiment_of(REFERENCE).likelihood
     assert law.log_prob(read, level)[0] > plain.log_prob(read, level)[0] + 5.0
@@ -418,7 +425,7 @@ def test_a_run_is_the_warier_the_less_it_could_end_wrong(stepped):
 
 def test_readings_lost_to_exactly_black_are_no_chance():
     """Noise never repeats a value; three readings that are black to the last digit were lost."""
-    law = laws(Lost)[0]
+    law = laws(LostReadingLaw)[0]
     level = np.array([[60.0, 10.0, 10.0, 10.0, 60.0]])
     plain = experiment_of(REFERENCE).likelihood
     exact, noisy = np.array([60.3, 10.0, 10.0, 10.0, 59.1]), np.array([60.3, 10.4, 9.2, 10.9, 59.1])

@@ -135,7 +135,7 @@ def arm_error(
 def moved_by_arm(
     experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw an error of the arm for each sample of the shape, (n_samples, n_params): by how much it is moved."""
+    """Draw an error of the arm for each sample, theta (n_samples, n_params), and return its shift, of the same form."""
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     if isinstance(experiment.shape, AnyOf):
         moved[experiment.shape.which(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
@@ -171,7 +171,7 @@ def _mean_shifts(
     sd: FloatArray,
     likely_shape: str,
 ) -> FloatArray:
-    """Tell by how much each independent error of one sd moves the posterior mean of the shape, (n_params, n_errors)."""
+    """Return the shift of the shape's posterior mean by each error of one sd, (n_params, n_errors)."""
     shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
     columns = np.arange(len(mean))
     if isinstance(shape, AnyOf):

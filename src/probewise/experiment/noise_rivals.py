@@ -46,7 +46,7 @@ def _mean_over(nodes: list[FloatArray]) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class Tailed:
+class OutlierLaw:
     """Likelihood with outliers, marginalised over their share and width.
 
     `sd` and `step` are those of the declared noise (step 0: not rounded); `shares` and `sizes`, (n_nodes,), are equally
@@ -69,7 +69,7 @@ class Tailed:
 
 
 @dataclass(frozen=True, eq=False)
-class Lost:
+class LostReadingLaw:
     """Likelihood with lost readings, independent of the target.
 
     Lost readings are black, exactly or within the noise, or anything in the range.
@@ -96,7 +96,7 @@ class Lost:
 
 
 @dataclass(frozen=True, eq=False)
-class Correlated:
+class CorrelatedLaw:
     """Likelihood with AR(1) noise, marginalised over the correlation."""
 
     sd: float
@@ -118,7 +118,7 @@ class Correlated:
 
 
 @dataclass(frozen=True, eq=False)
-class WithSignal:
+class SignalDependentLaw:
     """Likelihood with noise that grows with the signal, marginalised over the ratio."""
 
     sd: float
@@ -140,7 +140,7 @@ class WithSignal:
 
 
 @dataclass(frozen=True, eq=False)
-class Flickering:
+class FlickerLaw:
     """Likelihood under a lamp that flickers faster than the readings: each reading has a random phase.
 
     `amplitudes` are equally weighted nodes. A sine of uniform phase is approximated by a mixture over a few phases.
@@ -164,7 +164,7 @@ class Flickering:
 
 
 @dataclass(frozen=True, eq=False)
-class OnLattice:
+class LatticeLaw:
     """Likelihood with coarser rounding than declared; without a lattice, the same as the declared noise.
 
     Three values or more show their lattice. Of readings that should not be rounded at all, two values that recur do,
@@ -200,7 +200,7 @@ class OnLattice:
         return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(self.step) if self.step else 0.0))
 
 
-Law = Tailed | Lost | Correlated | WithSignal | Flickering | OnLattice
+Law = OutlierLaw | LostReadingLaw | CorrelatedLaw | SignalDependentLaw | FlickerLaw | LatticeLaw
 
 
 def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, Law]:
@@ -218,12 +218,12 @@ def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, L
     shares, sizes = Outliers().bank()[:, 0].T
     amplitudes = HeavyTailedPrior(0.01 * (high - low), positive=True).from_unit((np.arange(6) + 0.5) / 6)
     return {
-        "outliers": Tailed(sd, step, shares, sizes),
-        "dropouts": Lost(sd, step, dark, low, high),
-        "correlated_noise": Correlated(sd, step),
-        "signal_dependent_noise": WithSignal(sd, step, dark, bright),
-        "flicker": Flickering(sd, step, tuple(amplitudes.tolist())),
-        "quantisation": OnLattice(sd, step),
+        "outliers": OutlierLaw(sd, step, shares, sizes),
+        "dropouts": LostReadingLaw(sd, step, dark, low, high),
+        "correlated_noise": CorrelatedLaw(sd, step),
+        "signal_dependent_noise": SignalDependentLaw(sd, step, dark, bright),
+        "flicker": FlickerLaw(sd, step, tuple(amplitudes.tolist())),
+        "quantisation": LatticeLaw(sd, step),
     }
 
 

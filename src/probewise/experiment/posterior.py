@@ -210,7 +210,7 @@ def updated(
 def _with_last_reading(
     previous: Posterior, problems: list[SensorProblem], usual: MoveEffort, rng: np.random.Generator
 ) -> list[Particles]:
-    """Take the last reading into every kind, with less effort into improbable rivals."""
+    """Update every kind with the last reading, improbable rivals with less effort."""
     return [
         update(particles, problem, rng=rng, effort=BRIEF if kind.left_out and p < _SUSPECTED[1][0] else usual)
         for kind, particles, problem, p in zip(

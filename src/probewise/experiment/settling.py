@@ -1,9 +1,9 @@
 """Utility of a reading for shape and sensor faults jointly, and near the end for ending the run.
 
 Several kinds of hypotheses may explain all readings and differ in the shape. The utility is the expected information
-about all of them together. If some reading may be the last, it is the probability of that: every length known under the
-mixture, with little chance that one is wrong. Kinds that are aliased but agree on the shape then need not be
-distinguished. Once the lengths are known, readings check what is left open (`checking`).
+about all of them together. If some reading may meet the stopping rule (every length known under the mixture, little
+chance that one is wrong), it is the probability of that: kinds that are aliased but agree on the shape need not be
+distinguished. Of such readings those count more that spare a check afterwards (`checking`).
 """
 
 from __future__ import annotations

@@ -30,6 +30,7 @@ def value_digest(value: object) -> str:
 
 
 def _add_to_digest(digest: Any, value: object) -> None:
+    """Add types, names of fields and bits of a value to a digest."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         digest.update(f"<{type(value).__qualname__}>".encode())
         for item in dataclasses.fields(value):

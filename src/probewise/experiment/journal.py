@@ -200,6 +200,7 @@ def _salvaged(path: str | Path, head: bytes, index: int) -> Entry | None:
 
 
 def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
+    """Parse a measurement from a line's JSON object; errors name the row and the column."""
     column = "index"
     try:
         index = line["index"]

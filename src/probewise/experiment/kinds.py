@@ -168,6 +168,7 @@ class _Part:
 
 
 def _parts(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_Part]:
+    """List the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
     if not isinstance(shape, AnyOf):
         return [_Part("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)

@@ -318,6 +318,7 @@ def _steps(
     before: Journal | None,
     settings: Mapping[str, Any],
 ) -> Generator[Step, None, None]:
+    """Yield the steps: those of the journal `before`, then those of new readings, written to `path`."""
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
     field = ArmOverGrid.under(instrument, experiment.grid)
     first = _rng_of(seed, 0)

@@ -112,6 +112,7 @@ class NestedSampling:
     def _sampled_anew(
         self, had: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
     ) -> Particles:
+        """Sample one kind by nested sampling; its evidence is zero if none of its hypotheses is possible."""
         try:
             result = run(
                 kind.problem(recording),
@@ -129,6 +130,7 @@ class NestedSampling:
 
 
 def _weighted(result: NestedResult, n_calls: int) -> Weighted:
+    """Return the weighted samples of a run, with the number of evaluations so far."""
     return Weighted(
         result.names,
         result.theta,

@@ -39,7 +39,7 @@ _ENDING = 60  # most informative places, tested for ending the run, and most inf
 _LEAST_BITS = 1e-3  # of a reading of the far side, which is taken even if it promises nothing
 _UNSEEN = 0.5  # worth of knowing the lengths where the far side is still to be read
 _LABEL = "expected information about the shape and what the sensor leaves out (bits)"
-_ENDS = "probability that a reading there ends the run, and bits about what the sensor leaves out"
+_ENDS = "probability that a reading there ends the run, plus bits about what the sensor leaves out"
 
 
 def utility_near_end(

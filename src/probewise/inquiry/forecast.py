@@ -101,6 +101,8 @@ class DirectForecast:
 
 @dataclass(frozen=True, eq=False)
 class _DirectPredictive:
+    """Predictions of the hypotheses `asked` as the `index` of the nearest level, (n_asked, n_designs)."""
+
     asked: IntArray
     stands_for: FloatArray
     index: IntArray

@@ -62,6 +62,8 @@ class DiscForecast:
 
 @dataclass(frozen=True, eq=False)
 class _DiscPredictive:
+    """Discs over a grid of places, with the sensor's orientations `turns_rad`, (n_combinations, n_places)."""
+
     table: DiscTable
     theta: FloatArray
     grid: Grid
@@ -189,6 +191,8 @@ class _ShapesAt(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _TabulatedPredictive:
+    """Shapes over a grid of places, for each orientation and height of the sensor."""
+
     shapes_at: dict[tuple[float, float], _ShapesAt]
     ways: list[tuple[float, float]]
     grid: Grid

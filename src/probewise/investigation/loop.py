@@ -90,6 +90,7 @@ def _rounds(
     rounds: int,
     rngs: list[np.random.Generator],
 ) -> Generator[Round, None, None]:
+    """Yield the rounds; `diagnosed` diagnoses all recordings so far, `rngs` has one generator per round."""
     recordings: list[Recording] = []
     asked, wanted = "the first plan", plan
     for number, rng in enumerate(rngs, start=1):

@@ -45,6 +45,7 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
 
 
 def _one(text: str) -> Concealed:
+    """Parse one effect, NAME:VALUE,VALUE."""
     name, _, numbers = text.partition(":")
     kinds = _kinds()
     if name not in kinds:

@@ -248,9 +248,11 @@ class Inquiry(ShowsItself):
 
     @property
     def _near(self) -> bool:
+        """Whether the goal is not reached yet, but every sd is within `_NEAR_GOAL` times its goal."""
         return bool(self._goal) and 1.0 < self._times_goal < _NEAR_GOAL
 
     def _utility_under(self, weight: FloatArray) -> FloatArray:
+        """Compute the acquisition function for the posterior samples with these weights, (n_settings,)."""
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
         theta = self._posterior.theta[resampled(weight, n, self._rng)]
         theta = theta[self._rng.permutation(n)]  # copies of one sample apart
@@ -263,6 +265,7 @@ class Inquiry(ShowsItself):
         return np.asarray(now - predictive.distance(values, np.array(goal)))
 
     def _costs(self) -> FloatArray:
+        """Return the seconds of a reading at each setting from here, (n_settings,) or a single number."""
         given = self._cost_s
         if given is None:
             return np.ones(len(self._settings))
@@ -277,6 +280,7 @@ class Inquiry(ShowsItself):
 
 
 def _goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
+    """Check the target sds by parameter; none if no goal is given."""
     if goal is None:
         return {}
     if not isinstance(goal, Mapping) or not goal:

@@ -95,6 +95,7 @@ class Settings:
 
 
 def _column(name: str, values: Any) -> Column:
+    """Convert the values of one knob to a read-only column of finite numbers or of names, (n,)."""
     array = np.asarray(values)
     if array.ndim != 1 or not array.size or array.dtype.kind not in "biufU":
         raise ParameterError(name, values, _ALLOWED)

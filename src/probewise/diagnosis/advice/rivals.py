@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from itertools import islice
 
 import numpy as np
@@ -10,11 +11,10 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, next_scans
 from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
 from probewise.diagnosis.fitting.fit import residual_degrees_of_freedom
+from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import spoken_name
-
-__all__ = ["next_readings"]
 
 _LEAST_PROBABILITY = 0.01
 _MOST_RIVALS = 5
@@ -31,15 +31,7 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
-    found: list[WeighedFit] = []
-    for names in ranked:
-        candidate = searched.best(names, searched.certain) if names else null
-        # The rival of a named effect is the next hypothesis, however improbable; that of clean, a possible weak effect.
-        second = len(found) == 1 and bool(found[0].names)
-        if candidate is not None and (not found or second or probabilities[names] >= _LEAST_PROBABILITY):
-            found.append(candidate)
-        if len(found) == _MOST_RIVALS:
-            break
+    found = _leading(searched, null, {names: probabilities[names] for names in ranked})
     prepared = searched.prepared
     sd, plan, apparatus = found[0].sd, prepared.recording.plan, prepared.apparatus
     as_calibrated = f"{apparatus.words.null} as calibrated"
@@ -53,6 +45,20 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     tried = islice((rival for rival in imagined if rival is not None), _TRIED)
     wanted = (next_scans([*rivals, rival], sd, plan, apparatus) for rival in tried)
     return next((asked for asked in wanted if asked is not None), None)
+
+
+def _leading(searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]) -> list[WeighedFit]:
+    """Return the fits of the leading hypotheses on the mean, by their probabilities, the most probable first."""
+    found: list[WeighedFit] = []
+    for names, probability in ranked.items():
+        candidate = searched.best(names, searched.certain) if names else null
+        # The rival of a named effect is the next hypothesis, however improbable; that of clean, a possible weak effect.
+        second = len(found) == 1 and bool(found[0].names)
+        if candidate is not None and (not found or second or probability >= _LEAST_PROBABILITY):
+            found.append(candidate)
+        if len(found) == _MOST_RIVALS:
+            break
+    return found
 
 
 def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> Rival:

@@ -14,8 +14,6 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import in_vocabulary, out_of_vocabulary
 from probewise.effects import public_name
 
-__all__ = ["Hypothesis", "Judged", "Verdict", "credible_set", "decide", "hypotheses_of", "judge", "verdict_on"]
-
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
 _OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: rivals below it are not credible; priors differ by less
@@ -215,10 +213,15 @@ def decide(
         if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
             return "cannot_tell", top
         return ("noise" if set(top) <= noise_names else "named"), top
-    both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
-    of_class = {top} | {tuple(sorted({*top} - {name} | {other})) for name, other in both_ways if name in top}
+    of_class = _class_of(top, aliases)
     if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
         return "cannot_tell", top
     if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
         return "cannot_tell", ()
     return ("noise" if set(top) <= noise_names else "named"), top
+
+
+def _class_of(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
+    """Return a combination and those that differ from it by one effect swapped for its alias."""
+    both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
+    return {names} | {tuple(sorted({*names} - {name} | {other})) for name, other in both_ways if name in names}

@@ -14,9 +14,6 @@ from probewise.effects import NamedEffect, sign_of_motion
 from probewise.recordings.plan import Plan
 from probewise.scene import edge_distance, region_of
 
-__all__ = ["covariate_of", "covariates_of", "slope_along_the_move"]
-
-
 _MOST_SCANS = 24  # number of scans above which residuals are not located in single scans
 
 
@@ -67,14 +64,18 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
         out.append(Covariate("orientation", degrees, everything, groups=True))
     if len(np.unique(scan)) > 1:
         out.append(Covariate("scan", scan.astype(np.float64), everything, groups=True))
-    x_mm, y_mm = plan.x_mm[usable], plan.y_mm[usable]
+    return out + _places(plan, usable)
+
+
+def _places(plan: Plan, usable: IntArray) -> list[Covariate]:
+    """List the places along all scans in the longer direction, and along each long scan."""
+    x_mm, y_mm, scan = plan.x_mm[usable], plan.y_mm[usable], plan.scan[usable]
     by_scan = [np.flatnonzero(scan == k) for k in range(len(plan.scan_names))]
     along_x = np.ptp(x_mm) >= np.ptp(y_mm)
     alike = [rows for rows in by_scan if rows.size and (np.ptp(x_mm[rows]) >= np.ptp(y_mm[rows])) == along_x]
-    rows = np.sort(np.concatenate(alike)) if alike else everything
+    rows = np.sort(np.concatenate(alike)) if alike else np.arange(len(usable))
     longest = (x_mm if along_x else y_mm)[rows]
-    if _varies(longest):
-        out.append(Covariate("place", longest, rows))
+    out = [Covariate("place", longest, rows)] if _varies(longest) else []
     for rows, name in zip(by_scan, plan.scan_names, strict=True):
         if rows.size >= 16 and len(by_scan) <= _MOST_SCANS:
             along = x_mm[rows] if np.ptp(x_mm[rows]) >= np.ptp(y_mm[rows]) else y_mm[rows]

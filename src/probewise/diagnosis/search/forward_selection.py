@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from probewise.diagnosis.evidence.laplace import Linearised
@@ -26,8 +26,6 @@ from probewise.diagnosis.search.state import SearchState, rivals_of
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import AGAIN, first_of
 
-__all__ = ["Proposal", "promising", "proposals_for", "select_forward"]
-
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
@@ -48,19 +46,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
     within = {c: ORDERS_WITHIN if c.degrees_of_freedom <= freedom else STEERING for c in state.nulls}
     parents = [c for c in state.nulls if c.log_z > null.log_z - within[c]]
     for size in range(1, min(depth, len(state.effects)) + 1):
-        proposals: dict[Names, Proposal] = {}
-        for parent in parents:
-            proposals = proposals_for(state, parent, proposals)
-        if size == 2:
-            proposals = _with_scores_about_null(state, proposals)
-        if size == 1:
-            chosen = _refitted_alone(state, null, proposals)
-        else:
-            chosen = promising(state, proposals, width=beam, behind=STEERING)
-            chosen += [names for names in _both_copies(state, null) if names in proposals and names not in chosen]
-        asked = [proposals[names] for names in chosen]
-        if size == 1:
-            asked = [*asked[:1], *_proposals_under_plain_noise(state, null), *asked[1:]]
+        asked = _asked(state, null, parents, size, beam)
         state.share = SHARES[size - 1] if size <= len(SHARES) else 1.0
         refitted = []
         for k, proposal in enumerate(asked):
@@ -74,6 +60,21 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
         if not kept:
             break
         parents = [c for c in kept if c.log_z > max(r.log_z for r in rivals_of(c.names, kept)) - EXTENDED_WITHIN]
+
+
+def _asked(state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int, beam: int) -> list[Proposal]:
+    """Return the combinations of one size to refit, each extended from one of the parents."""
+    proposals: dict[Names, Proposal] = {}
+    for parent in parents:
+        proposals = proposals_for(state, parent, proposals)
+    if size == 1:
+        alone = [proposals[names] for names in _refitted_alone(state, null, proposals)]
+        return [*alone[:1], *_proposals_under_plain_noise(state, null), *alone[1:]]
+    if size == 2:
+        proposals = _with_scores_about_null(state, proposals)
+    chosen = promising(state, proposals, width=beam, behind=STEERING)
+    chosen += [names for names in _both_copies(state, null) if names in proposals and names not in chosen]
+    return [proposals[names] for names in chosen]
 
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:

@@ -44,8 +44,6 @@ from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.progress import Progress, silent
 
-__all__ = ["search"]
-
 
 def search(
     prepared: Prepared,
@@ -79,8 +77,7 @@ def search(
     if max_order is None:
         max_order = 1 if len(prepared.usable) < FEW_READINGS else MAX_ORDER
     prior = prior or prepared.apparatus.prior_odds(effects)
-    on_noise = {name: cast(NoiseEffect, effects[name]) for name in effects if name in prepared.on_noise}
-    on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
+    on_mean, on_noise = _by_side(prepared)
     refits = (
         Refits(prepared.null, Noises(recording, on_noise, prior), TemplateMemory(prepared.usable))
         if after is None
@@ -131,6 +128,13 @@ def search(
         evidences=evidences(),
         posterior=posterior(),
     )
+
+
+def _by_side(prepared: Prepared) -> tuple[dict[str, NamedEffect[Any]], dict[str, NoiseEffect]]:
+    """Divide the effects into those on the mean and those on the noise."""
+    effects, on_noise = prepared.effects, prepared.on_noise
+    on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
+    return on_mean, {name: cast(NoiseEffect, effects[name]) for name in effects if name in on_noise}
 
 
 def _refit_late(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:

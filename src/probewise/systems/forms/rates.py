@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -16,8 +16,6 @@ from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, with_unit
 from probewise.systems.forms.modulations import wave_joined, wave_numbers
 from probewise.systems.motion import Limit, Motion
-
-__all__ = ["forms_on_rates"]
 
 _MOST_WAVES = 64
 _N_SIZES = 9
@@ -181,12 +179,7 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > ends.middle else "falls"
-        taken = [
-            f"; {other} takes up {with_unit(mean[k], sd[k], '')} of the rest"
-            for k, other in enumerate(others, 1)
-            if mean[k] > _NO_SHARE
-        ]
-        return f"{state} {way} no further than {with_unit(mean[0], sd[0], '')}" + "".join(taken)
+        return f"{state} {way} no further than {with_unit(mean[0], sd[0], '')}" + _said_of_spilling(others, mean, sd)
 
     alone = Form(
         f"limit:{state}",
@@ -208,6 +201,15 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
             replace(alone, marginals=marginals(other), entries=entries(other), fixed=fixed(other)) for other in into
         ]
         yield replace(alone, alternatives=tuple(spilling))
+
+
+def _said_of_spilling(others: Sequence[str], mean: FloatArray, sd: FloatArray) -> str:
+    """Say which states take up what a bound stops, by the shares after its level."""
+    return "".join(
+        f"; {other} takes up {with_unit(mean[k], sd[k], '')} of the rest"
+        for k, other in enumerate(others, 1)
+        if mean[k] > _NO_SHARE
+    )
 
 
 def _rate_scale(about: About, state: str) -> float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -20,8 +20,6 @@ from probewise.errors import NotConvergedError
 from probewise.world.systems.forms.form import Form, Instants, Placed
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
-
-__all__ = ["solve_law"]
 
 _RTOL, _ATOL = 1e-8, 1e-10
 _CHECKS = np.array([0.25, 0.5, 0.75, 1.0])  # shares of a gap at which events are checked
@@ -329,15 +327,28 @@ class _Integration:
                 s, share = solved.y[:, -1].copy(), float(solved.t[-1])
                 if solved.status != 1 or share >= high:
                     break
-                forced = {}
-                for m, ((f, size), found, mode) in enumerate(zip(hard, solved.t_events or [], modes, strict=True)):
-                    if found.size and mode != 0:  # at rest, or at the bound
-                        s[names.index(f.target)] = 0.0 if f.sticks else size
-                    elif found.size:  # breaks loose
-                        forced[m] = int(np.sign(free(share, s)[f.target])) if f.sticks else 1
+                forced = _after_events(hard, modes, solved.t_events or [], s, names, partial(free, share))
             else:
                 raise NotConvergedError(f"the law of the {self.kind.name} sticks and slips without end")
         return s
+
+
+def _after_events(
+    hard: Sequence[tuple[Form, float]],
+    modes: Sequence[int],
+    events: Sequence[FloatArray],
+    s: FloatArray,
+    names: list[str],
+    free: Callable[[FloatArray], dict[str, float]],
+) -> dict[int, int]:
+    """Place states that came to rest or to their bound; return the modes of those that broke loose, by their number."""
+    forced: dict[int, int] = {}
+    for m, ((f, size), found, mode) in enumerate(zip(hard, events, modes, strict=True)):
+        if found.size and mode != 0:  # at rest, or at the bound
+            s[names.index(f.target)] = 0.0 if f.sticks else size
+        elif found.size:  # breaks loose
+            forced[m] = int(np.sign(free(s)[f.target])) if f.sticks else 1
+    return forced
 
 
 def _intervals_between(edges: Sequence[float]) -> Iterator[tuple[float, float]]:

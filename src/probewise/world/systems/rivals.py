@@ -17,8 +17,6 @@ from probewise.world.systems.fit import AddedForm, Fitted, Model, free_numbers, 
 from probewise.world.systems.forms.form import Form, Placed, as_numbers
 from probewise.world.systems.forms.true_system import TrueSystem
 
-__all__ = ["TELLING_NATS", "rivals_of", "short_name", "templates_of"]
-
 TELLING_NATS = 3.0
 """Evidence below which two explanations cannot be distinguished."""
 
@@ -132,23 +130,22 @@ def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model:
     bare = simulate(true.kind, true.rows, parameters, inner).readings
     out: dict[Form, FloatArray] = {}
     with np.errstate(all="ignore"):
-        for form in forms:
-            if form.side == "reading":
-                numbers = as_numbers(settings[form])
-                out[form] = (
-                    with_reading_effects(
-                        np.repeat(bare, len(settings[form]), axis=0), true.rows, [*outer, (form, numbers)]
-                    )
-                    - fitted.readings
-                )
-        alone = [f for f in forms if f.side != "reading" and (f.sticks or f.stops or true.kind.law is None)]
+        for form in (f for f in forms if f.side == "reading"):
+            unread = np.repeat(bare, len(settings[form]), axis=0)
+            out[form] = with_reading_effects(unread, true.rows, [*outer, (form, as_numbers(settings[form]))]) - fitted.readings
+        alone, together = _apart(true, [f for f in forms if f.side != "reading"])
         for form in alone:
             found = _simulated(true, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))
             out[form] = found - fitted.readings
-        together = [f for f in forms if f.side != "reading" and f not in alone]
         for chunk in _chunks(together, settings):
             out |= _simulated_together(true, chunk, settings, fitted, model)
     return out
+
+
+def _apart(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
+    """Divide forms into those to be simulated each alone, and those of one integration together."""
+    alone = [f for f in forms if f.sticks or f.stops or true.kind.law is None]
+    return alone, [f for f in forms if f not in alone]
 
 
 def _chunks(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]]) -> list[list[Form]]:

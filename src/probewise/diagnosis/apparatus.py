@@ -21,8 +21,6 @@ from probewise.diagnosis.scheduling import Command
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["Apparatus", "Words"]
-
 
 @dataclass(frozen=True)
 class Words:

@@ -41,9 +41,6 @@ from probewise.effects.vocabulary import require_effects
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
-__all__ = ["Thorough", "diagnose", "diagnose_prepared"]
-
-
 Thorough: TypeAlias = Callable[[Searched], tuple[Searched, tuple[Weighing, ...]]]
 """Function that recomputes the evidence of a search; returns it with better probabilities, and both evidences."""
 

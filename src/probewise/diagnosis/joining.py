@@ -14,8 +14,6 @@ from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Plan, Recording, require_recording
 from probewise.sensor import COMMANDED
 
-__all__ = ["covariates_joined", "join", "join_plans", "last_known"]
-
 
 def join(recordings: Sequence[Recording]) -> Recording:
     """Concatenate recordings: scans remain distinct, and so do patterns of one name with different descriptions.

@@ -18,8 +18,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording, require_recording
 from probewise.sensor import Stage
 
-__all__ = ["model_with"]
-
 
 def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Generator) -> ModelSamples:
     """Fit the sensor with exactly these effects, at the SSF order with the largest evidence.

@@ -21,8 +21,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording, require_described
 from probewise.sensor import Stage
 
-__all__ = ["Prepared", "prepare"]
-
 
 @dataclass(frozen=True, eq=False)
 class Prepared:

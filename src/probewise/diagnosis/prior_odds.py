@@ -11,8 +11,6 @@ from probewise.diagnosis.names import Names
 from probewise.effects import UNNAMED, NamedEffect, first_of, is_out_of_vocabulary
 from probewise.sensor import Stage
 
-__all__ = ["PriorOdds"]
-
 
 @dataclass(frozen=True)
 class PriorOdds:

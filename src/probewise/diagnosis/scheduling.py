@@ -10,8 +10,6 @@ import numpy as np
 from probewise._arrays import IntArray
 from probewise.recordings.plan import Plan
 
-__all__ = ["MOST_READINGS", "Command", "rows_of"]
-
 MOST_READINGS = 102
 
 

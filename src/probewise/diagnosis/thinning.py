@@ -9,8 +9,6 @@ import numpy as np
 from probewise._arrays import IntArray
 from probewise.recordings.plan import Recording
 
-__all__ = ["MOST_READINGS", "rows_to_diagnose"]
-
 MOST_READINGS = 2400
 _FEWEST_SCANS = 8
 _STRETCH = 6  # readings

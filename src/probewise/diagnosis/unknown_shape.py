@@ -21,8 +21,6 @@ from probewise.recordings.plan import Plan, Recording
 from probewise.scene import AnyOf, Region, Shape, outlines
 from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
-__all__ = ["SensorAndShape"]
-
 _N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
 
 

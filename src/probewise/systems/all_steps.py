@@ -30,8 +30,6 @@ from probewise.systems.motion import (
 )
 from probewise.systems.table import RunTable
 
-__all__ = ["KnownTrajectory", "Problem", "SolvedSteps", "Steps", "Trajectories", "integrate_near", "solve", "steps_of"]
-
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
 _NEWTONS = 8  # iterations with a sample's own Jacobian
 _HOPELESS = 4  # of these, after which a sample that still changes by a tenth is left to be stepped

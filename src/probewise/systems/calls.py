@@ -16,8 +16,6 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.progress import Progress
 from probewise.systems.simulator import Simulate
 
-__all__ = ["Caller", "CountedCalls", "IntegrationTally"]
-
 MOST_CALLS = 20_000
 """Limit of calls in a diagnosis, for a `simulate` that takes one sample at a time."""
 

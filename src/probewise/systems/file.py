@@ -15,8 +15,6 @@ from probewise.recordings.python_file import error_text, run_python_text
 from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_of
 
-__all__ = ["read_simulator"]
-
 _NAMES = (
     "reading",
     "unit",

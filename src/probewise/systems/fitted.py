@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind
-from probewise._posterior_samples import MIN_SAMPLES, require_absent, require_samples
+from probewise._posterior_samples import require_absent, require_samples
 from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError
@@ -26,8 +26,6 @@ from probewise.recordings.text import read_text
 from probewise.systems.forms.rebinding import Recorded
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
-
-__all__ = ["FORMAT", "MIN_SAMPLES", "FittedSystem", "read_fitted_system", "samples_csv", "write_fitted_system"]
 
 FORMAT = "system/1"
 _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` writes"

@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from probewise.errors import ParameterError
 from probewise.systems.table import RunTable
 
-__all__ = ["append_tables", "join_tables", "unused_name"]
-
 _FILE = "file"
 
 

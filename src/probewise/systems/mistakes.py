@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from probewise.errors import FileError
 from probewise.systems.simulator import Simulator
 
-__all__ = ["mistake_in"]
-
 _LONGEST = 160
 
 

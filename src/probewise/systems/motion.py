@@ -15,21 +15,6 @@ from probewise.errors import ParameterError
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
 
-__all__ = [
-    "Given",
-    "Limit",
-    "Motion",
-    "RowsInRuns",
-    "Term",
-    "gaps_of",
-    "integrate",
-    "integrate_states",
-    "observed",
-    "starts_of",
-    "states_by_step",
-    "stepped",
-]
-
 Term = Callable[[Mapping[str, Any], Mapping[str, Any], Mapping[str, Any]], Any]
 """A term of a state's rate: function of states, parameters and columns; returns (n_samples, n_runs)."""
 

@@ -27,8 +27,6 @@ from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
 from probewise.systems.table import RunRecording, RunTable, relative_sd_of
 
-__all__ = ["SystemPrediction", "as_recording", "draw_for_new_run", "predict_system", "write_system_prediction"]
-
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
 _SOME = 200  # samples used to estimate the scatter of predictions in each row

@@ -15,20 +15,6 @@ from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
 from probewise.systems.table import RunTable
 
-__all__ = [
-    "Columns",
-    "Extra",
-    "Law",
-    "Noise",
-    "Observe",
-    "Rates",
-    "Simulate",
-    "Simulator",
-    "Values",
-    "marginal_of",
-    "table_for",
-]
-
 Values: TypeAlias = Mapping[str, Any]
 """Parameters by name: floats, or arrays that broadcast against the rows."""
 

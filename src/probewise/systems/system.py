@@ -23,8 +23,6 @@ from probewise.systems.motion import Motion, RowsInRuns, integrate, observed
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
-__all__ = ["System", "SystemChain"]
-
 _N_STARTS = 8
 _N_TRIED = 3  # prior points for the trial calls that determine how a function can be called
 _MOST_STEPS = 4096  # integration steps over the longest run, in addition to one per row

@@ -17,8 +17,6 @@ from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.table import csv_text, number_text, read_table
 
-__all__ = ["RunRecording", "RunTable", "read_run_table", "relative_sd_of", "write_run_table"]
-
 _ONE_RUN = "all"
 
 

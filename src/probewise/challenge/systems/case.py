@@ -20,8 +20,6 @@ from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.systems import read_run_table, read_simulator
 from probewise.world.systems import SystemCase, SystemEffect, draw_system_case, system_stratum_of, write_system_case
 
-__all__ = ["run_system_case"]
-
 _OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
 
 

@@ -20,8 +20,6 @@ from probewise.systems.prediction import draw_for_new_run
 from probewise.systems.system import SystemChain
 from probewise.world.systems import SystemCase, right_predictions
 
-__all__ = ["log_densities_of_runs", "predicted_runs"]
-
 _N_SAMPLES = 200
 _N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the density must not depend on a few draws
 _LOG_ROOT = 0.5 * math.log(2 * math.pi)

@@ -29,8 +29,6 @@ from probewise.challenge.table import (
     singles_of,
 )
 
-__all__ = ["family_of", "gains_of", "score_systems"]
-
 Result = Mapping[str, Any]
 
 _MOST_NATS = 100.0  # cap on a recording's held-out gain

@@ -19,8 +19,6 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
 from probewise.effects import NamedEffect, first_of
 
-__all__ = ["Alias", "aliased_pairs", "aliases", "projected_cosine", "with_separating_plans"]
-
 ALIAS_COSINE = 0.9
 _LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # least nats per reading; less is rounding error
 

@@ -21,8 +21,6 @@ from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.scheduling import MOST_READINGS, Command, rows_of
 from probewise.recordings.plan import Plan
 
-__all__ = ["NextMeasurement", "Rival", "mutual_information", "next_scans"]
-
 _STRIDES = (2, 4)
 _PROMISING = 4  # scans per pair of rivals whose full predictive distribution is computed
 _ENOUGH = 40.0  # squared distance of predictions, in noise sds, beyond which more separation adds nothing

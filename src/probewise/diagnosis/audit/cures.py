@@ -24,8 +24,6 @@ from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan
 
-__all__ = ["cures_of"]
-
 _MOST_SETTINGS = 48  # bank entries per effect, since a hundred scans are tried at every step
 _MOST_SCANS = 5
 _WORTHWHILE = 0.15  # least reduction of the summed deficit by an added scan

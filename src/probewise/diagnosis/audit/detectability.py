@@ -22,17 +22,6 @@ from probewise.effects import Extent, NamedEffect
 from probewise.recordings.plan import Plan
 from probewise.sensor import Stage
 
-__all__ = [
-    "ALIAS",
-    "LAMBDA",
-    "LEAST_NATS",
-    "LEAST_SHARE",
-    "Expected",
-    "PlanTemplates",
-    "ProjectedTemplates",
-    "nats_between",
-]
-
 LAMBDA = 8.0  # size of an effect at which a plan is judged
 LEAST_NATS = 3.0  # least evidence that separates two effects
 ALIAS = math.sqrt(1 - 2 * LEAST_NATS / LAMBDA**2)  # the cosine at which the evidence is LEAST_NATS

@@ -7,8 +7,6 @@ from typing import Any
 
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit
 
-__all__ = ["CURE_PLAN", "audit_json"]
-
 CURE_PLAN = "cure_plan.csv"
 
 

@@ -35,17 +35,6 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_described, require_plan
 from probewise.sensor import Stage, is_free_form
 
-__all__ = [
-    "Cure",
-    "Detectability",
-    "DetectableSize",
-    "EffectAudit",
-    "PlanAudit",
-    "audit_plan",
-    "audit_recorded",
-    "audits_and_cosines",
-]
-
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
 _MOST_READINGS = 4000  # readings of a recording that are used; of a longer one every second, third, ...

@@ -15,8 +15,6 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence.laplace import Linearised, mix_scales
 from probewise.diagnosis.noise.law import NoiseLaw
 
-__all__ = ["Bank"]
-
 _ABSENT = 1e-9  # share of a template's sum of squares below which its projection is rounding error
 _REMEMBERED = 5  # most recent noise models in the cache, up to `_MOST_BYTES`
 _MOST_BYTES = 2**28

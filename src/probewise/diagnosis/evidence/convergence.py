@@ -9,8 +9,6 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.errors import NotConvergedError
 
-__all__ = ["require_converged", "require_finite"]
-
 _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
 
 

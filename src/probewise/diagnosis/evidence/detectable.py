@@ -10,8 +10,6 @@ from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw
 
-__all__ = ["log_detectable"]
-
 
 def log_detectable(found: Fit, law: NoiseLaw, usable: IntArray) -> float:
     """Return the log probability that every effect of a fit has a detectable size (lambda).

@@ -19,8 +19,6 @@ from probewise._arrays import FloatArray, frozen
 from probewise.diagnosis.evidence.joint import JointProblem, StandardNormal
 from probewise.diagnosis.fitting.coordinates import SensorCoordinates
 
-__all__ = ["Folded", "folded"]
-
 
 @dataclass(frozen=True, eq=False)
 class FoldedNormal(StandardNormal):

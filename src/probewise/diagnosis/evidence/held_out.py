@@ -13,8 +13,6 @@ from probewise.diagnosis.fitting.fit import Fit, fit, residual_degrees_of_freedo
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["LEAST_ROWS", "MOST_PARTS", "HeldOut", "Parts", "gain_by_part", "held_out_blocks", "held_out_gain"]
-
 LEAST_ROWS = 8
 """Least number of rows of a held-out part."""
 

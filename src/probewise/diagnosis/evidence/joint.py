@@ -16,8 +16,6 @@ from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.recordings.plan import Recording
 
-__all__ = ["JointProblem", "StandardNormal", "log_likelihood_of_whitened"]
-
 _HELD = 0.999  # share of the evidence in the noise nodes that are kept; the likelihood is rescaled for the rest
 
 

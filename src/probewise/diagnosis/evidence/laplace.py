@@ -15,20 +15,6 @@ from probewise.diagnosis.fitting.null import log_multiplicity
 from probewise.diagnosis.noise.law import NoiseLaw, forms
 from probewise.diagnosis.noise.models import NoiseModel, NoiseNodes
 
-__all__ = [
-    "LEAST_VISIBLE",
-    "SCALES",
-    "Blocks",
-    "Linearised",
-    "NoiseEvidence",
-    "block_log_bayes_factors",
-    "covariance_root",
-    "mix_scales",
-    "orthonormal",
-    "project_scaled",
-    "weigh",
-]
-
 SCALES = np.geomspace(0.05, 25.0, 8)
 """Prior scales of an effect's rms, in noise sds: a mixture with a heavy tail."""
 

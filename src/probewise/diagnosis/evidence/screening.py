@@ -15,8 +15,6 @@ from probewise.diagnosis.evidence.laplace import Blocks, Linearised, block_log_b
 from probewise.diagnosis.evidence.templates import EffectTemplates
 from probewise.diagnosis.names import Names
 
-__all__ = ["log_mean", "score_effects", "score_pairs"]
-
 _BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
 
 

@@ -19,8 +19,6 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.effects import NamedEffect, in_scans
 from probewise.sensor import Stage
 
-__all__ = ["EffectTemplates", "TemplateMemory", "combinations_of", "effect_templates"]
-
 _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
 _ROUNDING = 1e-9  # of the largest prediction: a smaller change counts as none
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache

@@ -24,19 +24,6 @@ from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture
 
-__all__ = [
-    "FARTHEST",
-    "LEAST_READINGS",
-    "CalibratedSensor",
-    "SensorCoordinates",
-    "default_sensor",
-    "effect_coordinates",
-    "effect_values",
-    "known_scene",
-    "natural_to_theta",
-    "theta_to_natural",
-]
-
 FARTHEST = 6.0
 """Bound of every coordinate: six standard deviations of its prior."""
 

@@ -17,8 +17,6 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor import is_free_form
 
-__all__ = ["SensorPrior", "require_same_unit", "require_sensor_prior", "sensor_from_posterior", "sensor_of"]
-
 
 def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArray) -> CalibratedSensor:
     """Build a prior from an earlier sensor's posterior mean and covariance.

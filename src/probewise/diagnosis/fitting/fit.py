@@ -18,16 +18,6 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES
 
-__all__ = [
-    "Fit",
-    "Model",
-    "fit",
-    "fits",
-    "residual_degrees_of_freedom",
-    "start_with_more_gaussians",
-    "starts_of_one_gaussian",
-]
-
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
 _AS_EXPECTED = 0.5  # of the gain to second order, from which a step without damping is taken without trying others

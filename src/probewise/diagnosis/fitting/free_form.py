@@ -21,8 +21,6 @@ from probewise.diagnosis.fitting.coordinates import (
 )
 from probewise.sensor import N_BENDS, N_FREE_FORM, bends_of, free_form
 
-__all__ = ["FreeForm", "free_form_to_natural"]
-
 _SHARE = 0.1  # prior sd of each weight, as a share of the mass
 
 

@@ -11,8 +11,6 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 from probewise.sensor import AnyEffect
 
-__all__ = ["Null", "Predictor", "log_multiplicity"]
-
 
 class Predictor(Protocol):
     """A model with its effects: a sensor's chain, or a user's own simulator.

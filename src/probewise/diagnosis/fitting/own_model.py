@@ -20,8 +20,6 @@ from probewise.priors import Prior, require_prior
 from probewise.recordings.plan import Plan
 from probewise.sensor import AnyEffect, Stage
 
-__all__ = ["OwnModel", "Parameters", "Simulate"]
-
 Parameters: TypeAlias = Mapping[str, FloatArray]
 """Parameters by name, each (n_samples, 1)."""
 

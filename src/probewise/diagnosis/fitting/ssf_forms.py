@@ -11,8 +11,6 @@ from probewise.diagnosis.fitting.free_form import FreeForm
 from probewise.diagnosis.fitting.null import Null
 from probewise.effects import Extent
 
-__all__ = ["SsfForms", "Start"]
-
 Start = tuple[Null, FloatArray]
 """A null and coordinates to fit it from, (n_starts, n_params)."""
 

@@ -17,8 +17,6 @@ from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
-__all__ = ["Excerpt", "commands", "distinct_scans", "excerpts", "reading_s", "rescheduled", "rows_that_need_no_hand"]
-
 _LEAST_ROWS = 8
 _MOST_SCANS = 6
 _NEAR = 26  # readings of an excerpt around an edge

@@ -16,8 +16,6 @@ from probewise.diagnosis.fitting.coordinates import CalibratedSensor, known_scen
 from probewise.diagnosis.fitting.fit import Model
 from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
-__all__ = ["fine_structure"]
-
 # In sds of the SSF, in its own metric.
 _REACH = 2.4
 _APART = 0.6

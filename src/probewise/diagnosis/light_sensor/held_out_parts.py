@@ -7,8 +7,6 @@ import numpy as np
 from probewise.diagnosis.evidence.held_out import LEAST_ROWS, MOST_PARTS, Parts
 from probewise.recordings.plan import Recording
 
-__all__ = ["held_out_parts"]
-
 
 def held_out_parts(recording: Recording) -> Parts:
     """Divide usable readings into scans or, if more than ten are long enough, into groups of scans.

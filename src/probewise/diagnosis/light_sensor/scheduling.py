@@ -12,16 +12,6 @@ from probewise.diagnosis.joining import covariates_joined, join_plans, last_know
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
-__all__ = [
-    "Scan",
-    "append_plans",
-    "as_alternatives",
-    "in_sequence",
-    "minutes_of",
-    "postponed",
-    "start_after",
-]
-
 BREAK_S = 30.0  # seconds to turn the sensor, or to exchange the sheet
 LAY_S = 60.0  # additional seconds to lay a new sheet
 

@@ -24,8 +24,6 @@ from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.effects import EFFECTS, NUISANCES, UNNAMED, VOCABULARY, Extent, NamedEffect
 from probewise.recordings.plan import Plan, Recording
 
-__all__ = ["LightSensor"]
-
 
 @dataclass(frozen=True)
 class LightSensor:

@@ -18,8 +18,6 @@ from probewise.diagnosis.light_sensor.scheduling import Scan, start_after
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 
-__all__ = ["target_swaps"]
-
 _FLAT_ROWS = 20  # readings over a uniform surface
 _FOOTPRINT = 1 / 14  # prior width of the footprint, as a share of a scan's length
 _ASIDE = 0.3  # displacement of an edge, as a share of a scan's length

@@ -16,8 +16,6 @@ from scipy.special import log_ndtr
 
 from probewise._arrays import FloatArray
 
-__all__ = ["Flat"]
-
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 
 

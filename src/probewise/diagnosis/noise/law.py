@@ -19,8 +19,6 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.flat import Flat
 from probewise.recordings.plan import Recording
 
-__all__ = ["NoiseLaw", "Tail", "forms", "noise_statistics", "steps_within_scans", "white_noise", "white_of"]
-
 _EM_STEPS = 12
 _LEAST = 1e-150  # least scale, for readings that are exactly as predicted
 

@@ -17,8 +17,6 @@ from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["NoiseModel", "NoiseNodes", "hides_the_noise", "least_sd", "log_lost_value", "rough_sd"]
-
 _FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
 _MANY = 12  # nodes of one effect above which they are thinned before combination with another's
 _APART = 0.3  # initial spacing of nodes in the log of half a step over the noise sd

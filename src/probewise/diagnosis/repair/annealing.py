@@ -17,8 +17,6 @@ from probewise.errors import NotConvergedError
 from probewise.nested.weights import n_effective, resampled
 from probewise.progress import Progress, silent
 
-__all__ = ["Density", "anneal", "importance_resample"]
-
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
 _LEAST_OF_IT = 0.5  # least acceptable share of the target
 _EFFECTIVE = 0.5  # least effective share of the samples after a step of beta

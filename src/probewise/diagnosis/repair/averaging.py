@@ -19,8 +19,6 @@ from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 from probewise.sensor import ACCURATE_NODES
 
-__all__ = ["over_hypotheses", "over_orders", "side_by_side"]
-
 
 def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
     """Mix samples of one hypothesis at several SSF orders by their probability.

@@ -14,8 +14,6 @@ from probewise.diagnosis.repair.improvement import Improvement, improvement_of
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
-__all__ = ["Best", "best_repair", "predicts_far_worse"]
-
 _RUIN = -1.0  # nats per held-out reading below which named effects are withdrawn
 
 

@@ -23,8 +23,6 @@ from probewise.diagnosis.repair.improvement import N_DRAWS, Improvement
 from probewise.diagnosis.residuals.locate import ALARM, global_p_value
 from probewise.diagnosis.search.searched import Searched
 
-__all__ = ["Correction", "correct", "corrected"]
-
 _ABOUT_EQUAL = 5.0  # nats
 _MOST_BASES = 6
 

@@ -19,8 +19,6 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.progress import Progress, silent
 
-__all__ = ["Drawn", "Ensemble", "draw_models"]
-
 _LEAST_OF_AN_ORDER = 0.2  # probability below which an SSF order is left out of the average
 _LEAST_OF_A_RIVAL = 0.02  # probability below which a hypothesis is left out of the average
 _MOST = 6  # hypotheses in one model

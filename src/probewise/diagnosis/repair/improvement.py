@@ -14,8 +14,6 @@ from probewise.diagnosis.residuals.locate import global_p_value
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
-__all__ = ["N_DRAWS", "Improvement", "improvement_of"]
-
 N_DRAWS = 499
 
 

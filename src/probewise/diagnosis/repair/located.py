@@ -13,8 +13,6 @@ from probewise.diagnosis.repair.best import Best
 from probewise.diagnosis.residuals.locate import Place, places, places_of_effect
 from probewise.diagnosis.search.searched import Searched
 
-__all__ = ["locate"]
-
 
 def locate(
     searched: Searched,

@@ -22,8 +22,6 @@ from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.nested.weights import n_effective, resampled
 from probewise.recordings.plan import Recording
 
-__all__ = ["Profiled"]
-
 _NODES = np.arange(-8.0, 8.5)  # of a slice, in sds of the Laplace approximation
 _STEPS = 3  # of the fit in each slice, in each of these rounds
 _ROUNDS = 2

@@ -13,8 +13,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["Quadratic"]
-
 _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at one step are neglected
 
 

@@ -19,8 +19,6 @@ from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import NamedEffect
 
-__all__ = ["Predicted", "Repair", "repair_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class Predicted:

@@ -30,8 +30,6 @@ from probewise.recordings import fingerprint
 from probewise.recordings.plan import Recording
 from probewise.sensor import ACCURATE_NODES
 
-__all__ = ["ModelSamples", "sample_model"]
-
 N_SAMPLES = 500
 N_WALKERS = 250
 _MOVES = 6  # moves of posterior samples after a step

@@ -13,8 +13,6 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.repair.quadratic import Quadratic
 
-__all__ = ["Surrogate"]
-
 
 @dataclass(frozen=True, eq=False)
 class Surrogate:

@@ -17,8 +17,6 @@ from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
 from probewise.diagnosis.residuals.covariate import Covariate
 
-__all__ = ["unknown_templates", "unlike_named"]
-
 _LIKE = 0.9  # cosine from which a basis duplicates a named effect
 _MOST_GROUPS = 24
 _FEW_SCANS = 6

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["Covariate"]
-
 
 @dataclass(frozen=True, eq=False)
 class Covariate:

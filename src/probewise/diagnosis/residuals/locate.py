@@ -21,8 +21,6 @@ from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
 
-__all__ = ["ALARM", "Place", "global_p_value", "places", "places_of_effect", "windows"]
-
 ALARM = 0.01
 """p-value below which the model is incomplete."""
 

@@ -17,8 +17,6 @@ from probewise.diagnosis.noise.law import NoiseLaw, Tail
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import windows
 
-__all__ = ["FAR_OUT", "score_clustering", "tail_probability"]
-
 FAR_OUT = ", far out"
 """Suffix of the names of families of unknown effects in which outlying readings cluster."""
 

@@ -9,8 +9,6 @@ from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 from probewise.effects import AGAIN
 
-__all__ = ["eliminate_backward"]
-
 
 def eliminate_backward(state: SearchState) -> None:
     """Refit the leading combinations without each of their effects in turn, and select forward from there.

@@ -20,8 +20,6 @@ from probewise.diagnosis.search.constants import MOST_FAULTS, NOISE_PAIR_WITHIN
 from probewise.effects import CorrelatedNoise, NoiseEffect, Quantisation, RandomWalk, lattice_step
 from probewise.recordings.plan import Recording
 
-__all__ = ["WITH_MEMORY", "Noises"]
-
 WITH_MEMORY = frozenset({CorrelatedNoise.name, RandomWalk.name})
 """Effects on the noise of which a noise distribution can contain only one."""
 

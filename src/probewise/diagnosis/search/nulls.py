@@ -10,8 +10,6 @@ from probewise.diagnosis.search.constants import STEERING
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
-__all__ = ["fit_nulls"]
-
 
 def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None:
     """Fit the null, or each form of the SSF: one Gaussian, the free form, more Gaussians.

@@ -13,8 +13,6 @@ from probewise.diagnosis.search.refits import is_significant
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
-__all__ = ["at_other_orders"]
-
 
 def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
     """Refit the most probable combinations at other plausible SSF orders.

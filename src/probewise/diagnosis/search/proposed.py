@@ -16,8 +16,6 @@ from probewise.diagnosis.search.searched import Searched
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
 
-__all__ = ["may_be_incomplete", "with_proposals"]
-
 _LEFT_FROM = 0.1  # probability that more is left than noise without a memory, from which formulas are proposed
 _MOST = 8  # formulas that are refitted
 _WITHIN = 12.0  # nats behind the best of what was refitted, within which screening must see a formula

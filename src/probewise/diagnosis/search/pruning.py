@@ -11,7 +11,6 @@ from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, out_of_vocabulary
 
-__all__ = ["prune"]
 Key = tuple[int, Names]
 
 

@@ -26,8 +26,6 @@ from probewise.diagnosis.search.twins import Swap, are_proportional
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
 
-__all__ = ["Refits", "is_significant"]
-
 Extended: TypeAlias = tuple[WeighedFit, dict[Names, float]]
 """A candidate with one more effect, and the closed-form scores of the effect by noise model."""
 

@@ -24,8 +24,6 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, in
 from probewise.effects import PROPOSAL, is_out_of_vocabulary
 from probewise.sensor import Stage
 
-__all__ = ["Evidences", "Posterior", "Screening", "Searched", "posterior_of"]
-
 _NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, as a smaller misfit beside it would
 
 

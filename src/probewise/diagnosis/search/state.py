@@ -25,8 +25,6 @@ from probewise.effects import NamedEffect
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
 
-__all__ = ["SearchState", "rivals_of"]
-
 
 @dataclass(eq=False)
 class SearchState:

@@ -29,8 +29,6 @@ from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.errors import DoubtfulResultWarning
 from probewise.progress import Progress, silent
 
-__all__ = ["weigh_thoroughly"]
-
 N_LIVE = 100
 
 _LEAST, _MOST = 2, 3  # hypotheses to recompute, apart from the null

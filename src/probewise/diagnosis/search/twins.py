@@ -11,8 +11,6 @@ from probewise.diagnosis.evidence.templates import EffectTemplates
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
-__all__ = ["Swap", "are_proportional"]
-
 _PROPORTIONAL = 1e-9  # one minus the cosine of two templates
 _SAME_READINGS = 1e-3  # noise sds, the largest difference of two predictions
 _SAME_SLOPES = 1e-3  # of the norm of a slope

@@ -21,8 +21,6 @@ from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
 
-__all__ = ["Unknown"]
-
 
 @dataclass(eq=False)
 class Unknown:

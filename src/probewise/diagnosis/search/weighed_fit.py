@@ -15,13 +15,6 @@ from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.search.constants import STEERING
 from probewise.effects import NUISANCES, is_out_of_vocabulary
 
-__all__ = [
-    "WeighedFit",
-    "expected_nats",
-    "in_vocabulary",
-    "out_of_vocabulary",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class WeighedFit:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-__all__ = ["Weighing", "with_agreement"]
-
 A_NAT = 1.0
 
 

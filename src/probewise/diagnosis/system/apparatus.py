@@ -34,8 +34,6 @@ from probewise.systems.forms import About, forms_of
 from probewise.systems.forms.proposals import proposals
 from probewise.systems.forms.stop import MeterStop
 
-__all__ = ["ON_NOISE", "SimulatorApparatus"]
-
 ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     SignalDependentNoise,
     CorrelatedNoise,

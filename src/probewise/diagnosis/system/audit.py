@@ -19,8 +19,6 @@ from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.forms import About, driving_columns, forms_of
 
-__all__ = ["audit_system"]
-
 _STANDS_STILL = 0.02  # noise sds by which predictions may change when the integration step is halved
 _NOISE = 0.01  # of the range of the readings, if no noise is declared
 _SETTINGS = 64  # of an effect's bank

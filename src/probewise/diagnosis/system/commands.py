@@ -15,8 +15,6 @@ from probewise.recordings.plan import Plan
 from probewise.systems import RunTable
 from probewise.systems.joining import append_tables, unused_name
 
-__all__ = ["RunCommand", "as_alternatives", "in_sequence", "run_commands"]
-
 _LEAST_ROWS = 4
 _MOST_RUNS = 4  # recorded runs to start from
 _MINUTES = {"ms": 1 / 60_000, "s": 1 / 60, "min": 1.0, "h": 60.0, "hour": 60.0, "day": 1440.0, "d": 1440.0}

@@ -27,8 +27,6 @@ from probewise.systems.forms import About
 from probewise.systems.forms.readings import since_start_of_run
 from probewise.systems.forms.stop import MeterStop, find_meter_stop
 
-__all__ = ["diagnose_system", "fit_system", "notes_on_calls", "prepare_system", "recording_of"]
-
 _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
 _N_HALVED = 4  # posterior samples of the repaired law for which the step is halved
 _MOST_COMPARED = 2400

@@ -34,8 +34,6 @@ from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 from probewise.systems import FittedSystem, RunTable, Simulator, table_for
 
-__all__ = ["Evidence", "SystemFit", "fit_json", "fit_simulator"]
-
 _N_LIVE = 200
 _MOST_NUMBERS = 60_000_000  # readings that nested sampling predicts; those of a law, which is integrated, count twice
 _LEAST_CALLS = 50_000  # of the likelihood, without which it would not end

@@ -18,8 +18,6 @@ from probewise.systems import FittedSystem, RunTable, System, write_run_table
 from probewise.systems.forms import About
 from probewise.systems.forms.rebinding import Recorded, recorded
 
-__all__ = ["bound_about", "calibrated_of", "fitted_system", "repaired_of"]
-
 
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
     """Return the repaired model of a diagnosis: the simulator with the effects that it leaves out.

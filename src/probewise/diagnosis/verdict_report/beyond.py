@@ -15,8 +15,6 @@ from probewise.diagnosis.verdict_report.findings import ParameterFound, paramete
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import is_out_of_vocabulary
 
-__all__ = ["Formula", "Remainder", "formula_of", "remainder_of"]
-
 _N_DRAWS = 199
 
 

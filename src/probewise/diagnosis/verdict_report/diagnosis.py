@@ -22,8 +22,6 @@ from probewise.diagnosis.verdict_report.findings import EffectFound, NoiseFound
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.recordings.plan import Recording
 
-__all__ = ["Diagnosis", "VerdictReport"]
-
 _MOVED = {
     "unknown_probability": "judged.unknown_probability",
     "clean_probability": "judged.clean_probability",

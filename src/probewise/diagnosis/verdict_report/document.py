@@ -13,8 +13,6 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, require_diag
 from probewise.diagnosis.verdict_report.findings import ParameterFound
 from probewise.effects import public_name
 
-__all__ = ["NEXT_PLAN", "diagnosis_json", "diagnosis_schema"]
-
 NEXT_PLAN = "next_plan.csv"
 
 

@@ -22,8 +22,6 @@ from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.recordings.plan import Plan
 
-__all__ = ["EffectFound", "NoiseFound", "ParameterFound", "effects_found", "noise_found", "parameters_of"]
-
 _LEAST_PROBABILITY = 1e-3
 _IS_UNKNOWN = 0.5  # probability of an unknown effect from which effects beside it are listed
 _STANDS_BESIDE = 0.5  # conditional probability from which an effect counts as beside the unknown one

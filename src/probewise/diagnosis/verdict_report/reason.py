@@ -12,8 +12,6 @@ from probewise.diagnosis.residuals.outlying import FAR_OUT
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import spoken_name
 
-__all__ = ["TO_SEPARATE", "Grounds", "reason_of"]
-
 TO_SEPARATE = "; to tell them apart: "
 """Introduces the next readings in the reason of `cannot_tell`."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-__all__ = ["p_in_words", "unit_in_words"]
-
 _LEAST_P = 1e-300  # smallest p-value that floating point represents reliably
 
 

@@ -16,8 +16,6 @@ from probewise.systems.motion import RowsInRuns, integrate_states
 from probewise.systems.system import System, given_columns
 from probewise.systems.table import RunTable
 
-__all__ = ["About"]
-
 _ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
 _ROWS_OF_A_RUN = 3  # least rows per run on average
 _UNSEEN = 1e-7  # of the noise sd: a smaller change of the readings counts as none

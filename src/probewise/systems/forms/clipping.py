@@ -9,8 +9,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.priors import Uniform
 
-__all__ = ["ClippingLevels", "clipping_levels"]
-
 _LOWER_PART = 0.4  # of a range: a ceiling may cut off more of it than a floor
 _LEAST = 0.003  # of a range, that is cut off at least by what is looked for
 _N_LEVELS = 10  # of either

@@ -11,8 +11,6 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Act, Form, Say, with_unit
 
-__all__ = ["forms_of_extras"]
-
 _N_VALUES = 9
 _UNSEEN = 1e-7  # of the noise
 

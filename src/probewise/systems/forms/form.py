@@ -17,8 +17,6 @@ from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable
 
-__all__ = ["Act", "ChangePoints", "Form", "Say", "with_unit"]
-
 Act = Callable[[Any, FloatArray, RunTable], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the table; returns the value with the effect."""
 

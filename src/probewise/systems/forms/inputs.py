@@ -17,8 +17,6 @@ from probewise.systems.forms.modulations import wave_joined, wave_numbers
 from probewise.systems.forms.readings import earlier
 from probewise.systems.table import RunTable
 
-__all__ = ["driving_columns", "forms_on_inputs"]
-
 _N_SIZES = 9
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
 _MOST_WAVES_OF_A_LAW = 96

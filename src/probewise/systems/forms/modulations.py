@@ -14,17 +14,6 @@ from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import ChangePoints, with_unit
 from probewise.systems.table import RunTable
 
-__all__ = [
-    "Modulation",
-    "column",
-    "drift",
-    "per_run",
-    "step",
-    "wave",
-    "wave_joined",
-    "wave_numbers",
-]
-
 _MOST_MOMENTS = 512
 _MOST_WAVES = 1024
 _PHASE = Uniform(-2 * np.pi, 2 * np.pi)  # two turns, so that one of a phase's equivalent values is far from both ends

@@ -13,8 +13,6 @@ from probewise.systems.forms.form import Act, Form
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.forms.readings import modulated
 
-__all__ = ["forms_on_parameters"]
-
 
 def forms_on_parameters(about: About) -> Iterator[Form]:
     """Yield the ways in which each parameter may vary: drift, step, per run, with a column."""

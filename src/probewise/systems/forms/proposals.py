@@ -22,8 +22,6 @@ from probewise.systems.forms.proposals_in_time import proposals_in_time
 from probewise.systems.motion import Motion
 from probewise.systems.table import RunTable
 
-__all__ = ["proposals"]
-
 _MOST_SWITCHES = 128  # thresholds of a switch in a column
 _THRESHOLDS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)  # quantiles of a state beyond which a term may act
 _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter one is kept

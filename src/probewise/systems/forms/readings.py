@@ -15,8 +15,6 @@ from probewise.systems.forms.form import Act, Form, with_unit
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.table import RunTable
 
-__all__ = ["forms_on_readings", "modulated"]
-
 _N_SIZES = 9
 
 

@@ -19,8 +19,6 @@ from probewise.systems.simulator import Simulator
 from probewise.systems.system import System
 from probewise.systems.table import RunTable
 
-__all__ = ["Recorded", "has_value_per_run", "rebind_forms", "recorded"]
-
 _WITH_VALUE_PER_RUN = ("offset_per_run", "gain_per_run", "differs", "noise_per_run")
 
 

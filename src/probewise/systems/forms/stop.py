@@ -15,8 +15,6 @@ from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
 from probewise.sensor.stages import NoiseLevel
 
-__all__ = ["MeterStop", "find_meter_stop"]
-
 _LEAST_IN_TURN = 5  # successive readings of exactly one value
 _LEAST_IN_ALL = 8
 # Of the median change from one reading to the next: on a coarser lattice readings are equal without a stop.

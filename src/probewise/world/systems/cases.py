@@ -31,8 +31,6 @@ from probewise.world.systems.strata import system_stratum_of
 from probewise.world.systems.visible_covariates import covariates_of
 from probewise.world.systems.vocabulary import FAMILIES, forms_of
 
-__all__ = ["KINDS", "Drawn", "SystemCase", "SystemEffect", "draw_system", "draw_system_case"]
-
 KINDS: tuple[SystemKind, ...] = (*FORMULAS, *LAWS)
 """Every kind of system."""
 

@@ -13,8 +13,6 @@ from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.motion import solve_law
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["Trace", "simulate", "with_reading_effects"]
-
 
 @dataclass(frozen=True, eq=False)
 class Trace:

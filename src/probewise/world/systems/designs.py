@@ -8,8 +8,6 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.kind import Columns, SystemKind
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["design_runs", "held_levels", "irregular_times", "random_waves", "there_and_back"]
-
 _PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
 

@@ -14,8 +14,6 @@ from probewise.recordings import write_text_atomically
 from probewise.recordings.table import csv_text
 from probewise.world.systems.cases import SystemCase, SystemEffect
 
-__all__ = ["owners_file", "table_text", "truth_of", "write_system_case"]
-
 
 def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tuple[Path, Path, Path, Path]:
     """Write simulator.py, table.csv, table_test.csv and truth.json into a directory, and return their paths."""

@@ -16,8 +16,6 @@ from probewise.world.systems.forms.form import Form, Numbers, Placed
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["AddedForm", "Fitted", "Model", "free_numbers", "numbers_of", "project_out"]
-
 _STEP = 1e-4  # step of a coordinate for derivatives
 _FORM_STEP = 0.1  # of the form's own step
 _FAR = 1e9  # residual in sds where a law diverges

@@ -8,8 +8,6 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.designs import held_levels, irregular_times, there_and_back
 from probewise.world.systems.kind import Columns, Logged, Prior, SystemKind
 
-__all__ = ["FORMULAS"]
-
 Rng = np.random.Generator
 
 

@@ -12,8 +12,6 @@ from scipy.special import ndtri
 
 from probewise._arrays import FloatArray
 
-__all__ = ["Columns", "Formula", "Law", "Logged", "Prior", "SystemKind", "Values"]
-
 Values: TypeAlias = Mapping[str, Any]
 """Parameters, states or columns by name: arrays that broadcast."""
 

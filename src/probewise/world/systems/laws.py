@@ -8,8 +8,6 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.designs import held_levels, irregular_times, random_waves
 from probewise.world.systems.kind import Columns, Law, Logged, Prior, SystemKind
 
-__all__ = ["LAWS"]
-
 Rng = np.random.Generator
 
 

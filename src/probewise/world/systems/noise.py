@@ -13,8 +13,6 @@ from scipy.optimize import brentq
 from probewise._arrays import FloatArray
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["OTHER_NOISE", "SystemNoise", "noise_of"]
-
 OTHER_NOISE = (
     "correlated_noise",
     "outliers",

@@ -12,8 +12,6 @@ from probewise.world.systems.chain import simulate
 from probewise.world.systems.fit import AddedForm, Model, free_numbers
 from probewise.world.systems.forms.form import Numbers
 
-__all__ = ["right_predictions"]
-
 _MOMENTS = 8  # distinct values of a dead time over samples, since the integration stops at each of them in every gap
 
 

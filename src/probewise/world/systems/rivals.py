@@ -132,7 +132,9 @@ def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model:
     with np.errstate(all="ignore"):
         for form in (f for f in forms if f.side == "reading"):
             unread = np.repeat(bare, len(settings[form]), axis=0)
-            out[form] = with_reading_effects(unread, true.rows, [*outer, (form, as_numbers(settings[form]))]) - fitted.readings
+            out[form] = (
+                with_reading_effects(unread, true.rows, [*outer, (form, as_numbers(settings[form]))]) - fitted.readings
+            )
         alone, together = _apart(true, [f for f in forms if f.side != "reading"])
         for form in alone:
             found = _simulated(true, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))

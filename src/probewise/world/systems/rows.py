@@ -10,8 +10,6 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 
-__all__ = ["SystemRows"]
-
 
 @dataclass(frozen=True, eq=False)
 class SystemRows:

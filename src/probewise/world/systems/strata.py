@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from probewise.world.challenge.strata import Stratum
 
-__all__ = ["SYSTEMS_WHEEL", "system_stratum_of"]
-
 SYSTEMS_WHEEL: tuple[Stratum, ...] = (
     *[Stratum("clean")] * 6,
     *[Stratum("clean", other_noise=True)] * 4,

@@ -8,8 +8,6 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.world.systems.forms.form import Form
 from probewise.world.systems.forms.true_system import TrueSystem
 
-__all__ = ["covariates_of"]
-
 _BINS = 20
 _AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts as equal
 _PLAIN = 0.25  # least explained share of the sum of squares

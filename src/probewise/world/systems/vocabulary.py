@@ -8,8 +8,6 @@ from probewise.world.systems.forms.inside import forms_of_parameters, forms_of_r
 from probewise.world.systems.forms.readings import forms_of_readings
 from probewise.world.systems.forms.true_system import TrueSystem
 
-__all__ = ["FAMILIES", "forms_of"]
-
 FAMILIES = (
     "offset_drift",
     "offset_step",

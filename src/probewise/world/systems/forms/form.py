@@ -11,8 +11,6 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["Bank", "Form", "Instants", "Numbers", "Placed", "Side", "as_numbers"]
-
 Side: TypeAlias = Literal["input", "parameter", "rate", "reading"]
 
 Numbers: TypeAlias = Mapping[str, Any]

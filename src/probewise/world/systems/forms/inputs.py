@@ -14,8 +14,6 @@ from probewise.world.systems.forms.readings import delayed
 from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["forms_of_inputs", "play"]
-
 Change = Callable[[FloatArray, SystemRows, Numbers], Any]
 
 

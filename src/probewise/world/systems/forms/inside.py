@@ -12,8 +12,6 @@ from probewise.world.systems.forms.form import Form
 from probewise.world.systems.forms.modulations import Modulation, one_by_one
 from probewise.world.systems.forms.true_system import TrueSystem
 
-__all__ = ["forms_of_parameters", "forms_of_rates", "term_in_rate", "varying_parameter"]
-
 _N_WAVES = 20
 
 

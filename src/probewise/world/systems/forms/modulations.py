@@ -12,19 +12,6 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Bank, Instants, Numbers
 from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 
-__all__ = [
-    "Modulation",
-    "along_time",
-    "by_run",
-    "one_by_one",
-    "settling",
-    "step",
-    "wave_bank",
-    "wave_joined",
-    "waves",
-    "with_column",
-]
-
 
 @dataclass(frozen=True, eq=False)
 class Modulation:

@@ -14,8 +14,6 @@ from probewise.world.systems.forms.readings import OFFSET
 from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["OUT_OF_VOCABULARY", "forms_out_of_vocabulary"]
-
 OUT_OF_VOCABULARY = (
     "product",
     "square_wave",

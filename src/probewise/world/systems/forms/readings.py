@@ -14,8 +14,6 @@ from probewise.world.systems.forms.modulations import Modulation
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["GAIN", "OFFSET", "added_to_readings", "delayed", "direction_of_change", "forms_of_readings"]
-
 GAIN, OFFSET, _BEND, _LAG, _CEILING = range(5)
 _N_WAVES = 240
 

@@ -13,8 +13,6 @@ from probewise.errors import NotConvergedError
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
-__all__ = ["TrueSystem", "log_uniform"]
-
 
 @dataclass(frozen=True, eq=False)
 class TrueSystem:

@@ -14,6 +14,7 @@ from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.calibration.seeded import SeededReference
+from probewise.calibration.whole_coordinates import FAINT, count_bright
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective
@@ -28,76 +29,89 @@ class _Silent:
         return np.zeros(len(theta))
 
 
-def _sorted_draws(prior: SSFPrior, n: int, rng: np.random.Generator) -> FloatArray:
-    """Draw from the prior and sort the Gaussians by mass."""
+def _sorted_draws(prior: SSFPrior, n: int, n_bright: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
+    """Draw from the prior, sort the Gaussians by mass, keep those of which so many are bright; and their share."""
     space = prior.coordinates
-    return space.leave(space.enter(prior.from_unit_cube(rng.random((n, len(prior.names))))))[0]
+    theta = space.leave(space.enter(prior.from_unit_cube(rng.random((40 * n, len(prior.names))))))[0]
+    kept = theta[count_bright(theta) == n_bright]
+    return kept[rng.integers(len(kept), size=n)], len(kept) / len(theta)
+
+
+PARTS = [(2, 1), (3, 1), (3, 2)]
 
 
 @pytest.fixture
-def references(recording: Recording, make_compensation: Callable[..., Compensation]) -> dict[int, Reference]:
+def references(
+    recording: Recording, make_compensation: Callable[..., Compensation]
+) -> dict[tuple[int, int], Reference]:
     silent, rng = cast("SensorProblem", _Silent()), np.random.default_rng(30)
-    return {n: Reference(default_prior(recording, n), silent, make_compensation(n, rng)) for n in (2, 3)}
+    return {(n, m): Reference(default_prior(recording, n), silent, make_compensation(n, rng), m) for n, m in PARTS}
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize(("n", "m"), PARTS)
 def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
-    references: dict[int, Reference], recording: Recording, n: int
+    references: dict[tuple[int, int], Reference], recording: Recording, n: int, m: int
 ) -> None:
-    """Mean weight one, and moments of the prior's own draws; four standard errors, so one false alarm in 16 000."""
+    """Mean weight the prior's share, and moments of its own draws; four standard errors: one false alarm in 16 000."""
     rng = np.random.default_rng(31)
-    reference = references[n]
-    drawn = reference.draw(_sorted_draws(default_prior(recording, n - 1), 10_000, rng), rng=rng)
+    reference = references[n, m]
+    rest, below = _sorted_draws(default_prior(recording, n - 1), 20_000, m, rng)
+    drawn = reference.draw(rest, rng=rng)
     weight = np.zeros(len(drawn))
     alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
-    alive = alive[np.isfinite(reference.prior.log_prob(drawn[alive]))]
-    weight[alive] = np.exp(-reference.log_likelihood(drawn[alive]))
+    alive = alive[np.isfinite(reference.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == m)]
+    coordinates = reference.prior.coordinates
+    drawn[alive] = coordinates.leave(coordinates.enter(drawn[alive]))[0]
+    weight[alive] = below * np.exp(-reference.log_likelihood(drawn[alive]))
     assert 0.2 < len(alive) / len(drawn) < 1.0
-    assert abs(weight.mean() - 1.0) < 4 * weight.std() / np.sqrt(len(weight))
-    plain = _sorted_draws(reference.prior, 10_000, rng)
+    plain, share = _sorted_draws(reference.prior, 20_000, m, rng)
+    assert abs(weight.mean() - share) < 4 * np.hypot(weight.std(), np.sqrt(share / 40)) / np.sqrt(len(weight))
 
     def asked(theta: FloatArray) -> FloatArray:
         """The first is narrower along x' than the last, the last sits left of it."""
         return ((theta[:, 3] > theta[:, -5]) & (theta[:, -7] < theta[:, 1])).astype(float)
 
     found = np.zeros(len(drawn))
-    found[alive] = weight[alive] * asked(drawn[alive])
+    found[alive] = weight[alive] * asked(drawn[alive]) / share
     error = np.hypot(found.std(), asked(plain).std()) / np.sqrt(len(drawn))
     assert abs(found.mean() - asked(plain).mean()) < 4 * error
 
 
 def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
-    references: dict[int, Reference], recording: Recording
+    references: dict[tuple[int, int], Reference], recording: Recording
 ) -> None:
-    """Where the recording says nothing and both evidences are one: mean weight one within four errors."""
-    rng, space = np.random.default_rng(36), PeakCoordinates(references[2].prior)
+    """Where the recording says nothing: mean weight the share of the prior with one bright Gaussian, four errors."""
+    rng, space = np.random.default_rng(36), PeakCoordinates(references[2, 1].prior)
     y = space.enter(space.prior.from_unit_cube(rng.random((2000, 14))))
     peaks = tuple(
         PeakDensity(space, StudentTDensity(y.mean(axis=0), width * np.linalg.cholesky(np.cov(y, rowvar=False))))
         for width in (0.4, 0.9)
     )
-    seeded = SeededReference(references[2], peaks, 0.0)
-    drawn = seeded.draw(_sorted_draws(default_prior(recording, 1), 10_000, rng), rng=rng)
+    seeded = SeededReference(references[2, 1], peaks, 0.0)
+    drawn = seeded.draw(_sorted_draws(default_prior(recording, 1), 10_000, 1, rng)[0], rng=rng)
     weight = np.zeros(len(drawn))
     alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
-    alive = alive[np.isfinite(seeded.prior.log_prob(drawn[alive]))]
+    alive = alive[np.isfinite(seeded.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == 1)]
     coordinates = seeded.prior.coordinates
     weight[alive] = np.exp(-seeded.log_likelihood(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
-    assert abs(weight.mean() - 1.0) < 4 * weight.std() / np.sqrt(len(weight)) < 0.4
+    # The lighter of two uniform numbers is below a tenth of the other.
+    assert abs(weight.mean() - FAINT) < 4 * weight.std() / np.sqrt(len(weight)) < 0.04
     there, log_drawn = seeded.redrawn(drawn[alive], rng=rng)
     assert there.shape == (len(alive), 14)
     assert np.isfinite(log_drawn).mean() > 0.1
     assert seeded.redrawn(drawn[:0], rng=rng)[0].shape == (0, 14)
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize(("n", "m"), PARTS)
 def test_undoing_a_compensated_gaussian_gives_the_others_back(
-    references: dict[int, Reference], recording: Recording, n: int
+    references: dict[tuple[int, int], Reference], recording: Recording, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(33)
-    reference = references[n]
-    rest = _sorted_draws(default_prior(recording, n - 1), 200, rng)
+    reference = references[n, m]
+    rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
     drawn = reference.with_compensated(rest, rng=rng)
+    possible = np.isfinite(drawn).all(axis=1)
+    drawn, rest = drawn[possible], rest[possible]
     back, log_density = reference.uncompensated(drawn)
     alive = np.isfinite(log_density)
     assert alive.sum() > 20
@@ -147,45 +161,48 @@ def test_the_pool_grows_until_enough_of_its_shapes_are_effective(
     assert len(make_compensation(2, np.random.default_rng(33), n_pool=5000).pool) == 5000
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize(("n", "m"), PARTS)
 def test_a_split_keeps_light_centre_and_covariance(
-    references: dict[int, Reference], recording: Recording, n: int
+    references: dict[tuple[int, int], Reference], recording: Recording, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(32)
-    rest = _sorted_draws(default_prior(recording, n - 1), 200, rng)
-    split = references[n].split(rest, rng=rng)
-    alive = np.isfinite(split).all(axis=1)
-    assert alive.sum() > 50
-    np.testing.assert_allclose(references[n].merged(split[alive]), rest[alive], rtol=1e-6)
-    space = references[n].prior.coordinates
-    np.testing.assert_allclose(space.leave(space.enter(split[alive]))[0], split[alive], rtol=1e-9)  # sorted already
+    rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
+    for label in range(m):
+        split = references[n, m].split(rest, label, rng=rng)
+        alive = np.isfinite(split).all(axis=1)
+        assert alive.sum() > 50
+        merged, log_density = references[n, m].merged(split[alive], label)
+        np.testing.assert_allclose(merged, rest[alive], rtol=1e-6)
+        assert np.isfinite(log_density).mean() > 0.5
 
 
-def test_only_a_uniform_prior_of_light_has_a_reference(references: dict[int, Reference], recording: Recording) -> None:
+def test_only_a_uniform_prior_of_light_has_a_reference(
+    references: dict[tuple[int, int], Reference], recording: Recording
+) -> None:
     usual = default_prior(recording, 2)
     paper = SSFPrior(2, usual.offset_mm, LogUniform(0.001, 1.0), usual.i_min, Uniform(50.0, 60.0))
     assert has_reference(usual)
     assert not has_reference(paper)
     with pytest.raises(ParameterError, match="prior"):
-        Reference(paper, cast("SensorProblem", _Silent()), references[2].compensation)
+        Reference(paper, cast("SensorProblem", _Silent()), references[2, 1].compensation, 1)
 
 
-@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize(("n", "m"), PARTS)
 def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
-    make_compensation: Callable[..., Compensation], recording: Recording, n: int
+    make_compensation: Callable[..., Compensation], recording: Recording, n: int, m: int
 ) -> None:
     """Where the recording says nothing: means and mean squares in the prior's cube, within five errors of uniform ones.
 
     The last Gaussian is drawn from a pool, which differs from the prior by the scatter of 4,000 shapes.
     """
     rng, prior = np.random.default_rng(35), default_prior(recording, n)
-    reference = Reference(prior, cast("SensorProblem", _Silent()), make_compensation(n, rng, spread=2e-3))
-    here = _sorted_draws(prior, 3000, rng)
+    reference = Reference(prior, cast("SensorProblem", _Silent()), make_compensation(n, rng, spread=2e-3), m)
+    here, _ = _sorted_draws(prior, 3000, m, rng)
     start = here
     for _ in range(12):
         there, log_drawn = reference.redrawn(here, rng=rng)
         moved = np.isfinite(there).all(axis=1)
-        moved[moved] = np.isfinite(prior.log_prob(there[moved]))
+        moved[moved] = np.isfinite(prior.log_prob(there[moved])) & (count_bright(there[moved]) == m)
         moved &= np.log(rng.random(len(here))) < log_drawn
         here = np.where(moved[:, None], there, here)
         here = prior.coordinates.leave(prior.coordinates.enter(here))[0]

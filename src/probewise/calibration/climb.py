@@ -22,6 +22,7 @@ from probewise._display import ShowsItself
 from probewise.calibration.priors import SSFPrior
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective, resampled
+from probewise.priors import Coordinates
 
 __all__ = ["N_SNAPSHOTS", "Climb", "KnownDensity", "Rung", "climb"]
 
@@ -34,9 +35,9 @@ _BRIDGE_STEPS = 30
 _DRAWS, _MOST_DRAWS = 2, 16
 # Times that the posterior's samples are kept; moves of each particle once it is reached, and between two afresh.
 N_SNAPSHOTS = 4
-_N_MORE, _AFRESH = 24, 2
+_N_MORE, _AFRESH = 16, 2
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
-_MOST_TEMPERATURES = 6
+_MOST_TEMPERATURES = 12
 # Share of the moves that change the coordinates of one Gaussian, or the levels, alone.
 _BY_BLOCK = 0.5
 _WHOLE_JUMP = 0.1
@@ -206,8 +207,11 @@ def climb(
     error_below: float,
     n_calls_below: int = 0,
     rng: np.random.Generator,
+    space: Coordinates | None = None,
     n_steps: int = _N_STEPS,
     n_more: int = _N_MORE,
+    least_effective: float = _KEPT,
+    at_once_from: int | None = None,
     told: Callable[[Rung], None] | None = None,
 ) -> Climb:
     """Climb to the posterior of N Gaussians.
@@ -232,10 +236,14 @@ def climb(
         Moves of each particle at each temperature.
     n_more
         Moves of each particle once the posterior is reached; samples are kept from the last half of them.
+    least_effective
+        Least share of the particles that a change of temperature leaves effective.
+    at_once_from
+        Temperature from which the posterior is taken for the next, for evidences that a bridge tells.
     told
         Called after every temperature.
     """
-    space = reference.prior.coordinates
+    space = reference.prior.coordinates if space is None else space
     n_calls = n_calls_below
 
     def known(x: FloatArray, beta: float = 0.0) -> _Cloud:
@@ -261,12 +269,12 @@ def climb(
             return known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
 
     now = drawn()
-    while n_effective(now.rise) < _KEPT * len(rest) and len(now.x) < _MOST_DRAWS * len(rest):
+    while n_effective(now.rise) < least_effective * len(rest) and len(now.x) < _MOST_DRAWS * len(rest):
         now = now.joined(drawn(), n_clouds)
     temperatures, accepted, overlap = [0.0], 0.0, 1.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
         rise = now.rise
-        beta = _next(rise, temperatures[-1], _KEPT * len(rest))
+        beta = 1.0 if len(temperatures) == at_once_from else _next(rise, temperatures[-1], least_effective, len(rest))
         width = beta - temperatures[-1]
         log_weight = (width * rise).reshape(n_clouds, -1)
         if not np.isfinite(log_weight.max(axis=1)).all():
@@ -282,7 +290,7 @@ def climb(
         for _ in range(n_steps):
             now, share = _moved_along_differences(now, partial(known, beta=beta), beta, rng)
             shares.append(share)
-        now = _moved_afresh(now, partial(known, beta=beta), reference, beta, rng)
+        now = _moved_afresh(now, partial(known, beta=beta), reference, space, beta, rng)
         accepted = float(np.mean(shares))
         if beta == 1.0:
             now = known(now.x)
@@ -299,7 +307,7 @@ def climb(
         for k in range(1, n_more + 1):
             now, _ = _moved_along_differences(now, partial(known, beta=1.0), 1.0, rng)
             if k % _AFRESH == 0:
-                now = _moved_afresh(now, partial(known, beta=1.0), reference, 1.0, rng)
+                now = _moved_afresh(now, partial(known, beta=1.0), reference, space, 1.0, rng)
             if k in keep:
                 kept.append(now)
     kept = kept or [now]
@@ -339,10 +347,10 @@ def _log_evidence_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArr
     return np.asarray(log_ratio), float(min(shares))
 
 
-def _next(rise: FloatArray, beta: float, least: float) -> float:
-    """Find the next temperature: that whose weights leave so many of the particles effective."""
+def _next(rise: FloatArray, beta: float, share: float, n_particles: int) -> float:
+    """Find the next temperature: that whose weights leave such a share of the particles effective."""
     # What is impossible is lost at any temperature.
-    least = min(least, _KEPT * float(np.isfinite(rise).sum()))
+    least = share * float(min(n_particles, np.isfinite(rise).sum()))
     if n_effective((1.0 - beta) * rise) >= least:
         return 1.0
     low, high = beta, 1.0
@@ -387,11 +395,11 @@ def _moved_afresh(
     now: _Cloud,
     known: Callable[[FloatArray], _Cloud],
     reference: KnownDensity,
+    space: Coordinates,
     beta: float,
     rng: np.random.Generator,
 ) -> _Cloud:
     """Propose to each particle a fresh one from the reference's density: only the rest of the target counts."""
-    space = reference.prior.coordinates
     there, log_drawn = reference.redrawn(space.leave(now.x)[0], rng=rng)
     with np.errstate(invalid="ignore"):
         new = known(space.enter(there))

@@ -18,6 +18,7 @@ from scipy.special import log_ndtr, logsumexp, ndtri_exp
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
 from probewise.calibration.lone import LoneResponses, light_of
+from probewise.calibration.whole_coordinates import WholeCoordinates
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled
 
@@ -118,7 +119,11 @@ class _Linear:
 
     @classmethod
     def of(
-        cls, below: SensorProblem, coordinates: MomentCoordinates, alone: SensorProblem, theta: FloatArray
+        cls,
+        below: SensorProblem,
+        coordinates: MomentCoordinates | WholeCoordinates,
+        alone: SensorProblem,
+        theta: FloatArray,
     ) -> _Linear:
         """Learn from posterior samples of N - 1 Gaussians, (n, 6 N - 4)."""
         recording = below.recording
@@ -131,9 +136,9 @@ class _Linear:
         per_sd = 1.0 / np.maximum(np.sqrt(variance), sd_floor(recording))[scan]
         x = coordinates.enter(theta)
         off = x - x.mean(axis=0)
-        # The masses stay, so that the share of light does; the first one's alone changes no reading.
-        shifts = np.ones(x.shape[1], dtype=np.bool_)
-        shifts[:-2:6] = False
+        # Only the whole and the levels shift: how Gaussians share the light, the readings tell too little to say.
+        shifts = np.zeros(x.shape[1], dtype=np.bool_)
+        shifts[1:6] = shifts[-2:] = True
         off[:, ~shifts] = 0.0
         covariance = off.T @ off / len(off)
         inverse = np.zeros_like(covariance)
@@ -187,7 +192,7 @@ class Compensation:
         Log of their mean over the pool, tempered.
     """
 
-    coordinates: MomentCoordinates
+    coordinates: MomentCoordinates | WholeCoordinates
     linear: _Linear
     pool: FloatArray
     answers: Answer
@@ -198,7 +203,7 @@ class Compensation:
     def of(
         cls,
         below: SensorProblem,
-        coordinates: MomentCoordinates,
+        coordinates: MomentCoordinates | WholeCoordinates,
         alone: SensorProblem,
         theta: FloatArray,
         *,

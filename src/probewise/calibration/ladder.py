@@ -16,16 +16,19 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.around_peak import around_peak, missed_about
-from probewise.calibration.climb import N_SNAPSHOTS, Climb, Rung, climb
+from probewise.calibration.around_peak import PeakDensity, around_peak, missed_about
+from probewise.calibration.climb import N_SNAPSHOTS, Climb, KnownDensity, Rung, climb
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_search import Found, Progress, Search
+from probewise.calibration.parts import Part, WholeFrame, held_shares, joined, split_by_bright
 from probewise.calibration.peaks import Peak, find_peaks
 from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.calibration.removal import Removal, bridged
 from probewise.calibration.seeded import SeededReference
+from probewise.calibration.sharing import SharingDensity
 from probewise.calibration.vouching import missed
+from probewise.calibration.whole_coordinates import count_bright
 
 __all__ = ["climb_orders", "next_order"]
 
@@ -50,6 +53,15 @@ _DISAGREE, _APART = 4.0, 1.0
 # A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
 _HIGHER, _MISSED = 2.0, 0.2
 _N_PILOTS, _N_WEIGHED = 400, 2000
+_AT_ONCE_FROM = 3
+# A part of the posterior below is followed where it holds this share of it; by many particles where it holds much.
+_LEAST_HELD, _MUCH_HELD, _FEW_PARTICLES = 0.005, 0.3, 400
+_POOL, _SMALL_POOL = 24_000, 6_000
+# All Gaussians may be bright where those of the order below are so with this share.
+_BRIGHT_HELD = 0.03
+# Moves at each temperature on the way to there, and the share of the particles that it leaves effective: what two
+# bright Gaussians hold counts in every order above.
+_TWO_BRIGHT, _MORE_BRIGHT = (15, 0.6), (6, 0.4)
 
 
 def climb_orders(
@@ -74,12 +86,14 @@ def climb_orders(
     if unlike:
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
-    found: dict[int, Found] = {}
     peaks = find_peaks(posing.problem, highest, rng=climbing)
+    whole = WholeFrame.of(peaks[1].theta)
+    found: dict[int, Found] = {}
+    parts: dict[int, Part] = {}
     for n in range(1, highest + 1):
         needed = n == 1 or peaks[n].log_likelihood - peaks[n - 1].log_likelihood > _NEEDED
-        found[n] = next_order(
-            posing, n, found.get(n - 1), peaks[n], climbing, needed=needed, search=search, progress=progress
+        found[n], parts = next_order(
+            posing, n, parts, peaks[n], climbing, whole=whole, needed=needed, search=search, progress=progress
         )
     return _vouched_for(posing, {n: found[n] for n in orders}, climbing, search=search, progress=progress), ()
 
@@ -124,14 +138,15 @@ def _why_not_climbable(posing: Posing, highest: int) -> str:
 def next_order(
     posing: Posing,
     n: int,
-    below: Found | None,
+    below: dict[int, Part],
     peak: Peak,
     rng: np.random.Generator,
     *,
+    whole: WholeFrame,
     needed: bool,
     search: Search,
     progress: Progress | None,
-) -> Found:
+) -> tuple[Found, dict[int, Part]]:
     """Climb to an order; search it in full where the climb is doubtful.
 
     Parameters
@@ -141,38 +156,46 @@ def next_order(
     n
         Number of Gaussians.
     below
-        What was found for n - 1; None for the first order.
+        Parts of the posterior of n - 1, by their number of bright Gaussians; empty for the first order.
     peak
         Highest peak of the likelihood.
     rng
         Source of randomness.
+    whole
+        Where the sensor is, and how large.
     needed
         Whether the readings need the last Gaussian, so that the posterior lies about the peak.
     search
         Searches it in full.
     progress
         Told of each temperature.
+
+    Returns
+    -------
+    What was found, and the parts of its posterior.
     """
     told: Callable[[Rung], None] | None = None if progress is None else partial(progress, n)
     about = partial(_about_peak, posing, n, peak, rng, told)
-    from_below = None if below is None else partial(_from_below, posing, n, below, peak, rng, told)
+    from_below = partial(_from_below, posing, n, below, peak, whole, rng, told) if below else None
     ways = [about, from_below] if needed else [from_below, about]
     notes: list[str] = []
     for way in ways:
         if way is None:
             continue
-        made = _searched_for_missed_peaks(posing, n, way(), peak, rng)
+        made, parts = way()
+        made = _searched_for_missed_peaks(posing, n, made, peak, rng)
         if not made.warnings:
-            return Found(made, None)
+            return Found(made, None), parts or split_by_bright(made, rng)
         notes.extend(made.warnings)
     full = search(n, rng)
     note = f"order {n} was searched in full, since the climb to it is doubtful: {'; '.join(dict.fromkeys(notes))}"
-    return replace(full, notes=(*full.notes, note))
+    found = replace(full, notes=(*full.notes, note))
+    return found, split_by_bright(found.evidence, rng)
 
 
 def _about_peak(
     posing: Posing, n: int, peak: Peak, rng: np.random.Generator, told: Callable[[Rung], None] | None
-) -> Climb:
+) -> tuple[Climb, dict[int, Part]]:
     """Carry particles from a density about the peak to the posterior."""
     problem = posing.problem(n)
     density, n_calls = around_peak(problem, peak.theta, rng=rng)
@@ -195,51 +218,127 @@ def _about_peak(
         )
         density, n_calls = density.fitted_to(made.theta), made.n_calls
     if made.warnings:
-        return made
+        return made, {}
     fitted = density
     drawn = fitted.draw(np.empty((_N_FITTED, 0)), rng=rng)
     log_weight = np.full(_N_FITTED, -np.inf)
     inside = np.flatnonzero(np.isfinite(drawn).all(axis=1))
     log_weight[inside] = problem.log_likelihood(drawn[inside]) - fitted.log_likelihood(drawn[inside])
-    return _with_bridged_evidence(
-        made, clouds, log_weight, (made.log_likelihood - fitted.log_likelihood(made.theta))[:, None]
-    )
+    taken = (made.log_likelihood - fitted.log_likelihood(made.theta))[:, None]
+    return _with_bridged_evidence(made, clouds, log_weight, taken), {}
 
 
 def _from_below(
-    posing: Posing, n: int, below: Found, peak: Peak, rng: np.random.Generator, told: Callable[[Rung], None] | None
-) -> Climb:
-    """Carry particles from the posterior of n - 1, and some from the peak, to that of n; bridge the two posteriors."""
-    problem_below, alone = posing.problem(n - 1), posing.problem(1)
-    coordinates = posing.prior_of(n - 1).coordinates
-    start = below.evidence
-    if isinstance(start, Climb):
-        rest, log_z, error = start.theta, start.log_z_of_clouds, start.start_error
-    else:
-        rest, _ = coordinates.leave(coordinates.enter(start.samples(4 * _N_PARTICLES, rng=rng)))
-        log_z, error = np.full(_N_CLOUDS, start.log_z), start.log_z_error
-    few = rest[:: len(rest) // _N_PARTICLES]
-    compensation = Compensation.of(problem_below, coordinates, posing.problem(1, n_nodes=_FEW_NODES), few, rng=rng)
-    about = tuple(
+    posing: Posing,
+    n: int,
+    below: dict[int, Part],
+    peak: Peak,
+    whole: WholeFrame,
+    rng: np.random.Generator,
+    told: Callable[[Rung], None] | None,
+) -> tuple[Climb, dict[int, Part]]:
+    """Climb to each part of the posterior: from that below with a faint Gaussian more, or to where all are bright."""
+    about = [
         around_peak(posing.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in (peak.theta, *peak.others)
+    ]
+    bright = count_bright(np.array([peak.theta, *peak.others]))
+    held = held_shares(below)
+    made: dict[int, Climb] = {}
+    for m, part in below.items():
+        near = tuple(density for density, own in zip(about, bright, strict=True) if own == m)
+        if held[m] > _LEAST_HELD:
+            many = held[m] > _MUCH_HELD
+            made[m] = _one_faint_more(posing, n, m, part, near, whole, many=many, rng=rng, told=told)
+    if held.get(n - 1, 0.0) > _BRIGHT_HELD:
+        near = tuple(density for density, own in zip(about, bright, strict=True) if own == n)
+        made[n] = _all_bright(posing, n, below[n - 1], near, whole, rng=rng, told=told)
+    return joined(made, rng), {m: Part.of(climbed) for m, climbed in made.items()}
+
+
+def _one_faint_more(
+    posing: Posing,
+    n: int,
+    n_bright: int,
+    below: Part,
+    about: tuple[PeakDensity, ...],
+    whole: WholeFrame,
+    *,
+    many: bool,
+    rng: np.random.Generator,
+    told: Callable[[Rung], None] | None,
+) -> Climb:
+    """Carry particles from a part of the posterior of n - 1, and some from peaks; bridge the two parts."""
+    problem_below = posing.problem(n - 1)
+    coordinates = whole.coordinates(posing.prior_of(n - 1), n_bright)
+    rest = below.theta
+    n_particles = _N_PARTICLES if many else _FEW_PARTICLES
+    few = rest[np.arange(n_particles) * len(rest) // n_particles]
+    compensation = Compensation.of(
+        problem_below,
+        coordinates,
+        posing.problem(1, n_nodes=_FEW_NODES),
+        few,
+        rng=rng,
+        n_pool=_POOL if many else _SMALL_POOL,
     )
-    reference = SeededReference(Reference(posing.prior_of(n), problem_below, compensation), about, start.log_z)
-    removal = Removal(posing.prior_of(n), alone)
+    reference: KnownDensity = Reference(posing.prior_of(n), problem_below, compensation, n_bright)
+    if about:
+        reference = SeededReference(reference, about, below.log_z)
     made = climb(
         posing.problem(n),
         reference,
         few,
-        log_z_below=log_z,
-        error_below=error,
+        log_z_below=below.log_z_of_clouds,
+        error_below=below.start_error,
         rng=rng,
+        space=whole.coordinates(posing.prior_of(n), n_bright),
+        at_once_from=_AT_ONCE_FROM,
         told=told,
     )
+    removal = Removal(posing.prior_of(n), posing.problem(1), n_bright)
     gaussian = posing.prior_of(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
+    # Any of the n - n_bright faint Gaussians may be the one that is added.
+    labels = math.log(n / (n - n_bright))
+    log_z = below.log_z_of_clouds + labels
     return _with_bridged_evidence(made, log_z, removal.added(rest, gaussian), removal.taken(made.theta))
+
+
+def _all_bright(
+    posing: Posing,
+    n: int,
+    below: Part,
+    about: tuple[PeakDensity, ...],
+    whole: WholeFrame,
+    *,
+    rng: np.random.Generator,
+    told: Callable[[Rung], None] | None,
+) -> Climb:
+    """Carry particles from a wide density to where all Gaussians are bright."""
+    space = whole.coordinates(posing.prior_of(n), n)
+    fewer = whole.coordinates(posing.prior_of(n - 1), n - 1).enter(below.theta)
+    reference: KnownDensity = SharingDensity.of(space, fewer)
+    if about:
+        reference = SeededReference(reference, about, 0.0)
+    n_steps, least_effective = _TWO_BRIGHT if n == 2 else _MORE_BRIGHT
+    return climb(
+        posing.problem(n),
+        reference,
+        np.empty((_N_PARTICLES if n == 2 else _FEW_PARTICLES, 0)),
+        log_z_below=np.zeros(_N_CLOUDS),
+        error_below=0.0,
+        rng=rng,
+        space=space,
+        n_steps=n_steps,
+        n_more=_FEW_MOVES,
+        least_effective=least_effective,
+        told=told,
+    )
 
 
 def _with_bridged_evidence(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> Climb:
     """Take the evidence from a bridge, where enough samples lie on it; doubt where it disagrees with the climb's."""
+    if made.temperatures[-1] < 1.0:
+        return made
     ratio, share = bridged(added, taken)
     if share < _LEAST_SHARE:
         return made
@@ -257,7 +356,9 @@ def _with_bridged_evidence(made: Climb, log_z: FloatArray, added: FloatArray, ta
         start_error=math.hypot(made.start_error, drift),
     )
     apart = abs(found.log_z - made.log_z)
-    if not apart > max(_DISAGREE * math.hypot(found.log_z_error, made.log_z_error), _APART):
+    if len(made.temperatures) > _AT_ONCE_FROM or not apart > max(
+        _DISAGREE * math.hypot(found.log_z_error, made.log_z_error), _APART
+    ):
         return found
     words = f"{made.log_z:.2f} ± {made.log_z_error:.2f} by temperatures, {found.log_z:.2f} ± {found.log_z_error:.2f}"
     return replace(found, doubts=(*found.doubts, f"two estimates of ln Z disagree: {words} by a bridge"))

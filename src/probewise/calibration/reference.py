@@ -6,11 +6,12 @@ the first so that light, centre and covariance of the two stay (split and merge 
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Protocol, TypeAlias
+from functools import cached_property, partial
+from typing import Protocol
 
 import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
@@ -18,6 +19,7 @@ from scipy.special import logsumexp, ndtr, ndtri
 from probewise._arrays import FloatArray
 from probewise.calibration.compensation import Answer, Compensation
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.whole_coordinates import FAINT, count_bright
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.priors import Uniform
@@ -35,7 +37,9 @@ _EVEN_MASS = 0.3
 _LEAST_RATIO = 1e-4
 _SHAPE = slice(1, 6)
 # Shares of the draws that are added as they are, and that are split; the others are compensated for.
-_ADDED, _SPLIT = 0.05, 0.15
+_ADDED, _SPLIT = 0.2, 0.3
+# Share of the moves afresh that take the light from a bright one.
+_RESPLIT = 0.5
 # Share of the compensated ones whose light follows the first-order posterior.
 _TOLD = 0.7
 _TINY = float(np.finfo(float).tiny)
@@ -44,10 +48,6 @@ _TINY = float(np.finfo(float).tiny)
 def has_reference(prior: SSFPrior) -> bool:
     """Whether the light that a Gaussian holds is uniform from nothing: what `Reference` is made for."""
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
-
-
-# The mass that a new Gaussian may have at most, by those of the others: `np.min`, so that it is the last, or `np.max`.
-_MassOf: TypeAlias = Callable[..., FloatArray]
 
 
 class _Draw(Protocol):
@@ -100,11 +100,14 @@ class Reference:
         Problem of N - 1 Gaussians.
     compensation
         How the others shift.
+    n_bright
+        Number of bright Gaussians, below N; see `count_bright`.
     """
 
     prior: SSFPrior
     below: SensorProblem
     compensation: Compensation
+    n_bright: int
 
     def __post_init__(self) -> None:
         if self.prior.n_gaussians < 2 or not has_reference(self.prior):
@@ -114,8 +117,13 @@ class Reference:
     def proposals(self) -> tuple[JumpProposal, ...]:
         """The ways that are mixed."""
         return (
+            *(
+                JumpProposal(
+                    _SPLIT / self.n_bright, partial(self.split, label=label), partial(self.merged, label=label)
+                )
+                for label in range(self.n_bright)
+            ),
             JumpProposal(_ADDED, self.with_last, lambda theta: (self.without_last(theta), self.log_added(theta))),
-            JumpProposal(_SPLIT, self.split, lambda theta: (self.merged(theta), self.log_split(theta))),
             JumpProposal(1.0 - _ADDED - _SPLIT, self.with_compensated, self.uncompensated),
         )
 
@@ -138,6 +146,18 @@ class Reference:
         return out
 
     def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Draw one faint Gaussian afresh: the others shift to compensate, or a bright one gives way.
+
+        Returns the new parameters, (n, 6 N + 2), nan where there are none; and the log of the density of the old over
+        that of the new, both over the prior's, (n,); -inf where the move is impossible.
+        """
+        there, log_drawn = np.empty(here.shape), np.empty(len(here))
+        split = rng.random(len(here)) < _RESPLIT
+        for rows, move in ((np.flatnonzero(split), self._resplit), (np.flatnonzero(~split), self._recompensated)):
+            there[rows], log_drawn[rows] = move(here[rows], rng=rng)
+        return there, log_drawn
+
+    def _recompensated(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Take away any Gaussian but the first, undo the shift of the others, add another one and shift them for it.
 
         The new one may be as heavy as the first, so that all others are moved, not the lightest alone. `here` is
@@ -146,16 +166,18 @@ class Reference:
         """
         m, n = len(here), self.prior.n_gaussians
         g = here[:, :-2].reshape(m, n, 6)
-        label = rng.integers(1, n, size=m)
+        label = rng.integers(self.n_bright, n, size=m)
         others = g[np.arange(n) != label[:, None]].reshape(m, 6 * (n - 1))
         rest = np.concatenate([others, here[:, -2:]], axis=1)
-        before, log_here = self._uncompensated(rest, g[np.arange(m), label], np.max)
+        before, log_here = self._uncompensated(rest, g[np.arange(m), label], False)
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         rows = np.flatnonzero(np.isfinite(log_here))
         if rows.size:
-            after, last, answer = self._compensated(before[rows], np.max, rng)
+            after, last, answer = self._compensated(before[rows], False, rng)
+            real = np.isfinite(after).all(axis=1)
+            rows, after, last, answer = rows[real], after[real], last[real], answer.take(np.flatnonzero(real))
             there[rows] = _insert_gaussian(after, last)
-            log_there = self._log_compensated(before[rows], after, last, answer, np.max)
+            log_there = self._log_compensated(before[rows], after, last, answer, False)
             log_drawn[rows] = np.where(np.isfinite(log_there), log_here[rows] - log_there, -np.inf)
         return there, log_drawn
 
@@ -170,27 +192,27 @@ class Reference:
         last = self.prior.from_unit_cube(rng.random((n, len(self.prior.names))))[:, :6]
         last[near] = self._drawn_near_one(rest[near], rng)
         ratio = np.where(near, 1.0 - rng.random(len(rest)), _drawn_ratio(len(rest), rng))
-        last[:, 0] = ratio * self._masses(rest).min(axis=1) * self._scale(last)
+        last[:, 0] = ratio * self._most(self._masses(rest), last_of_all=True) * self._scale(last)
         return _insert_gaussian(rest, last)
 
     def log_added(self, theta: FloatArray) -> FloatArray:
         """Log of r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
         mass = self._masses(theta)
-        least = mass[:, :-1].min(axis=1)
+        least = self._most(mass[:, :-1], last_of_all=True)
         near = self._log_near_one(theta[:, -8:-2], self.without_last(theta))
         anywhere = _log_ratio_density(mass[:, -1] / least)
         return np.asarray(np.logaddexp(math.log(1.0 - _NEAR) + anywhere, math.log(_NEAR) + near) - np.log(least))
 
     def with_compensated(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Add a Gaussian to N - 1 sorted ones and shift these, (n, 6 N - 4) -> (n, 6 N + 2)."""
-        return _insert_gaussian(*self._compensated(rest, np.min, rng)[:2])
+        return _insert_gaussian(*self._compensated(rest, True, rng)[:2])
 
     def uncompensated(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Undo `with_compensated`; also the log density as `JumpProposal.back` has it."""
-        return self._uncompensated(self.without_last(theta), theta[:, -8:-2], np.min)
+        return self._uncompensated(self.without_last(theta), theta[:, -8:-2], True)
 
     def _compensated(
-        self, rest: FloatArray, most_of: _MassOf, rng: np.random.Generator
+        self, rest: FloatArray, last_of_all: bool, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, Answer]:
         """Shift N - 1 sorted Gaussians for one of a mass up to `most_of` theirs; that one, (n, 6), and the answer."""
         last, answer = self.compensation.draw(len(rest), rng=rng)
@@ -198,23 +220,24 @@ class Reference:
         last[near] = self._drawn_near_one(rest[near], rng)
         answer = answer.put(near, self.compensation.linear.answer(last[near]))
         masses = self._masses(rest)
-        whole, most = masses.sum(axis=1), most_of(masses, axis=1)
+        whole, most = masses.sum(axis=1), self._most(masses, last_of_all=last_of_all)
         told = answer.draw_share(most / (whole + most), rng=rng)
         by_share = rng.random(len(rest)) < _TOLD
         ratio = np.where(by_share, told / (1.0 - told) * whole / most, _drawn_ratio(len(rest), rng))
         last[:, 0] = ratio * most * self._scale(last)
         share = ratio * most / (whole + ratio * most)
         coordinates = self.compensation.coordinates
-        return coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)[0], last, answer
+        after, log_prior = coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)
+        return np.where(np.isfinite(log_prior)[:, None], after, np.nan), last, answer
 
-    def _uncompensated(self, after: FloatArray, last: FloatArray, most_of: _MassOf) -> tuple[FloatArray, FloatArray]:
+    def _uncompensated(self, after: FloatArray, last: FloatArray, last_of_all: bool) -> tuple[FloatArray, FloatArray]:
         """Undo `_compensated`; also the log of its density over the prior's, but for likelihood and N."""
         answer = self.compensation.linear.answer(last)
         mass = last[:, 0] / self._scale(last)
         share = mass / (self._masses(after).sum(axis=1) + mass)
         coordinates = self.compensation.coordinates
         before = coordinates.leave(coordinates.enter(after) - share[:, None] * answer.shift)[0]
-        return before, self._log_compensated(before, after, last, answer, most_of)
+        return before, self._log_compensated(before, after, last, answer, last_of_all)
 
     def _log_compensated(
         self,
@@ -222,12 +245,12 @@ class Reference:
         after: FloatArray,
         last: FloatArray,
         answer: Answer,
-        most_of: _MassOf,
+        last_of_all: bool,
     ) -> FloatArray:
         """Log density of `_compensated` over the prior's, but for likelihood and N, (n,)."""
         coordinates = self.compensation.coordinates
         masses, mass = self._masses(after), last[:, 0] / self._scale(last)
-        whole, most = masses.sum(axis=1), most_of(masses, axis=1)
+        whole, most = masses.sum(axis=1), self._most(masses, last_of_all=last_of_all)
         share, ratio = mass / (whole + mass), mass / most
         log_before, log_after = (coordinates.leave(coordinates.enter(rest))[1] for rest in (before, after))
         log_share = answer.log_share_density(share, most / (whole + most))
@@ -254,36 +277,88 @@ class Reference:
         at = self._places(_insert_gaussian(rest[:, -2:], last))[0]
         return np.asarray(logsumexp(_log_near(at, centre, width), axis=1) - math.log(self.prior.n_gaussians - 1))
 
-    def split(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Take the last Gaussian out of the first, (n, 6 N - 4) -> (n, 6 N + 2); nan where no Gaussian is left."""
+    def split(self, rest: FloatArray, label: int, *, rng: np.random.Generator) -> FloatArray:
+        """Take the last Gaussian out of a bright one, (n, 6 N - 4) -> (n, 6 N + 2); nan where that one is used up."""
+        last, _ = self._drawn_beside(rest, label, self._most(self._masses(rest), last_of_all=True), rng)
+        return self._without_light(rest, label, last)
+
+    def merged(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
+        """Undo `split`; also the log density as `JumpProposal.back` has it."""
+        rest = self._with_light(self.without_last(theta), label, theta[:, -8:-2])
+        most = self._most(self._masses(rest), last_of_all=True)
+        return rest, self._log_split(rest, self.without_last(theta), label, theta[:, -8:-2], most)
+
+    def _resplit(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Give a faint Gaussian's light to a bright one, and take another out of a bright one; as `redrawn`."""
+        m, n = len(here), self.prior.n_gaussians
+        there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
+        label = rng.integers(self.n_bright, n, size=m)
+        to, of = rng.integers(self.n_bright, size=(2, m))
+        for faint, to_bright, of_bright in itertools.product(
+            range(self.n_bright, n), range(self.n_bright), range(self.n_bright)
+        ):
+            rows = np.flatnonzero((label == faint) & (to == to_bright) & (of == of_bright))
+            if not rows.size:
+                continue
+            old = here[rows]
+            last = old[:, 6 * faint : 6 * faint + 6]
+            others = np.delete(old, slice(6 * faint, 6 * faint + 6), axis=1)
+            rest = self._with_light(others, to_bright, last)
+            most = self._most(self._masses(rest), last_of_all=False)
+            log_here = self._log_split(rest, others, to_bright, last, most)
+            new_last, _ = self._drawn_beside(rest, of_bright, most, rng)
+            new = self._without_light(rest, of_bright, new_last)
+            log_there = self._log_split(rest, self.without_last(new), of_bright, new_last, most)
+            there[rows] = new
+            with np.errstate(invalid="ignore"):
+                log_drawn[rows] = np.where(
+                    np.isfinite(log_here) & np.isfinite(log_there), log_here - log_there, -np.inf
+                )
+        return there, log_drawn
+
+    def _drawn_beside(
+        self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Draw a Gaussian near a bright one, (n, 6), of a mass up to `most`; and that mass over it."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
         centre, width = self._places(rest)
-        u[:, _SHAPE] = _drawn_near(centre[:, 0], width[:, 0], rng)
+        u[:, _SHAPE] = _drawn_near(centre[:, label], width[:, label], rng)
         last = self.prior.from_unit_cube(u)[:, :6]
-        last[:, 0] = _drawn_ratio(n, rng) * _most_split(self._masses(rest)) * self._scale(last)
-        first = self._from_moments(self._moments(rest[:, :6]) - self._moments(last))
-        out = np.concatenate([first, rest[:, 6:-2], last, rest[:, -2:]], axis=1)
-        return np.where(np.isfinite(first).all(axis=1, keepdims=True), out, np.nan)
+        ratio = _drawn_ratio(n, rng)
+        last[:, 0] = ratio * most * self._scale(last)
+        return last, ratio
 
-    def merged(self, theta: FloatArray) -> FloatArray:
-        """Join the last Gaussian to the first, keeping light, centre and covariance, (n, 6 N + 2) -> (n, 6 N - 4)."""
-        first = self._from_moments(self._moments(theta[:, :6]) + self._moments(theta[:, -8:-2]))
-        return np.concatenate([first, theta[:, 6:-8], theta[:, -2:]], axis=1)
+    def _without_light(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
+        """Take a Gaussian's moments from those of a bright one, and add it; nan where nothing would be left."""
+        own = slice(6 * label, 6 * label + 6)
+        left = self._from_moments(self._moments(rest[:, own]) - self._moments(last))
+        out = _insert_gaussian(rest, last)
+        out[:, own] = left
+        return np.where(np.isfinite(left).all(axis=1, keepdims=True), out, np.nan)
 
-    def log_split(self, theta: FloatArray) -> FloatArray:
-        """Log of the density of a split over the prior's, but for the likelihood, (n, 6 N + 2) -> (n,)."""
-        whole = self.merged(theta)
-        masses = self._masses(whole)
-        most = _most_split(masses)
-        ratio = self._masses(theta)[:, -1] / np.maximum(most, _TINY)
-        centre, width = self._places(whole)
-        at = self._places(theta)[0][:, -1]
-        # At a fixed last Gaussian the moments of the first are shifted, so volumes in them stay.
-        found = self._log_prior_of_moments(whole[:, :6], whole) - self._log_prior_of_moments(theta[:, :6], whole)
+    def _with_light(self, others: FloatArray, label: int, last: FloatArray) -> FloatArray:
+        """Add a Gaussian's moments to those of a bright one, keeping light, centre and covariance of the two."""
+        own = slice(6 * label, 6 * label + 6)
+        out = others.copy()
+        out[:, own] = self._from_moments(self._moments(others[:, own]) + self._moments(last))
+        return out
+
+    def _log_split(
+        self, rest: FloatArray, others: FloatArray, label: int, last: FloatArray, most: FloatArray
+    ) -> FloatArray:
+        """Log density of a split over the prior's, but for likelihood and N, (n,); -inf where it is impossible."""
+        own = slice(6 * label, 6 * label + 6)
+        centre, width = self._places(rest)
+        ratio = last[:, 0] / self._scale(last) / np.maximum(most, _TINY)
+        at = self._places(_insert_gaussian(rest[:, -2:], last))[0][:, 0]
+        # At a fixed last Gaussian the moments of the bright one are shifted, so volumes in them stay.
         with np.errstate(divide="ignore", invalid="ignore"):
-            found += _log_near(at, centre[:, 0], width[:, 0]) + _log_ratio_density(ratio) - np.log(most)
-        return np.where((ratio < 1.0) & (ratio > 0.0) & np.isfinite(found), found, -np.inf)
+            found = self._log_prior_of_moments(rest[:, own], rest) - self._log_prior_of_moments(others[:, own], rest)
+            found += _log_near(at, centre[:, label], width[:, label]) + _log_ratio_density(ratio) - np.log(most)
+        possible = (ratio < 1.0) & (ratio > 0.0) & np.isfinite(found)
+        possible[possible] = count_bright(rest[possible]) == self.n_bright
+        return np.where(possible, found, -np.inf)
 
     def _log_prior_of_moments(self, g: FloatArray, levels_of: FloatArray) -> FloatArray:
         """Log of one Gaussian's prior density over its moments, up to a constant, (n, 6) -> (n,)."""
@@ -311,6 +386,11 @@ class Reference:
             g = np.stack([m[:, 0], u, v, 0.5 * vv / det, 0.5 * uu / det, -0.5 * uv / det], axis=1)
             g[:, 0] *= self._scale(g)
         return np.where(real[:, None], g, np.nan)
+
+    def _most(self, masses: FloatArray, *, last_of_all: bool) -> FloatArray:
+        """Most mass that a faint Gaussian may have beside others, (n, N - 1) -> (n,); or one that is the lightest."""
+        most = FAINT * masses.max(axis=1)
+        return np.asarray(np.minimum(most, masses.min(axis=1)) if last_of_all else most)
 
     def _scale(self, g: FloatArray) -> FloatArray:
         return self.prior.amplitude_scale(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
@@ -346,14 +426,6 @@ class Reference:
 def _insert_gaussian(rest: FloatArray, last: FloatArray) -> FloatArray:
     """Put a Gaussian, (n, 6), before the levels, (n, 6 N - 4) -> (n, 6 N + 2)."""
     return np.concatenate([rest[:, :-2], last, rest[:, -2:]], axis=1)
-
-
-def _most_split(masses: FloatArray) -> FloatArray:
-    """Most light that a split may take from the first of N - 1, (n, N - 1) -> (n,): the order must not change."""
-    first, others = masses[:, 0], masses[:, 1:]
-    if not others.shape[1]:
-        return np.asarray(0.5 * first)
-    return np.asarray(np.minimum(np.minimum(0.5 * first, first - others.max(axis=1)), others.min(axis=1)))
 
 
 def _drawn_ratio(n: int, rng: np.random.Generator) -> FloatArray:

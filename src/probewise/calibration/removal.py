@@ -19,6 +19,7 @@ from scipy.special import expit
 from probewise._arrays import FloatArray
 from probewise.calibration.lone import LoneResponses, light_of
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT, log_sigma_integral
 
@@ -49,13 +50,14 @@ class Removal:
 
     prior: SSFPrior
     alone: SensorProblem
+    n_bright: int
 
     def taken(self, theta: FloatArray) -> FloatArray:
-        """Log of that ratio for each Gaussian of samples of N, (n, 6 N + 2) -> (n, N)."""
+        """Log of that ratio for each faint Gaussian of sorted samples of N, (n, 6 N + 2) -> (n, N - n_bright)."""
         n = self.prior.n_gaussians
         at_once = max(1, _AT_ONCE // (n * self._readings.size))
         blocks = [theta[at : at + at_once] for at in range(0, len(theta), at_once)]
-        return np.concatenate([self._taken(block) for block in blocks]) if blocks else np.empty((0, n))
+        return np.concatenate([self._taken(block) for block in blocks]) if blocks else np.empty((0, n - self.n_bright))
 
     def added(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
         """Log of that ratio for a Gaussian more, (n, 6), of any light, beside samples of N - 1, (n, 6 N - 4)."""
@@ -72,10 +74,11 @@ class Removal:
 
     def _taken(self, theta: FloatArray) -> FloatArray:
         seen, light = self._responses(theta)
-        out = np.empty(light.shape)
-        for k in range(light.shape[1]):
+        out = np.empty((len(light), light.shape[1] - self.n_bright))
+        for at in range(out.shape[1]):
+            k = self.n_bright + at
             others = np.delete(light, k, axis=1)
-            out[:, k] = self._log_gain(
+            out[:, at] = self._log_gain(
                 _mixture_response(np.delete(seen, k, axis=1), others), seen[:, k], others, theta[:, -2:]
             )
         return out
@@ -110,7 +113,7 @@ class Removal:
     def _integrated(self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray) -> FloatArray:
         """Log of the integral over t, over the likelihood at t = 0; `whole`: the others' light over the brightest's."""
         n = self.prior.n_gaussians
-        low, high = self._bounds(square, both, own)
+        low, high = self._bounds(square, both, own, FAINT / (FAINT + whole))
         place, weight = _NODES
         share = (low[..., None] + (high - low)[..., None] * 0.5 * (place + 1.0)).clip(1e-14, 1.0 - 1e-12)
         log_density = self._log_density(square, both, own, whole, share)
@@ -124,12 +127,12 @@ class Removal:
         """Log of likelihood times prior of shares of the light, (..., n_shares)."""
         q = share[..., None]
         left = square[..., None, :] - 2.0 * q * both[..., None, :] + q * q * own[..., None, :]
-        whole = whole[..., None]
-        t = whole * share / (1.0 - share)
-        log_measure = np.log(whole) - 2.0 * np.log1p(-share) - self.prior.n_gaussians * np.log(np.maximum(t, 1.0))
+        log_measure = np.log(whole[..., None]) - 2.0 * np.log1p(-share)
         return np.asarray(self._log_likelihood(left) + log_measure)
 
-    def _bounds(self, square: FloatArray, both: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _bounds(
+        self, square: FloatArray, both: FloatArray, own: FloatArray, most: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Shares of light between which the likelihood is not negligible, (...,) each."""
         share = np.zeros(square.shape[:-1])
         for _ in range(_N_NEWTON):
@@ -138,13 +141,14 @@ class Removal:
             per_variance = np.minimum(self._likelihood.sizes / left, 1.0 / self._likelihood.sd_floor**2)
             told = (per_variance * own).sum(axis=-1) + 1e-12
             best = (per_variance * both).sum(axis=-1) / told
-            share = best.clip(0.0, 1.0)
+            share = np.clip(best, 0.0, most)
         sd = 1.0 / np.sqrt(told)
-        # Where less than nothing would be best, the likelihood falls from 0 almost by an exponential.
-        below = np.abs(best) / sd
-        reach = np.where(best < 0.0, _REACH**2 * sd / (below + np.hypot(below, _REACH)), _REACH * sd)
-        low = (share - reach).clip(0.0, 1.0)
-        return low, np.maximum((share + reach).clip(0.0, 1.0), low + 1e-12)
+        # Where the best share is out of bounds, the likelihood falls from the bound almost by an exponential.
+        beyond = np.maximum(np.maximum(-best, best - most), 0.0) / sd
+        reach = _REACH**2 * sd / (beyond + np.hypot(beyond, _REACH))
+        low = np.clip(share - reach, 0.0, most)
+        high = np.clip(share + reach, 0.0, most)
+        return low, np.maximum(high, low + 1e-12)
 
     def _log_likelihood(self, square: FloatArray) -> FloatArray:
         """Log likelihood up to a constant from sums of squares, (..., n_sets) -> (...)."""

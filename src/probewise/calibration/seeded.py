@@ -14,8 +14,8 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration.around_peak import PeakDensity
+from probewise.calibration.climb import KnownDensity
 from probewise.calibration.priors import SSFPrior
-from probewise.calibration.reference import Reference
 
 __all__ = ["SeededReference"]
 
@@ -36,7 +36,7 @@ class SeededReference:
         Natural log of the evidence of N - 1.
     """
 
-    reference: Reference
+    reference: KnownDensity
     peaks: tuple[PeakDensity, ...]
     log_z_below: float
 
@@ -53,7 +53,7 @@ class SeededReference:
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw one for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
-        out = np.empty((len(rest), rest.shape[1] + 6))
+        out = np.empty((len(rest), len(self.prior.names)))
         for density, rows in self._shared_out(len(rest), rng):
             out[rows] = density.draw(rest[rows], rng=rng)
         return out
@@ -65,8 +65,8 @@ class SeededReference:
             there[rows], log_drawn[rows] = density.redrawn(here[rows], rng=rng)
         return there, log_drawn
 
-    def _shared_out(self, n: int, rng: np.random.Generator) -> list[tuple[PeakDensity | Reference, IntArray]]:
+    def _shared_out(self, n: int, rng: np.random.Generator) -> list[tuple[KnownDensity, IntArray]]:
         """Share out rows at random: to the peaks, then to the reference."""
         which = np.minimum((rng.random(n) * len(self.peaks) / _SHARE).astype(np.int64), len(self.peaks))
-        densities: tuple[PeakDensity | Reference, ...] = (*self.peaks, self.reference)
+        densities: tuple[KnownDensity, ...] = (*self.peaks, self.reference)
         return [(density, np.flatnonzero(which == k)) for k, density in enumerate(densities)]

@@ -1,0 +1,71 @@
+"""A density to start from where all Gaussians hold much of the light: a Student-t about the posterior below.
+
+Where N Gaussians share the light of one footprint, its moments are those that N - 1 Gaussians have; of what is left,
+each Gaussian's share, place and width, the readings say little. Such a part of the posterior is broad, is far from
+that of N - 1 Gaussians with a faint one more, and has no peak of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.calibration.around_peak import StudentTDensity
+from probewise.calibration.priors import SSFPrior
+from probewise.calibration.whole_coordinates import WholeCoordinates
+
+# Of the others' log ratios to the heaviest: mean and sd; in units of the whole: variance of places, sd of the logs.
+_LOG_RATIO, _LOG_RATIO_SD = -1.2, 0.8
+_PLACE, _LOG_SD = 0.8, 1.0
+_LOG_LIGHT, _LOG_LIGHT_SD = -0.4, 0.4
+_WIDENED = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class SharingDensity:
+    """A Student-t in coordinates of the whole: a `KnownDensity`."""
+
+    space: WholeCoordinates
+    one: StudentTDensity
+
+    @classmethod
+    def of(cls, space: WholeCoordinates, fewer: FloatArray) -> SharingDensity:
+        """Make it of N Gaussians from samples of N - 1 in coordinates of their whole, (n, 6 N - 4)."""
+        d = fewer.shape[1] + 6
+        own, last = np.r_[: d - 8, d - 2, d - 1], np.arange(d - 8, d - 2)
+        mean, covariance = fewer.mean(axis=0), _WIDENED**2 * np.cov(fewer, rowvar=False)
+        # No reading tells the light of all.
+        covariance[0] = covariance[:, 0] = 0.0
+        mean[0], covariance[0, 0] = _LOG_LIGHT, _LOG_LIGHT_SD**2
+        middle, root = np.empty(d), np.zeros((d, d))
+        middle[own], middle[last] = mean, np.r_[_LOG_RATIO, mean[1:6]]
+        root[np.ix_(own, own)] = np.linalg.cholesky(covariance)
+        root[last, last] = np.r_[_LOG_RATIO_SD, np.sqrt(_PLACE * np.exp(mean[3:5])), _LOG_SD, _LOG_SD, _LOG_SD]
+        # The rows are in the order of the coordinates, so that a lower root stays one.
+        return cls(space, StudentTDensity(middle, np.asarray(np.linalg.cholesky(root @ root.T))))
+
+    @property
+    def prior(self) -> SSFPrior:
+        """Of N Gaussians."""
+        return self.space.prior
+
+    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+        """Log density over the prior's sorted one, (n, 6 N + 2) -> (n,)."""
+        x = self.space.enter(theta)
+        return np.asarray(self.one.log_density(x) - self.space.leave(x)[1])
+
+    def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw as many as there are rows in `rest`, (n, 6 N + 2); nan where outside the prior."""
+        theta, log_prior = self.space.leave(self.one.draw(len(rest), rng))
+        theta[~np.isfinite(log_prior)] = np.nan
+        return theta
+
+    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Draw afresh, and the log density of the old over that of the new, over the prior's."""
+        there = self.draw(here, rng=rng)
+        log_drawn = np.full(len(here), -np.inf)
+        rows = np.flatnonzero(np.isfinite(there).all(axis=1))
+        log_drawn[rows] = self.log_likelihood(here[rows]) - self.log_likelihood(there[rows])
+        return there, log_drawn

@@ -97,8 +97,10 @@ def joined(made: dict[int, Climb], rng: np.random.Generator) -> Climb:
     log_z = np.array([climbed.log_z for climbed in climbs])
     share = np.exp(log_z - logsumexp(log_z))
     main = climbs[int(np.argmax(share))]
-    if any(climbed.temperatures[-1] < 1.0 for climbed in climbs):
-        return main
+    lost = [climbed for climbed in climbs if climbed.temperatures[-1] < 1.0]
+    if lost:
+        # A climb that was not reached says so itself; how much it holds is not known.
+        return lost[0]
     n_clouds = len(main.log_z_of_clouds)
     blocks = n_clouds * N_SNAPSHOTS
     size = len(main.theta) // blocks

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray
+from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates, kinds_of
 from probewise.calibration.lone import light_of
 from probewise.calibration.priors import SSFPrior
@@ -20,6 +20,7 @@ from probewise.calibration.priors import SSFPrior
 FAINT = 0.1
 _TAPER = 3.0
 _LEAST = 1e-12
+_UNIT = np.array([[1.0], [1.0], [0.0]])
 
 
 @dataclass(frozen=True)
@@ -70,11 +71,14 @@ class WholeCoordinates:
         ratio = np.exp(g[0, 1:])
         mean, first = self._others(g)
         whole_mean, whole = g[1:3, 0].copy(), _covariance(g[3:6, 0])
+        # An extreme correlation is one in its last digit.
+        real = _is_covariance(whole)
+        whole[:, ~real] = _UNIT
         g[1:3, 0] = (whole_mean - mean) / first
         off = g[1:3, 0] - whole_mean
         own = (whole - self._spread(g, whole_mean)) / first - _products(off)
-        real = (own[0] > 0.0) & (own[1] > 0.0) & (own[2] ** 2 < (1.0 - _LEAST) * own[0] * own[1])
-        own[:, ~real] = np.array([1.0, 1.0, 0.0])[:, None]
+        real &= _is_covariance(own)
+        own[:, ~real] = _UNIT
         g[3:6, 0] = _logs(own)
         heaviest = 1.0 / (1.0 + ratio.sum(axis=0))
         g[1:3, 0] = heaviest * (g[1:3, 0] + (ratio * g[1:3, 1:]).sum(axis=1))
@@ -118,6 +122,11 @@ def _covariance(logs: FloatArray) -> FloatArray:
     """Variances and covariance of log variances and inverse hyperbolic tangent of the correlation, (3, ...)."""
     variance = np.exp(logs[:2])
     return np.stack([*variance, np.tanh(logs[2]) * np.sqrt(variance[0] * variance[1])])
+
+
+def _is_covariance(covariance: FloatArray) -> BoolArray:
+    xx, yy, xy = covariance
+    return np.asarray((xx > 0.0) & (yy > 0.0) & (xy**2 < (1.0 - _LEAST) * xx * yy))
 
 
 def _logs(covariance: FloatArray) -> FloatArray:

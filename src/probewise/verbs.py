@@ -81,7 +81,7 @@ def calibrate(
         sequential Monte Carlo, from the peak of its likelihood or from the number below. One search of the whole prior
         with few live points vouches for the chosen number; what is doubtful is searched in full.
         "full": the same priors; every number is searched by nested sampling, and its evidence refined by importance
-        sampling. Takes six to ten times as long. "refined" is its former name.
+        sampling. Takes two to ten times as long. "refined" is its former name.
         "paper": uniform priors, and the evidence of nested sampling alone. All have the Student-t likelihood.
     nested_stop
         Stopping rule of nested sampling with the method "paper": "change" (of ln Z below 1e-8; the default), or

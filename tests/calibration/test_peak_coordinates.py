@@ -7,7 +7,7 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import default_prior
-from probewise.calibration.around_peak import PeakDensity, StudentTDensity, missed_about
+from probewise.calibration.around_peak import PeakDensity, StudentTDensity, share_missed_about
 from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.inference import SensorProblem
 from probewise.recordings import Recording
@@ -69,7 +69,7 @@ def test_a_peak_is_missed_where_its_part_of_the_evidence_has_no_samples(recordin
     y = space.enter(theta[theta[:, 1] > 0.0])
     density = PeakDensity(space, StudentTDensity(y.mean(axis=0), 0.8 * np.linalg.cholesky(np.cov(y, rowvar=False))))
     asked = {
-        name: missed_about(silent, density, some, np.log(z), n_draws=4000, rng=rng)
+        name: share_missed_about(silent, density, some, np.log(z), n_draws=4000, rng=rng)
         for name, some, z in (("all", theta, 1.0), ("half", half, 0.5))
     }
     assert asked["all"] < 0.05

@@ -62,7 +62,7 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
     alive = alive[np.isfinite(reference.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == m)]
     coordinates = reference.prior.coordinates
     drawn[alive] = coordinates.leave(coordinates.enter(drawn[alive]))[0]
-    weight[alive] = below * np.exp(-reference.log_likelihood(drawn[alive]))
+    weight[alive] = below * np.exp(-reference.log_over_prior(drawn[alive]))
     assert 0.2 < len(alive) / len(drawn) < 1.0
     plain, share = _sorted_draws(reference.prior, 20_000, m, rng)
     assert abs(weight.mean() - share) < 4 * np.hypot(weight.std(), np.sqrt(share / 40)) / np.sqrt(len(weight))
@@ -93,7 +93,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
     alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
     alive = alive[np.isfinite(seeded.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == 1)]
     coordinates = seeded.prior.coordinates
-    weight[alive] = np.exp(-seeded.log_likelihood(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
+    weight[alive] = np.exp(-seeded.log_over_prior(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
     # The lighter of two uniform numbers is below a tenth of the other.
     assert abs(weight.mean() - FAINT) < 4 * weight.std() / np.sqrt(len(weight)) < 0.04
     there, log_drawn = seeded.redrawn(drawn[alive], rng=rng)

@@ -92,7 +92,7 @@ def test_a_sharing_density_keeps_the_whole_of_the_gaussians_below() -> None:
     possible = theta[np.isfinite(theta).all(axis=1)]
     assert len(possible) > 400
     assert (count_bright(possible) == 2).all()
-    assert np.isfinite(density.log_likelihood(possible)).all()
+    assert np.isfinite(density.log_over_prior(possible)).all()
     x = asked.enter(possible)
     for own, other in ((1, 1), (2, 2), (-2, -2), (-1, -1)):
         sd = below[:, other].std()

@@ -19,8 +19,6 @@ from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested.weights import n_effective
 
-__all__ = ["PeakDensity", "around_peak", "missed_about"]
-
 _DEGREES_OF_FREEDOM = 8.0
 _N_ROUNDS, _N_PILOTS = 4, 1000
 _DIFFERENCE = 1e-5
@@ -39,18 +37,20 @@ class StudentTDensity:
     root: FloatArray
 
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, d)."""
         white = rng.standard_normal((n, len(self.mean)))
         white *= np.sqrt(_DEGREES_OF_FREEDOM / rng.chisquare(_DEGREES_OF_FREEDOM, size=(n, 1)))
         return np.asarray(self.mean + white @ self.root.T)
 
     @property
     def least_log_density(self) -> float:
-        """Above it lie nearly all of the draws; by Fisher's distribution."""
+        """Log density above which nine tenths of the draws lie, by Fisher's distribution."""
         d = len(self.mean)
         at = self.mean + math.sqrt(d * float(fdtri(d, _DEGREES_OF_FREEDOM, _NEAR))) * self.root[:, 0]
         return float(self.log_density(at[None])[0])
 
     def log_density(self, y: FloatArray) -> FloatArray:
+        """Natural log of the density, (n, d) -> (n,)."""
         nu, d = _DEGREES_OF_FREEDOM, len(self.mean)
         white = np.linalg.solve(self.root, (y - self.mean).T)
         norm = gammaln((nu + d) / 2) - gammaln(nu / 2) - 0.5 * d * math.log(nu * math.pi)
@@ -102,7 +102,7 @@ class PeakDensity:
         each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.relabelled]
         return np.asarray(np.max(each, axis=0) > self.one.least_log_density)
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+    def log_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log density over the prior's, (n, 6 N + 2) -> (n,)."""
         y = self.space.enter(theta)
         return self._log_density(y) - self.space.leave(y)[1]
@@ -112,7 +112,7 @@ class PeakDensity:
         there = self.draw(here, rng=rng)
         log_drawn = np.full(len(here), -np.inf)
         rows = np.flatnonzero(np.isfinite(there).all(axis=1))
-        log_drawn[rows] = self.log_likelihood(here[rows]) - self.log_likelihood(there[rows])
+        log_drawn[rows] = self.log_over_prior(here[rows]) - self.log_over_prior(there[rows])
         return there, log_drawn
 
     def _log_density(self, y: FloatArray) -> FloatArray:
@@ -156,7 +156,7 @@ def around_peak(
     return PeakDensity(space, density), n_calls
 
 
-def missed_about(
+def share_missed_about(
     problem: SensorProblem,
     density: PeakDensity,
     theta: FloatArray,
@@ -208,7 +208,7 @@ def _laplace(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -
 
 
 def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
-    """Raise weights to the power, at most 1, that leaves at least so many draws effective."""
+    """Scale log weights by the largest power, at most 1, that leaves an effective sample size of `least` or more."""
     low, high = 0.0, 1.0
     if n_effective(log_weight) >= least:
         return log_weight

@@ -24,8 +24,6 @@ from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective, resampled
 from probewise.priors import Coordinates
 
-__all__ = ["N_SNAPSHOTS", "Climb", "KnownDensity", "Rung", "climb"]
-
 # A change of temperature leaves at least this share of the particles effective.
 _KEPT = 0.25
 _N_STEPS = 3
@@ -57,7 +55,7 @@ class KnownDensity(Protocol):
         """Of N Gaussians."""
         ...
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+    def log_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log of the density over the prior's sorted one, up to what `log_z_below` counts; (n, 6 N + 2) -> (n,)."""
         ...
 
@@ -257,7 +255,7 @@ def climb(
             log_likelihood[possible] = problem.log_likelihood(theta[possible])
             if beta < 1.0:
                 n_calls += possible.size
-                log_reference[possible] = reference.log_likelihood(theta[possible])
+                log_reference[possible] = reference.log_over_prior(theta[possible])
         return _Cloud(x, log_prior, log_likelihood, log_reference)
 
     n_clouds = len(log_z_below)

@@ -22,8 +22,6 @@ from probewise.calibration.whole_coordinates import WholeCoordinates
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled
 
-__all__ = ["Answer", "Compensation"]
-
 # All particles take their shapes from one pool, whose scatter no cloud tells: with 6,000 it was the greatest part of
 # the error of ln Z of two Gaussians. So many are drawn at a time, until enough are effective or there are many.
 _N_DRAWN, _EFFECTIVE, _MOST_DRAWN = 12_000, 4_000, 60_000
@@ -39,7 +37,10 @@ _LOG_ROOT_2PI = 0.5 * float(np.log(2.0 * np.pi))
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """The answer to one Gaussian more: shift of the coordinates per share, (n, d); mean and sd of the share, (n,)."""
+    """The answer to one Gaussian more.
+
+    `shift` of the coordinates per share of the light, (n, d); `mean` of the share and 1.2 times its first-order `sd`, (n,).
+    """
 
     shift: FloatArray
     mean: FloatArray

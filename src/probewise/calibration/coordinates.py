@@ -11,8 +11,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.priors import Prior
 
-__all__ = ["MixtureDensity", "MomentCoordinates", "kinds_of"]
-
 
 class MixtureDensity(Prior, Protocol):
     """A prior of a mixture's parameters with what the coordinates need beside its density."""

@@ -9,8 +9,6 @@ from probewise.errors import ParameterError
 from probewise.recordings import Plan
 from probewise.sensor import SensorModel
 
-__all__ = ["DistinctRows"]
-
 
 class DistinctRows:
     """Wrapper of a model whose predictions depend only on a row's place, orientation and pattern.

@@ -11,8 +11,6 @@ from probewise._arrays import FloatArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor import Footprint, SSFField, field_of, footprint_of
 
-__all__ = ["by_mass", "choose_pixel_mm", "mean_field", "mixture_moments"]
-
 _SIGMAS = 5.0
 _MAX_PIXELS_A_SIDE = 301
 _SERIES = (1.0, 0.5, 0.2, 0.1)

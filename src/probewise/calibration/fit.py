@@ -31,8 +31,6 @@ from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_described, require_recording
 from probewise.sensor import SSFField
 
-__all__ = ["Calibration", "OrderFit", "calibrate"]
-
 _N_SAMPLES = 1000
 # Ratio of posterior to prior sd above which the recording is not informative.
 _UNINFORMED = 0.7
@@ -141,7 +139,7 @@ def calibrate(
     orders
         Numbers of Gaussians to try.
     n_live
-        Live points of nested sampling.
+        Live points of nested sampling, 2 or more; with `quick`, of the orders that are searched in full alone.
     rng
         Source of randomness; spawned for each order.
     quick
@@ -174,8 +172,8 @@ def calibrate(
     Raises
     ------
     ParameterError
-        If `orders` is empty, the recording has no contrast (see `scan_geometry`), or a name in it cannot be written
-        to a file.
+        If `orders` is empty, the recording has no contrast (see `scan_geometry`), a name in it cannot be written to a
+        file, a value is out of its range, or `quick` is asked with `refined=False`.
 
     Warns
     -----

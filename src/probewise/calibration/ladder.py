@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.around_peak import PeakDensity, around_peak, missed_about
+from probewise.calibration.around_peak import PeakDensity, around_peak, share_missed_about
 from probewise.calibration.climb import N_SNAPSHOTS, Climb, KnownDensity, Rung, climb
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_search import Found, Progress, Search
@@ -27,10 +27,8 @@ from probewise.calibration.reference import Reference, has_reference
 from probewise.calibration.removal import Removal, bridged
 from probewise.calibration.seeded import SeededReference
 from probewise.calibration.sharing import SharingDensity
-from probewise.calibration.vouching import missed
+from probewise.calibration.vouching import part_missed
 from probewise.calibration.whole_coordinates import count_bright
-
-__all__ = ["climb_orders", "next_order"]
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
@@ -117,7 +115,7 @@ def _vouched_for(
         if chosen in asked or not isinstance(made, Climb):
             return found
         asked.add(chosen)
-        why = missed(posing, chosen, made, rng=rng, progress=progress)
+        why = part_missed(posing, chosen, made, rng=rng, progress=progress)
         if why:
             note = f"searched in full, since the quick way missed a peak of order {chosen}: {why}"
             for n in (n for n in found if n >= chosen):
@@ -223,8 +221,8 @@ def _about_peak(
     drawn = fitted.draw(np.empty((_N_FITTED, 0)), rng=rng)
     log_weight = np.full(_N_FITTED, -np.inf)
     inside = np.flatnonzero(np.isfinite(drawn).all(axis=1))
-    log_weight[inside] = problem.log_likelihood(drawn[inside]) - fitted.log_likelihood(drawn[inside])
-    taken = (made.log_likelihood - fitted.log_likelihood(made.theta))[:, None]
+    log_weight[inside] = problem.log_likelihood(drawn[inside]) - fitted.log_over_prior(drawn[inside])
+    taken = (made.log_likelihood - fitted.log_over_prior(made.theta))[:, None]
     return _with_bridged_evidence(made, clouds, log_weight, taken), {}
 
 
@@ -370,7 +368,7 @@ def _searched_for_missed_peaks(posing: Posing, n: int, made: Climb, peak: Peak, 
         return made
     problem = posing.problem(n)
     density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_PILOTS)
-    share = missed_about(problem, density, made.theta, made.log_z, n_draws=_N_WEIGHED, rng=rng)
+    share = share_missed_about(problem, density, made.theta, made.log_z, n_draws=_N_WEIGHED, rng=rng)
     if share < _MISSED:
         return made
     higher = peak.log_likelihood - float(made.log_likelihood.max())

@@ -9,8 +9,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.inference import SensorProblem
 
-__all__ = ["LoneResponses", "light_of"]
-
 
 @dataclass(frozen=True, eq=False)
 class LoneResponses:

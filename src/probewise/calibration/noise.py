@@ -10,8 +10,6 @@ from scipy.special import gammainc, gammaincinv
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, ShapeError
 
-__all__ = ["ScanNoise", "draw_sd", "noise_by_scan", "pooled_sd"]
-
 
 @dataclass(frozen=True)
 class ScanNoise:

@@ -12,8 +12,6 @@ from probewise.calibration.climb import Climb, Rung
 from probewise.calibration.posing import Posing
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 
-__all__ = ["Found", "Progress", "Search", "report_of", "search_order"]
-
 Progress = Callable[[int, RoundSummary | Rung], None]
 
 _N_DRAWS = 8000

@@ -17,8 +17,6 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration.priors import SSFPrior
 
-__all__ = ["PeakCoordinates"]
-
 _MOST_LOG = 60.0
 
 

@@ -19,8 +19,6 @@ from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
 
-__all__ = ["Peak", "find_peaks"]
-
 _N_DRAWS = 1500
 # Starts to two Gaussians, and to more; by the prior, by a split of the peak below, by one added to it.
 _STARTS, _FEWER_STARTS = (12, 14, 6), (7, 8, 3)
@@ -85,7 +83,7 @@ def _prior(problem: SensorProblem) -> SSFPrior:
 
 
 def _split_gaussian(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Split one Gaussian of each into two that keep its light, centre and covariance, (n, 6 N) -> (n, 6 N + 6)."""
+    """Split one Gaussian of each into two that keep its light, centre and covariance, (n, 6 N + 2) -> (n, 6 N + 8)."""
     m = len(theta)
     g = theta[:, :-2].reshape(m, -1, 6)
     rows, which = np.arange(m), rng.integers(g.shape[1], size=m)
@@ -111,7 +109,7 @@ def _split_gaussian(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
 
 
 def _with_lone_gaussian(prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Add a Gaussian that holds a fifth of the light of the first, or less, (n, 6 N), (n, 6) -> (n, 6 N + 6)."""
+    """Add a Gaussian that holds a fifth of the light of the first, or less, (n, 6 N + 2), (n, 6) -> (n, 6 N + 8)."""
     one, first = lone.copy(), theta[:, :6]
     light = first[:, 0] / prior.amplitude_scale(first[:, 3] * first[:, 4] - first[:, 5] ** 2)
     one[:, 0] = light * rng.uniform(0.01, 0.2, len(one)) * prior.amplitude_scale(one[:, 3] * one[:, 4] - one[:, 5] ** 2)

@@ -16,8 +16,6 @@ from probewise.recordings import Recording
 from probewise.scene import KnownScene
 from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
-__all__ = ["Posing", "problem_for"]
-
 
 @dataclass(frozen=True, eq=False)
 class Posing:

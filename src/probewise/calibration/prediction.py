@@ -17,8 +17,6 @@ from probewise.recordings import Plan, Prediction, Recording
 from probewise.recordings.plan import require_described, require_plan
 from probewise.scene import KnownScene
 
-__all__ = ["predict"]
-
 # Numbers held in memory by one block of samples: about 30 MB.
 _BLOCK = 4_000_000
 

@@ -25,8 +25,6 @@ from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
 from probewise.recordings import Uniform as UniformPattern
 from probewise.scene import KnownScene
 
-__all__ = ["PriorRow", "SSFPrior", "ScanGeometry", "blind_axis_rad", "default_prior", "paper_prior", "scan_geometry"]
-
 _MAX_CORRELATION = 0.98
 _SAME_AXIS = 0.01  # chord of the doubled angle; it equals 0.3 degrees
 _TINY = float(np.finfo(float).tiny)
@@ -69,6 +67,8 @@ class SSFPrior:
         That unit, mm^2; if `None`, `amplitude` is the prior of a itself, as in the paper.
     max_correlation
         Largest abs(C) / sqrt(A B), below 1.
+    reasons
+        Why each bound is as it is, for the report: pairs of `offset_mm`, `precision` or `levels` and words.
     """
 
     n_gaussians: int

@@ -24,8 +24,6 @@ from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
 from probewise.priors import Uniform
 
-__all__ = ["JumpProposal", "Reference", "has_reference"]
-
 # Share of the new Gaussians that lie near one of the others, and how near: of the cube's side, in precision and
 # correlation; in place, by the other's own width.
 _NEAR = 0.25
@@ -127,7 +125,7 @@ class Reference:
             JumpProposal(1.0 - _ADDED - _SPLIT, self.with_compensated, self.uncompensated),
         )
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+    def log_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
         parts = np.empty((len(self.proposals), len(theta)))
         for part, proposal in zip(parts, self.proposals, strict=True):

@@ -23,8 +23,6 @@ from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT, log_sigma_integral
 
-__all__ = ["Removal", "bridged"]
-
 _Sums: TypeAlias = tuple[FloatArray, FloatArray, FloatArray]
 
 _AT_ONCE = 400_000

@@ -17,8 +17,6 @@ from probewise.calibration.around_peak import PeakDensity
 from probewise.calibration.climb import KnownDensity
 from probewise.calibration.priors import SSFPrior
 
-__all__ = ["SeededReference"]
-
 _SHARE = 0.3
 
 
@@ -45,11 +43,11 @@ class SeededReference:
         """Of N Gaussians."""
         return self.reference.prior
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+    def log_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
         each = math.log(_SHARE / len(self.peaks)) + self.log_z_below
-        parts = [each + peak.log_likelihood(theta) for peak in self.peaks]
-        return np.asarray(logsumexp([math.log(1.0 - _SHARE) + self.reference.log_likelihood(theta), *parts], axis=0))
+        parts = [each + peak.log_over_prior(theta) for peak in self.peaks]
+        return np.asarray(logsumexp([math.log(1.0 - _SHARE) + self.reference.log_over_prior(theta), *parts], axis=0))
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw one for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""

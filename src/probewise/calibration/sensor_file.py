@@ -16,7 +16,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind, require_path
-from probewise._posterior_samples import MIN_SAMPLES, require_absent, require_samples
+from probewise._posterior_samples import require_absent, require_samples
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -40,17 +40,6 @@ from probewise.sensor import (
     mixture_names,
     mixture_of_field,
 )
-
-__all__ = [
-    "BOUND_TO_SCANS",
-    "FORMAT",
-    "MIN_SAMPLES",
-    "FittedSensor",
-    "OrderEvidence",
-    "read_sensor",
-    "require_sensor",
-    "write_sensor",
-]
 
 T = TypeVar("T")
 

@@ -51,7 +51,7 @@ class SharingDensity:
         """Of N Gaussians."""
         return self.space.prior
 
-    def log_likelihood(self, theta: FloatArray) -> FloatArray:
+    def log_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log density over the prior's sorted one, (n, 6 N + 2) -> (n,)."""
         x = self.space.enter(theta)
         return np.asarray(self.one.log_density(x) - self.space.leave(x)[1])
@@ -67,5 +67,5 @@ class SharingDensity:
         there = self.draw(here, rng=rng)
         log_drawn = np.full(len(here), -np.inf)
         rows = np.flatnonzero(np.isfinite(there).all(axis=1))
-        log_drawn[rows] = self.log_likelihood(here[rows]) - self.log_likelihood(there[rows])
+        log_drawn[rows] = self.log_over_prior(here[rows]) - self.log_over_prior(there[rows])
         return there, log_drawn

@@ -9,8 +9,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.sensor import Footprint, footprint_of
 
-__all__ = ["Quantity", "ssf_quantities"]
-
 
 @dataclass(frozen=True)
 class Quantity:

@@ -18,8 +18,6 @@ from probewise.calibration.posing import Posing
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested import NestedResult, run
 
-__all__ = ["missed", "share_apart"]
-
 _LEAST_LIVE, _LIVE_PER_PARAM = 50, 4
 # One false alarm in 30,000 where the errors are normal.
 _N_ERRORS = 4.0
@@ -28,7 +26,7 @@ _MISSED = 0.2
 _N_SAMPLES, _N_OWN, _N_OTHERS = 300, 500, 2000
 
 
-def missed(
+def part_missed(
     posing: Posing, n: int, climbed: Climb, *, rng: np.random.Generator, progress: Progress | None = None
 ) -> str:
     """Say in words what a climb missed; empty where a search of the prior vouches for it.
@@ -78,7 +76,7 @@ def share_apart(known: FloatArray, asked: FloatArray, *, rng: np.random.Generato
     Parameters
     ----------
     known
-        Samples in coordinates, (n, d), cloud after cloud: the first tenth or so is independent of the rest.
+        Samples in coordinates, (n, d), cloud after cloud: the first 500 are held against 2,000 of the others.
     asked
         Those that are asked about, (m, d).
     rng

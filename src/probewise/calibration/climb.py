@@ -297,18 +297,10 @@ def climb(
         overlap = min(overlap, share)
         if told is not None:
             told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
-    kept = []
-    # A reference that is far from the posterior is forgotten late.
-    n_more *= len(temperatures) - 1
-    keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
+    kept = [now]
     if temperatures[-1] == 1.0:
-        for k in range(1, n_more + 1):
-            now, _ = _moved_along_differences(now, partial(known, beta=1.0), 1.0, rng)
-            if k % _AFRESH == 0:
-                now = _moved_afresh(now, partial(known, beta=1.0), reference, space, 1.0, rng)
-            if k in keep:
-                kept.append(now)
-    kept = kept or [now]
+        # A reference that is far from the posterior is forgotten late.
+        kept = _settled(now, partial(known, beta=1.0), reference, space, n_more * (len(temperatures) - 1), rng)
     x = np.stack([cloud.x.reshape(n_clouds, n, -1) for cloud in kept], axis=1)
     theta, _ = space.leave(x.reshape(-1, x.shape[-1]))
     log_likelihood = np.stack([cloud.log_likelihood.reshape(n_clouds, n) for cloud in kept], axis=1)
@@ -326,6 +318,26 @@ def climb(
         if overlap >= _LEAST_OVERLAP
         else (f"two temperatures have {overlap:.1%} of the particles in common",),
     )
+
+
+def _settled(
+    now: _Cloud,
+    known: Callable[[FloatArray], _Cloud],
+    reference: KnownDensity,
+    space: Coordinates,
+    n_more: int,
+    rng: np.random.Generator,
+) -> list[_Cloud]:
+    """Move particles of the posterior so many times; keep `N_SNAPSHOTS` of the last half."""
+    keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
+    kept = []
+    for k in range(1, n_more + 1):
+        now, _ = _moved_along_differences(now, known, 1.0, rng)
+        if k % _AFRESH == 0:
+            now = _moved_afresh(now, known, reference, space, 1.0, rng)
+        if k in keep:
+            kept.append(now)
+    return kept
 
 
 def _log_evidence_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:

@@ -39,7 +39,8 @@ _LOG_ROOT_2PI = 0.5 * float(np.log(2.0 * np.pi))
 class Answer:
     """The answer to one Gaussian more.
 
-    `shift` of the coordinates per share of the light, (n, d); `mean` of the share and 1.2 times its first-order `sd`, (n,).
+    `shift` of the coordinates per share of the light, (n, d); `mean` of the share, and `sd`, 1.2 times that of first
+    order, (n,).
     """
 
     shift: FloatArray

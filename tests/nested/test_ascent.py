@@ -18,9 +18,9 @@ from probewise.nested.sampler import search
 
 @dataclasses.dataclass(frozen=True)
 class Cross:
-    """The Student cross in 8-D; a `fence` keeps hypotheses within a distance of its middle along all arms but one."""
+    """The Student cross in 8-D, of which only what lies further out than `fence` along the first arm is likely."""
 
-    fence: float = 0.0
+    fence: float
 
     @property
     def known(self) -> problems.Known:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import combinations
 from typing import Any, cast
 
@@ -54,3 +55,14 @@ def test_of_one_wave_two_are_likelier_than_it_beside_another_effect_and_all_sums
     assert odds.log_mean(("wave", "wave~again")) > odds.log_mean(("drift", "wave"))
     as_any = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twofold=frozenset({"wave"}))
     assert as_any.log_mean(("wave", "wave~again")) == as_any.log_mean(("drift", "wave"))
+
+
+def test_every_noise_sums_to_one_beside_an_effect_and_alone():
+    """One departure, of the noise or of the law, is likelier than one of each."""
+    odds = replace(SimulatorApparatus.prior_odds(cast(Any, None), {}), n_noises=5)
+    for alone in (False, True):
+        sets = (names for k in range(4) for names in combinations("abcde", k))
+        assert sum(math.exp(odds.log_noise(names, alone=alone)) for names in sets) == pytest.approx(1.0)
+    assert math.exp(odds.log_noise((), alone=True)) == pytest.approx(0.8)
+    assert odds.log_noise(("a",), alone=True) > odds.log_noise(("a",))
+    assert PriorOdds().log_noise(("a",), alone=True) == PriorOdds().log_noise(("a",))

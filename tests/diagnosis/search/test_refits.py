@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -12,11 +13,13 @@ from probewise.diagnosis.search import search as searching
 from probewise.diagnosis.search.noises import Noises
 from probewise.diagnosis.search.nulls import fit_nulls
 from probewise.diagnosis.search.refits import Refits, _amounts, is_significant
+from probewise.diagnosis.search.searched import Evidences, posterior_of
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.twins import are_proportional
 from probewise.diagnosis.system.diagnose import prepare_system
 from probewise.effects import CorrelatedNoise, Extent, RandomWalk
 from probewise.priors import LogUniform, Uniform
+from probewise.progress import silent
 from probewise.systems import RunTable, Simulator
 
 _N = 120
@@ -139,3 +142,20 @@ def test_a_slope_that_differs_from_run_to_run_is_fitted_as_well_as_one_straight_
     best = y - lines @ np.linalg.lstsq(lines, y)[0]
     assert np.sum(found.residuals**2) == pytest.approx(np.sum(best**2), rel=0.02)
     assert np.abs(found.z).max() < 3.0
+
+
+def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
+    """Eight pairs promise 500 nats by screening, of which six are refitted and keep nothing: the others fall, too."""
+    state = _state(prepared)
+    promised = state.null.log_z + 500.0
+    pairs = list(itertools.combinations(sorted(state.effects), 2))[:8]
+    state.about_null |= {(tuple(sorted(pair)), ()): promised for pair in pairs}
+
+    def posterior():
+        return posterior_of(Evidences(state.candidates, state.screened()), state.prior, certain=(), n_forms=1)
+
+    searching._refit_late(state, posterior, silent)
+    left = {names: value for (names, _), value in state.screened().items() if names not in state.undetected}
+    assert len(left) >= 2
+    assert all(value < max(c.log_z for c in state.candidates.values()) + 3.0 for value in left.values())
+    assert state.optimism > 400

@@ -82,6 +82,16 @@ def test_the_prior_is_restricted_to_so_many_bright_gaussians() -> None:
     assert count_bright(np.array([[1.0, 0, 0, 1, 1, 0, FAINT, 0, 0, 1, 1, 0, 0, 1]])).tolist() == [1]
 
 
+def test_what_is_not_sorted_by_mass_is_outside_the_prior() -> None:
+    asked = space(3)
+    x = asked.enter(drawn(asked, 20, 7))
+    heavier, swapped = x.copy(), x.copy()
+    heavier[:, 6] = 0.1
+    swapped[:, [6, 12]] = swapped[:, [12, 6]]
+    assert (asked.leave(heavier)[1] == -np.inf).all()
+    assert (asked.leave(swapped)[1] == -np.inf).all()
+
+
 def test_a_sharing_density_keeps_the_whole_of_the_gaussians_below() -> None:
     """All of its draws share the light; centre and levels scatter about those below, twice as wide or more."""
     asked, one = space(2, n_bright=2), space(1)

@@ -232,6 +232,8 @@ def climb(
         Source of randomness.
     n_steps
         Moves of each particle at each temperature.
+    space
+        Coordinates of the particles, and the prior that they are held to; default: those of the prior.
     n_more
         Moves of each particle once the posterior is reached; samples are kept from the last half of them.
     least_effective

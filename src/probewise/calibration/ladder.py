@@ -1,9 +1,10 @@
 """Fit one order after another: from the peak of its likelihood, or from the posterior of the order below.
 
 Where one Gaussian more raises the likelihood much, its posterior lies about the highest peak, and particles start from
-a density fitted there. Where it does not, they start from the posterior below with one more Gaussian added, and the two
-evidences are bridged by taking Gaussians away and adding them. At every order ascents from all over the prior look for
-a peak that the particles missed; a search of the whole prior vouches for the order that is chosen.
+a density fitted there. Where it does not, each part of the posterior, by its number of bright Gaussians, is reached by
+itself: from that part of the order below with a faint Gaussian more, whose two evidences are bridged by taking
+Gaussians away and adding them; or, where all are bright, from a wide density. At every order ascents from all over the
+prior look for a peak that the particles missed; a search of the whole prior vouches for the order that is chosen.
 """
 
 from __future__ import annotations

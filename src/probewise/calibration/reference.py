@@ -1,7 +1,7 @@
-"""A density of N Gaussians to start from: the posterior of N - 1 with one more Gaussian, lighter than they are.
+"""A density of N Gaussians to start from: a part of the posterior of N - 1 with one more, faint Gaussian.
 
 The new one is added to the others as they are; or added while the others shift to compensate for it; or taken out of
-the first so that light, centre and covariance of the two stay (split and merge moves: Richardson & Green 1997).
+a bright one so that light, centre and covariance of the two stay (split and merge moves: Richardson & Green 1997).
 """
 
 from __future__ import annotations
@@ -74,17 +74,18 @@ class JumpProposal:
 
 @dataclass(frozen=True)
 class Reference:
-    """The posterior of N - 1 Gaussians with one more, lighter than each of them.
+    """A part of the posterior of N - 1 Gaussians with one more, lighter than each of them, and faint.
 
     Gaussians have no labels, so they are sorted by mass here as in `MomentCoordinates`, the lightest last. With p_N
-    the prior of N unsorted Gaussians, L the likelihood and Z the evidence of N - 1, the density mixes three ways:
+    the prior of N unsorted Gaussians, L the likelihood and Z the evidence of the part of N - 1, the density mixes three
+    ways:
 
-    - One is added. With m the least mass of the N - 1 in the prior's unit and r the new one's density over its prior's
-      below m: N! p_N L r / (N m Z). r mixes Gaussians of the prior, light ones more often, and some near one of the
-      others.
+    - One is added. With m the most mass that it may have (the least of the N - 1, or `FAINT` of the greatest), in the
+      prior's unit, and r the new one's density over its prior's below m: N! p_N L r / (N m Z). r mixes Gaussians of the
+      prior, light ones more often, and some near one of the others.
     - One is added and the others shift, by an amount that depends on the new one and the masses alone, so that volumes
       stay; see `Compensation`.
-    - The first is split. The moments of the first (mass, mass times centre, mass times second moment) lose those of
+    - A bright one is split. Its moments (mass, mass times centre, mass times second moment) lose those of
       the new one, which lies near it; at a fixed new one that is a shift, so volumes of moments stay.
 
     All integrate to one, so that the evidence of N over that of N - 1 is the mean of posterior density over

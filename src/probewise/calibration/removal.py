@@ -1,9 +1,9 @@
 """The evidence of N Gaussians over that of N - 1, by taking one of the N away or adding one.
 
 With one Gaussian's light at nothing, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
-posterior tell of the other's evidence: from N, take one Gaussian away; from N - 1, add one drawn from the prior. Its
-light is integrated out, which one predicted curve allows: residuals are linear in its share of the light. Both kinds
-of samples meet in a bridge (Bennett 1976).
+posterior tell of the other's evidence: from N, take one faint Gaussian away; from N - 1, add one drawn from the prior.
+Its light is integrated out, which one predicted curve allows: residuals are linear in its share of the light. Both
+kinds of samples meet in a bridge (Bennett 1976).
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _N_ROOT, _ROOT = 60, 1e-7
 
 @dataclass(frozen=True, eq=False)
 class Removal:
-    """Mean likelihood over the light of one Gaussian, over the likelihood without it.
+    """Mean likelihood over the light of one faint Gaussian, over the likelihood without it.
 
     Parameters
     ----------
@@ -44,6 +44,8 @@ class Removal:
         Of N Gaussians, 2 or more, light uniform; see `has_reference`.
     alone
         Problem of one Gaussian over the same recording.
+    n_bright
+        Number of bright Gaussians, below N.
     """
 
     prior: SSFPrior

@@ -1,6 +1,6 @@
-"""A density to start from in two parts: from the order below, and about the highest peak.
+"""A density to start from in two parts: another density, such as that from the order below, and about peaks.
 
-The order below tells of most of a posterior, but its draws may leave out a peak that is narrow. A part of the
+The other density tells of most of a posterior, but its draws may leave out a peak that is narrow. A part of the
 particles starts about the peaks that least squares found, so that each is seen where it holds a part of the evidence.
 """
 
@@ -27,11 +27,11 @@ class SeededReference:
     Parameters
     ----------
     reference
-        Made from the posterior of N - 1 Gaussians.
+        The density that is mixed with them, of N Gaussians.
     peaks
         Densities about the highest peaks of N, one or more.
     log_z_below
-        Natural log of the evidence of N - 1.
+        What `reference` counts beside its density: natural log of the evidence of N - 1, or 0.
     """
 
     reference: KnownDensity

@@ -66,6 +66,8 @@ class WholeCoordinates:
         """Map coordinates to parameters, (n, 6 N + 2); also return the prior's log density, (n,)."""
         y = x.copy()
         g = kinds_of(y)
+        # Sorted by mass; a clipped ratio must not pass for one that is.
+        sorted_by_mass = (g[0, 1:2] <= 0.0).all(axis=0) & (g[0, 2:] <= g[0, 1:-1]).all(axis=0)
         g[0, 1:] = g[0, 1:].clip(-100.0, 0.0)
         g[3:5] = g[3:5].clip(-100.0, 100.0)
         ratio = np.exp(g[0, 1:])
@@ -84,7 +86,7 @@ class WholeCoordinates:
         g[1:3, 0] = heaviest * (g[1:3, 0] + (ratio * g[1:3, 1:]).sum(axis=1))
         theta, log_density = self._moments.leave(y)
         log_density += 2.0 * np.log(heaviest) - 5.0 * np.log(first) + _log_volume(whole) - _log_volume(own)
-        real &= np.isfinite(log_density)
+        real &= sorted_by_mass & np.isfinite(log_density)
         if self.n_bright is not None:
             real &= 1 + (ratio > FAINT).sum(axis=0) == self.n_bright
         return theta, np.where(real, log_density, -np.inf)

@@ -108,7 +108,7 @@ def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
 
 
 def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
-    free = FreeForm.about(default_sensor(EXTENT, 1))
+    free = FreeForm.from_one_gaussian(default_sensor(EXTENT, 1))
     rng = np.random.default_rng(0)
     z = 0.02 * rng.normal(size=(4000, free.n_params))
     theta = free.theta(z)

@@ -57,7 +57,7 @@ class SensorAndShape:
         """
         known = sensor_of(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
-        found = [_likely(cls(known, member, np.empty((0, 0))), recording, rng) for member in members]
+        found = [_likely_shapes(cls(known, member, np.empty((0, 0))), recording, rng) for member in members]
         best = min(range(len(members)), key=lambda k: found[k][0])
         return cls(known, members[best], found[best][1])
 
@@ -158,7 +158,7 @@ class _ShapeAmongPatterns:
         return {name: known.get(name, unknown) for name in self.plan.pattern_names}
 
 
-def _likely(null: SensorAndShape, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
+def _likely_shapes(null: SensorAndShape, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
     """Search for fitting shapes with the prior-mean sensor; return the best sum of squares and the best four shapes.
 
     Random draws of the prior, refined repeatedly about the best ones.

@@ -8,7 +8,7 @@ import pytest
 
 from probewise.diagnosis import audit_plan, join
 from probewise.diagnosis.audit.detectability import Expected, PlanTemplates, ProjectedTemplates
-from probewise.diagnosis.audit.plan_audit import _cured_at
+from probewise.diagnosis.audit.plan_audit import _steps_that_cure
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.light_sensor.commands import commands
 from probewise.diagnosis.light_sensor.scheduling import append_plans
@@ -105,8 +105,8 @@ def test_what_a_step_behind_the_last_cure_spoils_is_cured_all_the_same():
     detectability = {"lag": "aaff", "tilt": "aafa", "halo": "afaa", "glint": "ffff", "edge": "aaaa"}
     words = {"a": "aliased", "f": "fine"}
     steps = [[SimpleNamespace(name=n, detectability=words[of[k]]) for n, of in detectability.items()] for k in range(4)]
-    assert _cured_at(steps) == {"lag": 2, "tilt": 2}
-    assert _cured_at(steps[:1]) == {}
+    assert _steps_that_cure(steps) == {"lag": 2, "tilt": 2}
+    assert _steps_that_cure(steps[:1]) == {}
 
 
 @pytest.mark.slow

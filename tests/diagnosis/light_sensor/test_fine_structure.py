@@ -28,7 +28,7 @@ def fitted(recording: Recording, *, free: bool = True) -> Fit:
     one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law.at_least(NOISE_SD))
     if not free:
         return one
-    form = FreeForm.about(sensor)
+    form = FreeForm.from_one_gaussian(sensor)
     start = form.start_from(one.z)[0]
     return fit(Model(form, (), recording.plan), recording, start, law.at_least(NOISE_SD))
 

@@ -22,7 +22,7 @@ PLAN = two_way_plan()
 
 @pytest.mark.slow
 def test_a_sensor_of_free_form_is_written_read_and_driven_by():
-    free = FreeForm.about(default_sensor(Extent(10.0, 60.0, PLAN), 1))
+    free = FreeForm.from_one_gaussian(default_sensor(Extent(10.0, 60.0, PLAN), 1))
     rng = np.random.default_rng(5)
     z = 0.3 * rng.standard_normal(free.n_params) + 0.02 * rng.standard_normal((500, free.n_params))
     chain = free.chain(PLAN, (), n_nodes=16)

@@ -76,7 +76,7 @@ def test_the_time_of_a_weighing_grows_with_its_live_points_and_its_hypotheses(st
     leaders = thorough._leading_hypotheses(stepped)
     few, many = (thorough._estimated_minutes(leaders, stepped, n, rng=np.random.default_rng(0)) for n in (100, 10_000))
     assert few[0] < few[1] < many[1]
-    assert thorough._in_words((3.2, 14.1)) == "3 to 15 minutes"
+    assert thorough._minutes_in_words((3.2, 14.1)) == "3 to 15 minutes"
 
 
 @pytest.mark.slow
@@ -166,7 +166,7 @@ def moved(stepped, monkeypatch, gap, doubts=()):
         own = gap if candidate.names else 0.5
         return Weighing(candidate.names, candidate.n_gaussians, 0.0, own, 0.01, doubts)
 
-    monkeypatch.setattr(thorough, "_weigh", weigh)
+    monkeypatch.setattr(thorough, "_weigh_by_nested_sampling", weigh)
     return weigh_thoroughly(stepped, rng=np.random.default_rng(0))
 
 

@@ -31,7 +31,7 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
     probabilities |= {names: p for names, p in by_mean.items() if names and names != ("unknown",)}
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
-    found = _leading(searched, null, {names: probabilities[names] for names in ranked})
+    found = _leading_fits(searched, null, {names: probabilities[names] for names in ranked})
     prepared = searched.prepared
     sd, plan, apparatus = found[0].sd, prepared.recording.plan, prepared.apparatus
     as_calibrated = f"{apparatus.words.null} as calibrated"
@@ -47,7 +47,7 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     return next((asked for asked in wanted if asked is not None), None)
 
 
-def _leading(searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]) -> list[WeighedFit]:
+def _leading_fits(searched: Searched, null: WeighedFit, ranked: Mapping[Names, float]) -> list[WeighedFit]:
     """Return the fits of the leading hypotheses on the mean, by their probabilities, the most probable first."""
     found: list[WeighedFit] = []
     for names, probability in ranked.items():

@@ -174,7 +174,7 @@ class PlanAudit(ShowsItself):
         return sum(cure.minutes for cure in self.cures)
 
     def summary(self) -> str:
-        """Return a plain-text summary."""
+        """Return a plain-text summary of the audit."""
         lines = [f"{len(self.plan)} readings in {count_of(self.plan.scan_names, self.words.run)}; {self.assumed}"]
         lines += _wrapped_list("fine", [e.name for e in self.seen_as("fine")])
         lines += _wrapped_list("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
@@ -264,7 +264,7 @@ def audit_plan(
         progress("judging the plan with its cures", k, len(chosen))
         current = append_plans(current, [command.plan])
         steps.append(audits_and_cosines(PlanTemplates.of(expected, current, effects), effects, unit)[0])
-    cured = _cured_at(steps)
+    cured = _steps_that_cure(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
         Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
@@ -273,7 +273,7 @@ def audit_plan(
     return PlanAudit(plan, said, before, cosines, cures, steps[n_kept])
 
 
-def _cured_at(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
+def _steps_that_cure(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
     """Return, for each effect cured by the steps, the step from which it remains fine.
 
     An effect may be fine at some step and not after a later one.
@@ -315,7 +315,7 @@ def audit_recorded(
     if sensor is not None:
         null = sensor_of(sensor)
     elif is_free_form(own[:, :-2]):
-        null = FreeForm.about(default_sensor(extent, 1))
+        null = FreeForm.from_one_gaussian(default_sensor(extent, 1))
     else:
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)

@@ -37,7 +37,7 @@ class Bank:
     columns: FloatArray
     widths: IntArray
     labels: tuple[str, ...]
-    _whitened: dict[tuple[bytes, ...], _Whitened] = field(default_factory=dict, repr=False)
+    _whitened: dict[tuple[bytes, ...], _WhitenedTemplates] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> Bank:
@@ -92,7 +92,7 @@ class Bank:
             members, at = self._of_width(width)
             absorbed = taken[:, at].transpose(1, 0, 2)
             left = products - absorbed.transpose(0, 2, 1) @ absorbed
-            gain, axes = _principal(left)
+            gain, axes = _eigenvectors_of_grams(left)
             gain = np.where(gain > _ABSENT * n, gain, 0.0)
             turned = axes.transpose(0, 2, 1) @ along[at]
             explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
@@ -111,7 +111,7 @@ class Bank:
         members = np.flatnonzero(self.widths == width)
         return members, self._first_columns[members, None] + np.arange(width)
 
-    def _scaled_under(self, law: NoiseLaw) -> _Whitened:
+    def _scaled_under(self, law: NoiseLaw) -> _WhitenedTemplates:
         """Whiten all templates and scale each to unit rms."""
         key = law.linear
         if key in self._whitened:
@@ -128,11 +128,11 @@ class Bank:
             for width in map(int, np.unique(self.widths)):
                 blocks = whitened[:, self._of_width(width)[1]].transpose(1, 0, 2)
                 products[width] = blocks.transpose(0, 2, 1) @ blocks
-            self._whitened[key] = _Whitened(whitened, products)
+            self._whitened[key] = _WhitenedTemplates(whitened, products)
         return self._whitened[key]
 
 
-def _principal(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _eigenvectors_of_grams(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return eigenvalues (n, width) and eigenvectors (n, width, width) of Gram matrices (n, width, width).
 
     One or two columns, nearly all templates, have them in closed form (Jacobi's rotation).
@@ -153,7 +153,7 @@ def _principal(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Whitened:
+class _WhitenedTemplates:
     """All templates, whitened, (n_points, n_columns), and by width their Gram matrices, (n, width, width)."""
 
     templates: FloatArray

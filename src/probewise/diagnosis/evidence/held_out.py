@@ -111,7 +111,7 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
     miss = recording.readings[asked] - predicted
     if of_its_own.any():
-        return _one_after_another(
+        return _sequential_log_densities(
             own, miss, slopes, without.z - about, np.asarray(np.linalg.inv(curvature), dtype=np.float64), sigma_2
         )
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
@@ -122,7 +122,7 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     return np.asarray(np.logaddexp(narrow, wide) * own.kept)
 
 
-def _one_after_another(
+def _sequential_log_densities(
     law: NoiseLaw, miss: FloatArray, slopes: FloatArray, mean: FloatArray, covariance: FloatArray, sigma_2: float
 ) -> FloatArray:
     """Return the log density of each reading given those before it, (n,); `mean` and `covariance` are updated.

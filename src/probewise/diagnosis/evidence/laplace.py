@@ -124,7 +124,7 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) ->
         variance = np.maximum(squares() / n_points, least)
         curvature = jj / variance[:, None, None] + np.eye(p)
         steps = _newton_steps(curvature, jr / variance[:, None] - found.z)
-    fit_and_prior = _peak(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
+    fit_and_prior = _laplace_terms(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
     rss = squares()
     variance = np.maximum(rss / n_points, least)
     misfit = 0.5 * n_points * np.log(variance) + 0.5 * rss / variance
@@ -148,7 +148,7 @@ def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> Float
         steps += _newton_steps(curvature, downhill.T).T
     left = residual - slopes @ steps
     sigma = tail.scale(left, n_points, floor=least, start=sigma)
-    fit_and_prior = _peak((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
+    fit_and_prior = _laplace_terms((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
     scale = 0.5 * np.log(2 * math.pi / tail.scale_curvature(left, sigma, n_points))
     return np.asarray(fit_and_prior - tail.minus_log_likelihood(left, sigma, n_points) + scale)
 
@@ -163,7 +163,7 @@ def _newton_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
         return np.asarray(np.linalg.solve(curvature + ridge, downhill[:, :, None])[:, :, 0])
 
 
-def _peak(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
+def _laplace_terms(z: FloatArray, curvature: FloatArray, n_points: int | IntArray) -> FloatArray:
     """Return Laplace's approximation for modes at z (n_laws, n_params), with the constant of the densities."""
     widths = -0.5 * np.linalg.slogdet(curvature)[1]
     return np.asarray(widths - 0.5 * np.sum(z**2, axis=1) - 0.5 * n_points * math.log(2 * math.pi))

@@ -48,7 +48,7 @@ def score_pairs(
     turned = np.concatenate([turned, np.zeros((1, turned.shape[1]))])
     own = dict(zip(entries, np.split(turned, np.cumsum(widths)[:-1], axis=1), strict=True))
     asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
-    both = [_side_by_side(own[first], own[second]) for first, second in asked]
+    both = [_joined_templates(own[first], own[second]) for first, second in asked]
     blocks = Blocks.of_projected(np.concatenate(both, axis=1), [c.shape[1] for c in both], [""] * len(both), problem)
     together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_points)[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
@@ -62,7 +62,7 @@ def score_pairs(
     return out
 
 
-def _side_by_side(first: FloatArray, second: FloatArray) -> FloatArray:
+def _joined_templates(first: FloatArray, second: FloatArray) -> FloatArray:
     """Join two templates of unit rms into one of unit rms."""
     widths = first.shape[1], second.shape[1]
     scaled = [t * math.sqrt(w / sum(widths)) for t, w in zip((first, second), widths, strict=True)]

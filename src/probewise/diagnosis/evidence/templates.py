@@ -86,13 +86,15 @@ def effect_templates(
     else:
         # Variants bound to the same scans and patterns differ only in their priors and share one prediction.
         columns = []
-        for _, group in itertools.groupby(range(len(choice)), key=lambda at: _bound_to(variants[choice[at]])):
+        for _, group in itertools.groupby(
+            range(len(choice)), key=lambda at: _scans_and_patterns_of(variants[choice[at]])
+        ):
             at = list(group)
             columns += _predicted_changes(found, variants[choice[at[0]]], entries[at], usable)
     return EffectTemplates(tuple(columns), tuple(entries), variants, choice)
 
 
-def _bound_to(variant: NamedEffect[Any]) -> tuple[object, object]:
+def _scans_and_patterns_of(variant: NamedEffect[Any]) -> tuple[object, object]:
     return variant.scans, variant.patterns
 
 

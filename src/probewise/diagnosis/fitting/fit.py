@@ -31,7 +31,7 @@ def _points_about(z: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.concatenate([z[None, :], z + np.diag(steps)]), steps
 
 
-def _differentiated(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _value_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Convert predictions at these points (n_params + 1, n_points) to the one at z and slopes (n_points, n_params)."""
     return batch[0], (batch[1:] - batch[0]).T / steps
 
@@ -88,7 +88,7 @@ class Model:
     def jacobian(self, z: FloatArray, plan: Plan | None = None) -> tuple[FloatArray, FloatArray]:
         """Predict and differentiate at one point z (n_params,): (n_points,), (n_points, n_params)."""
         points, steps = _points_about(z)
-        return _differentiated(self.predict(points, plan), steps)
+        return _value_and_slopes(self.predict(points, plan), steps)
 
     def with_effect(self, effect: NamedEffect[Any]) -> Model:
         """Append an effect."""
@@ -172,7 +172,7 @@ def fits(
 
     If predictions broadcast, the fits run in parallel, in batches that fit a processor's cache.
     """
-    walks = [_walk(model, recording, start, law, max_steps, tolerance) for start in starts]
+    walks = [_minimise(model, recording, start, law, max_steps, tolerance) for start in starts]
     at_once = 1
     if model.sensor.in_bulk:
         at_once = max(_AT_ONCE // (len(_DAMPINGS) * (model.n_params + 1) * len(recording.readings)), 1)
@@ -191,7 +191,7 @@ def fits(
     return [found[k] for k in range(len(walks))]
 
 
-def _walk(
+def _minimise(
     model: Model, recording: Recording, start: FloatArray, law: NoiseLaw, max_steps: int, tolerance: float
 ) -> Generator[FloatArray, FloatArray, Fit]:
     """Minimise from one start: yields points to predict, (n, n_params), and is sent predictions, (n, n_points)."""
@@ -206,7 +206,7 @@ def _walk(
 
     def jacobian(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         points, steps = _points_about(z)
-        return _differentiated((yield points)[:, usable], steps)
+        return _value_and_slopes((yield points)[:, usable], steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
@@ -223,7 +223,7 @@ def _walk(
         variance = float(sigma[0]) ** 2 / law.information
         curvature = turned.T @ turned / variance + eye
         downhill = turned.T @ law.as_normal(whitened, sigma)[:, 0] / variance - z
-        tries = _steps(curvature, downhill)
+        tries = _damped_steps(curvature, downhill)
         if not len(tries):
             break
         expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
@@ -244,7 +244,7 @@ def _walk(
             break
         z, best = tries[at], float(values[at])
         if about:
-            predicted, slopes = _differentiated(all_predicted[at], about[at][1])
+            predicted, slopes = _value_and_slopes(all_predicted[at], about[at][1])
         else:
             predicted, slopes = yield from jacobian(z)
         if settled:
@@ -253,7 +253,7 @@ def _walk(
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)
 
 
-def _steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
+def _damped_steps(curvature: FloatArray, downhill: FloatArray) -> FloatArray:
     """Return the step for each damping, (n_solved, n_params).
 
     If readings are fitted exactly, the prior is lost in rounding and weakly damped systems may be singular; these are

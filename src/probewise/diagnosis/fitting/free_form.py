@@ -36,7 +36,7 @@ class FreeForm(CalibratedSensor):
     n_gaussians: int = field(default=N_FREE_FORM, init=False)
 
     @classmethod
-    def about(cls, one: SensorCoordinates) -> Self:
+    def from_one_gaussian(cls, one: SensorCoordinates) -> Self:
         """Build the prior from place and size of one Gaussian, with small weights of the free form."""
         factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
         factor[: one.n_params, : one.n_params] = one.factor

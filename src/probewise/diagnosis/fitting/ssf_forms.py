@@ -30,7 +30,7 @@ class SsfForms:
         """Return the free form, starting from the fit of one Gaussian."""
         one = found.model.sensor
         assert isinstance(one, SensorCoordinates)
-        free = FreeForm.about(one)
+        free = FreeForm.from_one_gaussian(one)
         return free, free.start_from(found.z)
 
     def one_more(self, found: Fit, order: int) -> Start:

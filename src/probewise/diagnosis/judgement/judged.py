@@ -213,7 +213,7 @@ def decide(
         if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
             return "cannot_tell", top
         return ("noise" if set(top) <= noise_names else "named"), top
-    of_class = _class_of(top, aliases)
+    of_class = _alias_class_of(top, aliases)
     if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
         return "cannot_tell", top
     if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
@@ -221,7 +221,7 @@ def decide(
     return ("noise" if set(top) <= noise_names else "named"), top
 
 
-def _class_of(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
+def _alias_class_of(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
     """Return a combination and those that differ from it by one effect swapped for its alias."""
     both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
     return {names} | {tuple(sorted({*names} - {name} | {other})) for name, other in both_ways if name in names}

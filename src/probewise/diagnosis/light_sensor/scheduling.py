@@ -75,7 +75,7 @@ def as_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
 
     Covariates that they lack, such as battery voltage, keep their last value of that plan.
     """
-    return _as_left(_joined_plan(scans), after)
+    return _with_last_known_covariates(_joined_plan(scans), after)
 
 
 def in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
@@ -86,10 +86,10 @@ def in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
     out: list[Scan] = []
     for scan in scans:
         out.append(_started_at(scan, start_after(out[-1].plan) if out else float(scan.plan.time_s[0])))
-    return _as_left(_joined_plan(out), after)
+    return _with_last_known_covariates(_joined_plan(out), after)
 
 
-def _as_left(plan: Plan, after: Plan) -> Plan:
+def _with_last_known_covariates(plan: Plan, after: Plan) -> Plan:
     """Fill covariates that cannot be commanded with their last values of the plan before."""
     read = {name: last_known(values) for name, values in after.covariates.items() if name not in COMMANDED}
     kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}

@@ -46,11 +46,11 @@ def target_swaps(plan: Plan) -> list[Scan]:
         across = _rotated_scan(_repeated_scan(plan, part.rows, f"across{part.suffix}"))
         out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
     edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
-    laid = (_laid_otherwise(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
+    laid = (_scans_over_moved_targets(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
     return [*out, *next(filter(None, laid), [])]
 
 
-def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
+def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     """List scans over an edge turned by 180 or 90 degrees or moved, and over stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
     beyond = _distance_inside(plan, scan, edge)
@@ -61,7 +61,7 @@ def _laid_otherwise(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     half_round = replace(edge, normal_rad=edge.normal_rad + math.pi, offset_mm=-edge.offset_mm)
     laid = [
         (f"{name}_half_round", f"turn pattern {name} by 180 degrees about its edge and scan it", once, half_round),
-        (f"{name}_quarter", f"turn pattern {name} and its scan by 90 degrees", *_both_turned(once, edge)),
+        (f"{name}_quarter", f"turn pattern {name} and its scan by 90 degrees", *_rotated_scan_and_edge(once, edge)),
     ]
     middle_mm = float(beyond.mean())
     for end in (-1.0, 1.0):
@@ -117,7 +117,7 @@ def _rotated_scan(scan: Plan) -> Plan:
     return replace(scan, x_mm=x_mm - (scan.y_mm - y_mm), y_mm=y_mm + (scan.x_mm - x_mm))
 
 
-def _both_turned(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane]:
+def _rotated_scan_and_edge(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane]:
     """Rotate a scan with the edge under it, at the same distance from the scan's middle."""
     normal_rad = edge.normal_rad + math.pi / 2
     x_mm, y_mm = scan.x_mm.mean(), scan.y_mm.mean()

@@ -88,7 +88,7 @@ class NoiseModel:
         """Return the nodes of all combinations of the effects, given predictions of the usable rows, (n_usable,)."""
         residuals = (self._readings - predicted) / self._relative_sd
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
-        sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._lattice / math.sqrt(12)) or 1.0
+        sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12)) or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
         rows = NoiseRows(predicted, sd, self.recording.plan.scan[self.recording.usable])
@@ -147,9 +147,9 @@ class NoiseModel:
         walk = at(level.walk) ** 2 * self._rows_on if np.any(level.walk) else np.zeros(0)
         log_extra = 0.0
         if lost_share > 0:
-            n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._cell, 1.0)
+            n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._lost_value_resolution, 1.0)
             # Each lost reading has that value to within a cell.
-            log_extra = n_lost * math.log(lost_share / self._cell)
+            log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
             log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
         return NoiseLaw(
@@ -174,12 +174,12 @@ class NoiseModel:
         return self.recording.relative_sd[self.recording.usable]
 
     @cached_property
-    def _cell(self) -> float:
+    def _lost_value_resolution(self) -> float:
         """Resolution of a lost reading's value, in reading units."""
-        return self._lattice or _FINE * rough_sd(self.recording) or 1e-12
+        return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
-    def _lattice(self) -> float:
+    def _rounding_step(self) -> float:
         """Rounding step of all readings, 0 if there is none."""
         return lattice_step(self._readings)
 

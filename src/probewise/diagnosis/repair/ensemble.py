@@ -127,11 +127,11 @@ def draw_models(
     elif judged.verdict in ("named", "cannot_tell") and fit.names:
         model = ensemble.averaged(fit, ensemble.likely(fit))
     elif not (judged.too_little or judged.withdrawn):
-        model = _left_open(ensemble, searched, test, best.noise)
+        model = _average_of_hypotheses(ensemble, searched, test, best.noise)
     return Drawn(samples if fit is null else ensemble.of(null), samples, model)
 
 
-def _left_open(ensemble: Ensemble, searched: Searched, test: GlobalTest, noise: Names) -> ModelSamples:
+def _average_of_hypotheses(ensemble: Ensemble, searched: Searched, test: GlobalTest, noise: Names) -> ModelSamples:
     """Average over hypotheses if none is stated: named ones by probability, and the null for the rest."""
     by_mean = searched.posterior.by_mean
     named = {names for _, names in searched.evidences.fits if not out_of_vocabulary(names)}

@@ -65,11 +65,14 @@ class Profiled:
         slopes = law(found.slopes)
         sd = max(float(law.scale(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.information)
         covariance = np.linalg.inv(slopes.T @ slopes / sd**2 + np.eye(len(found.z)))
-        tried = [cls._along(found, law, recording, at, covariance, float(sd)) for at in _nonlinear(found)]
+        tried = [
+            cls._along_coordinate(found, law, recording, at, covariance, float(sd))
+            for at in _nonlinear_coordinates(found)
+        ]
         return max((profile for profile in tried if profile is not None), key=lambda p: p._curvature, default=None)
 
     @classmethod
-    def _along(
+    def _along_coordinate(
         cls, found: Fit, law: NoiseLaw, recording: Recording, at: int, covariance: FloatArray, sd: float
     ) -> Self | None:
         nodes = found.z[at] + _NODES * np.sqrt(covariance[at, at])
@@ -99,14 +102,14 @@ class Profiled:
                 tried = state[0].copy()
                 tried[:, rest] += np.clip(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0], -1.0, 1.0)
                 tried = np.clip(tried, -FARTHEST, FARTHEST)
-                state = _better(state, (tried, *sliced(tried)))
+                state = _higher_slices(state, (tried, *sliced(tried)))
             # A slice that went astray begins again from its neighbour's fit, towards the middle.
             towards = np.arange(n) - np.sign(np.arange(n) - int(np.argmax(state[1])))
             tried = state[0][towards]
             tried[:, at] = nodes
-            state = _better(state, (tried, *sliced(tried)))
+            state = _higher_slices(state, (tried, *sliced(tried)))
         z, height, joined = state
-        there = _about_the_best(height)
+        there = _slices_about_best(height)
         if there.sum() < len(_NODES) // 2:
             return None
         curvature, _ = _normal_equations(joined[there], z[there][:, rest], sd)
@@ -125,13 +128,13 @@ class Profiled:
         return float(np.max(np.abs(fall - 0.5 * apart**2)[within]))
 
     @cached_property
-    def _edges(self) -> FloatArray:
+    def _cell_edges(self) -> FloatArray:
         return np.linspace(self.nodes[0], self.nodes[-1], _N_CELLS + 1)
 
     @cached_property
-    def _shares(self) -> FloatArray:
+    def _cell_probabilities(self) -> FloatArray:
         """Probability of each cell of the coordinate, (n_cells,)."""
-        middle = 0.5 * (self._edges[1:] + self._edges[:-1])
+        middle = 0.5 * (self._cell_edges[1:] + self._cell_edges[:-1])
         log_density = np.interp(middle, self.nodes, self.log_evidence)
         shares = np.exp(log_density - log_density.max())
         return np.asarray(shares / shares.sum())
@@ -143,8 +146,8 @@ class Profiled:
 
     def draws(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""
-        cell = rng.choice(_N_CELLS, n_samples, p=self._shares)
-        value = self._edges[cell] + np.diff(self._edges)[cell] * rng.random(n_samples)
+        cell = rng.choice(_N_CELLS, n_samples, p=self._cell_probabilities)
+        value = self._cell_edges[cell] + np.diff(self._cell_edges)[cell] * rng.random(n_samples)
         middle, slice_of = self._normal_at(value)
         eps = rng.standard_normal(middle.shape) / np.sqrt(rng.chisquare(_FREEDOM, (n_samples, 1)) / _FREEDOM)
         rest = middle + np.einsum("nij,nj->ni", self.roots[slice_of], eps)
@@ -173,9 +176,9 @@ class Profiled:
         middle, slice_of = self._normal_at(value)
         eps = np.linalg.solve(self.roots[slice_of], (rest - middle)[:, :, None])[:, :, 0]
         volume = np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
-        cell = np.clip(np.searchsorted(self._edges, value) - 1, 0, _N_CELLS - 1)
+        cell = np.clip(np.searchsorted(self._cell_edges, value) - 1, 0, _N_CELLS - 1)
         with np.errstate(divide="ignore"):
-            log_share = np.log(self._shares[cell])
+            log_share = np.log(self._cell_probabilities[cell])
         tail = 0.5 * (_FREEDOM + rest.shape[1]) * np.log1p(np.sum(eps**2, axis=1) / _FREEDOM)
         return np.asarray(log_share - tail - volume[slice_of])
 
@@ -184,7 +187,7 @@ Slices = tuple[FloatArray, FloatArray, FloatArray]
 """Coordinates (n_nodes, n_params), log posteriors (n_nodes,), whitened derivatives with residuals."""
 
 
-def _better(old: Slices, new: Slices) -> Slices:
+def _higher_slices(old: Slices, new: Slices) -> Slices:
     """Take each slice from the fit that is higher."""
     higher = new[1] > old[1]
     return (
@@ -194,7 +197,7 @@ def _better(old: Slices, new: Slices) -> Slices:
     )
 
 
-def _about_the_best(height: FloatArray) -> BoolArray:
+def _slices_about_best(height: FloatArray) -> BoolArray:
     """Return the slices about the best, as far as none is far below it, (n_nodes,)."""
     best = int(np.argmax(height))
     low = np.flatnonzero(~(height > height[best] - _FAR))
@@ -203,7 +206,7 @@ def _about_the_best(height: FloatArray) -> BoolArray:
     return out
 
 
-def _nonlinear(found: Fit) -> list[int]:
+def _nonlinear_coordinates(found: Fit) -> list[int]:
     """List the coordinates of effects that are no amplitudes."""
     out = []
     for effect in found.model.effects:

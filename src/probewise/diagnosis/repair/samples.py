@@ -71,7 +71,7 @@ class ModelSamples:
         """Convert to a FittedSensor, for predictions, the robot, and sensor.json."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
         from_chain = by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
-        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_step_mm(recording))
+        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_usual_step_mm(recording))
         field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable
         residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
@@ -151,7 +151,7 @@ def sample_model(
     }
     theta = found.model.theta_of(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
-    theta = np.concatenate([theta, *(_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
+    theta = np.concatenate([theta, *(_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
     names = tuple(effect.name for effect in chain.effects)
     of_lattice = [i for i, name in enumerate(chain.names) if name == f"{Quantisation.name}.step"]
     for i in of_lattice:
@@ -229,7 +229,9 @@ def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatA
     return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
 
 
-def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator) -> FloatArray:
+def _draws_about_nodes(
+    effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator
+) -> FloatArray:
     """Draw one effect's parameters uniformly about the drawn nodes, half way to the next: (n_samples, n_params)."""
     settings = noise.nodes.settings[:, noise.noise.columns_of(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)
@@ -242,7 +244,7 @@ def _about_nodes(effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, 
     return np.where(spread, effect.prior.from_unit_cube(moved), values)
 
 
-def _step_mm(recording: Recording) -> float:
+def _usual_step_mm(recording: Recording) -> float:
     plan = recording.plan
     moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
     moves = moves[moves > 0]

@@ -61,7 +61,7 @@ def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope
         for covariate in covariates
         for template in _bases_of(covariate, ways)
     ]
-    found += [("what was seen before", template) for template in _memories(signal, starts)]
+    found += [("what was seen before", template) for template in _memory_bases(signal, starts)]
     found += [("ends of scans", template) for template in _end_transients(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
     return Bank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
@@ -91,48 +91,48 @@ def _family_name(covariate: Covariate, template: FloatArray) -> str:
 
 def _bases_of(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArray]:
     if covariate.groups:
-        yield from _of_groups(covariate, ways)
+        yield from _group_bases(covariate, ways)
     elif covariate.scan is not None:
-        yield _smooth(covariate, ways.adds, 6)
-        yield _smooth(covariate, ways.shift, 3)
-        yield from _windows(covariate, ways.adds, (4, 8, 16) if ways.n_scans <= _FEW_SCANS else (8,))
+        yield _cosine_bases(covariate, ways.adds, 6)
+        yield _cosine_bases(covariate, ways.shift, 3)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16) if ways.n_scans <= _FEW_SCANS else (8,))
     elif covariate.name == "place":
         for terms in (3, 8, 20):
-            yield _smooth(covariate, ways.adds, terms)
-            yield _smooth(covariate, ways.shift, terms)
-        yield _smooth(covariate, ways.gain, 3)
-        yield _smooth(covariate, ways.gain, 8)
-        yield _smooth(covariate, ways.turned, 3)
-        yield _smooth(covariate, ways.turned * ways.shift, 3)
-        yield from _steps(covariate, ways.shift)
-        yield from _windows(covariate, ways.adds, (4, 8, 16))
+            yield _cosine_bases(covariate, ways.adds, terms)
+            yield _cosine_bases(covariate, ways.shift, terms)
+        yield _cosine_bases(covariate, ways.gain, 3)
+        yield _cosine_bases(covariate, ways.gain, 8)
+        yield _cosine_bases(covariate, ways.turned, 3)
+        yield _cosine_bases(covariate, ways.turned * ways.shift, 3)
+        yield from _step_bases(covariate, ways.shift)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
     elif covariate.name == "time":
         for terms in (3, 8, 24, 64):
-            yield _smooth(covariate, ways.adds, terms)
+            yield _cosine_bases(covariate, ways.adds, terms)
         for way in (ways.gain, ways.shift):
-            yield _smooth(covariate, way, 3)
-            yield _smooth(covariate, way, 8)
-            yield from _steps(covariate, way)
-        yield from _steps(covariate, ways.adds)
-        yield from _windows(covariate, ways.adds, (4, 8, 16))
+            yield _cosine_bases(covariate, way, 3)
+            yield _cosine_bases(covariate, way, 8)
+            yield from _step_bases(covariate, way)
+        yield from _step_bases(covariate, ways.adds)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
     elif covariate.name in ("level", "edge_distance"):
         for terms in (3, 8, 20):
-            yield _smooth(covariate, ways.adds, terms)
+            yield _cosine_bases(covariate, ways.adds, terms)
         side = np.where(ways.gain > 0.5 * ways.gain.max(), 1.0, -1.0)
-        yield _smooth(covariate, side * ways.adds, 8)
-        yield _smooth(covariate, ways.turned, 3)
-        yield from _windows(covariate, ways.adds, (4, 8, 16))
+        yield _cosine_bases(covariate, side * ways.adds, 8)
+        yield _cosine_bases(covariate, ways.turned, 3)
+        yield from _window_bases(covariate, ways.adds, (4, 8, 16))
     elif covariate.name == "slope":
-        yield _smooth(covariate, ways.adds, 3)
+        yield _cosine_bases(covariate, ways.adds, 3)
         yield _on_all_rows(covariate.values[:, None], covariate, len(ways.adds))
         yield _on_all_rows(np.abs(covariate.values)[:, None], covariate, len(ways.adds))
     else:  # a logged column of the recording
         for way in (ways.adds, ways.gain):
-            yield _smooth(covariate, way, 3)
-            yield _smooth(covariate, way, 8)
+            yield _cosine_bases(covariate, way, 3)
+            yield _cosine_bases(covariate, way, 8)
 
 
-def _of_groups(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArray]:
+def _group_bases(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArray]:
     codes = np.unique(covariate.values, return_inverse=True)[1]
     if codes.max() >= _MOST_GROUPS:
         return
@@ -143,7 +143,7 @@ def _of_groups(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatAr
         yield from (column[:, None] * way[:, None] for column in member.T)
 
 
-def _memories(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
+def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
     """Yield memories of earlier readings in the scan: exponential averages with several constants, and the maximum."""
     held = np.empty((len(signal), len(_MEMORIES) + 1))
     keep = np.exp(-1 / np.array(_MEMORIES))
@@ -173,7 +173,7 @@ def _end_transients(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
             yield np.concatenate([each * begin[:, None], each * end[:, None]], axis=1)
 
 
-def _smooth(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
+def _cosine_bases(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
     """Return cosines along the covariate, with resolution in proportion to the square of `way`."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     distinct, codes = np.unique(values, return_inverse=True)
@@ -187,7 +187,7 @@ def _smooth(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
     return _on_all_rows(waves * way[covariate.rows, None], covariate, len(way))
 
 
-def _steps(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator[FloatArray]:
+def _step_bases(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator[FloatArray]:
     """Yield steps at change points with equal shares of the sum of `way` squared."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     order = np.argsort(values, kind="stable")
@@ -197,7 +197,7 @@ def _steps(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator
         yield _on_all_rows(((values > at) * way[covariate.rows])[:, None], covariate, len(way))
 
 
-def _windows(covariate: Covariate, way: FloatArray, parts: Sequence[int]) -> Iterator[FloatArray]:
+def _window_bases(covariate: Covariate, way: FloatArray, parts: Sequence[int]) -> Iterator[FloatArray]:
     order, n = np.argsort(covariate.values, kind="stable"), len(covariate.values)
     for n_parts in parts:
         width = max(n // n_parts, 2)

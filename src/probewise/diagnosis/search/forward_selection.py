@@ -46,7 +46,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
     within = {c: ORDERS_WITHIN if c.degrees_of_freedom <= freedom else STEERING for c in state.nulls}
     parents = [c for c in state.nulls if c.log_z > null.log_z - within[c]]
     for size in range(1, min(depth, len(state.effects)) + 1):
-        asked = _asked(state, null, parents, size, beam)
+        asked = _proposals_to_refit(state, null, parents, size, beam)
         state.share = SHARES[size - 1] if size <= len(SHARES) else 1.0
         refitted = []
         for k, proposal in enumerate(asked):
@@ -62,7 +62,9 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
         parents = [c for c in kept if c.log_z > max(r.log_z for r in rivals_of(c.names, kept)) - EXTENDED_WITHIN]
 
 
-def _asked(state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int, beam: int) -> list[Proposal]:
+def _proposals_to_refit(
+    state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int, beam: int
+) -> list[Proposal]:
     """Return the combinations of one size to refit, each extended from one of the parents."""
     proposals: dict[Names, Proposal] = {}
     for parent in parents:

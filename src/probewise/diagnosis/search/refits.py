@@ -74,7 +74,7 @@ class Refits:
         unless the noise has memory: there it may still gain under white noise.
         """
         found = self._fit(model, starts, law, max_steps)
-        if beyond is not None and not law.has_memory and not _gains(found, beyond.found, law):
+        if beyond is not None and not law.has_memory and not _improves_fit(found, beyond.found, law):
             return WeighedFit.of(found, law, beyond.evidence, 0.0)
         for _ in range(2):
             evidence = self.noises.weigh(found)
@@ -255,10 +255,10 @@ def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:
 
 def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
     """Return whether an added effect is significant: the fit improves by more than expected per parameter."""
-    return _gains(candidate.found, parent.found, candidate.law)
+    return _improves_fit(candidate.found, parent.found, candidate.law)
 
 
-def _gains(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
+def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
     def misfit(fitted: Fit) -> float:
         whitened = law(fitted.residuals)[:, None]
         return float(law.minus_log_likelihood(whitened, law.scale(whitened))[0])

@@ -77,7 +77,7 @@ def search(
     if max_order is None:
         max_order = 1 if len(prepared.usable) < FEW_READINGS else MAX_ORDER
     prior = prior or prepared.apparatus.prior_odds(effects)
-    on_mean, on_noise = _by_side(prepared)
+    on_mean, on_noise = _effects_on_mean_and_noise(prepared)
     refits = (
         Refits(prepared.null, Noises(recording, on_noise, prior), TemplateMemory(prepared.usable))
         if after is None
@@ -94,7 +94,7 @@ def search(
     else:
         state.sensors |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
-    unknown = _unknown(state, prepared, after)
+    unknown = _unknown_effects_of(state, prepared, after)
     screening = Screening(templates, state.null.found, unknown.bases, unknown.covariates)
 
     def evidences() -> Evidences:
@@ -130,7 +130,7 @@ def search(
     )
 
 
-def _by_side(prepared: Prepared) -> tuple[dict[str, NamedEffect[Any]], dict[str, NoiseEffect]]:
+def _effects_on_mean_and_noise(prepared: Prepared) -> tuple[dict[str, NamedEffect[Any]], dict[str, NoiseEffect]]:
     """Divide the effects into those on the mean and those on the noise."""
     effects, on_noise = prepared.effects, prepared.on_noise
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
@@ -168,11 +168,11 @@ def _refit_null(state: SearchState) -> None:
             state.keep(again)
 
 
-def _unknown(state: SearchState, prepared: Prepared, after: Searched | None) -> Unknown:
+def _unknown_effects_of(state: SearchState, prepared: Prepared, after: Searched | None) -> Unknown:
     """Build the basis functions of unknown effects about the best null; those of an earlier search serve again."""
     named = [effect for name, effect in state.effects.items() if not out_of_vocabulary((name,))]
     if after is None:
-        bases, covariates = _bases(state, prepared, named)
+        bases, covariates = _unknown_bases(state, prepared, named)
     else:
         bases, covariates = after.screening.unknown_bases, after.screening.covariates
     each = state.prior.unknown_complexity_penalty
@@ -186,7 +186,7 @@ def _unknown(state: SearchState, prepared: Prepared, after: Searched | None) -> 
     )
 
 
-def _bases(
+def _unknown_bases(
     state: SearchState, prepared: Prepared, named: Sequence[NamedEffect[Any]]
 ) -> tuple[Bank, tuple[Covariate, ...]]:
     null, recording = state.null, prepared.recording

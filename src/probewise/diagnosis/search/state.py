@@ -206,7 +206,10 @@ class SearchState:
         }
 
     def log_evidence(self, names: Names) -> float:
-        """Return the largest log evidence of a combination: of its refit or, without one, by screening."""
+        """Return a combination's log evidence, the largest over SSF orders and noise models.
+
+        It is that of the refits or, if there are none, that of the screening.
+        """
         screened = (value for (own, _), value in self.screened().items() if own == names)
         return max([c.log_z for c in self.of(names)] or screened, default=-np.inf)
 

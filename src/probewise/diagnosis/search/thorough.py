@@ -79,10 +79,14 @@ def weigh_thoroughly(
     require_rng(rng)
     weighings: dict[tuple[int, Names], Weighing] = {}
     leaders = _leading_hypotheses(searched)
-    bar = _Bar(progress, len(leaders), _estimated_minutes(leaders, searched, n_live, rng=np.random.default_rng(0)))
+    bar = _ProgressBar(
+        progress, len(leaders), _estimated_minutes(leaders, searched, n_live, rng=np.random.default_rng(0))
+    )
     for k, ((candidate, noise), own) in enumerate(zip(leaders, rng.spawn(len(leaders)), strict=True)):
         key = candidate.n_gaussians, candidate.names
-        weighings[key] = _weigh(candidate, noise, searched, rng=own, n_live=n_live, rounds=partial(bar.told, k))
+        weighings[key] = _weigh_by_nested_sampling(
+            candidate, noise, searched, rng=own, n_live=n_live, rounds=partial(bar.show_round, k)
+        )
     told = tuple(weighings.values())
     if all(w.agree for w in told) or any(w.doubts for w in told):
         return searched, told
@@ -118,7 +122,7 @@ def _noise_of(searched: Searched, mean: Names) -> Names:
     return max(own, key=lambda noise: own[noise])
 
 
-def _weigh(
+def _weigh_by_nested_sampling(
     candidate: WeighedFit,
     noise: Names,
     searched: Searched,
@@ -152,7 +156,7 @@ def _weigh(
 
         told = weigh_near(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
-            told = max(told, weigh_near(_of_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
+            told = max(told, weigh_near(_draw_from_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
     more = explored.log_z + candidate.log_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:
@@ -181,17 +185,17 @@ def _estimated_minutes(
     return _FEWEST_RUNS * seconds / 60, _MOST_RUNS_IN_ALL * seconds / 60
 
 
-class _Bar:
-    """One progress bar over all hypotheses, with the estimated duration in its title."""
+class _ProgressBar:
+    """One progress bar over the runs of all hypotheses, with the estimated duration in its title."""
 
     def __init__(self, progress: Progress, n: int, minutes: tuple[float, float]) -> None:
         self._progress, self._n, self._runs = progress, n, 0
         self._at, self._depth = -1, 0.0
-        self._stage = f"weighing {n} hypotheses again, about {_in_words(minutes)}"
+        self._stage = f"weighing {n} hypotheses again, about {_minutes_in_words(minutes)}"
         progress(self._stage, 0, n * _STEPS)
 
-    def told(self, k: int, label: str, state: nested.RoundSummary) -> None:
-        """Update with a round of a run of hypothesis number `k`."""
+    def show_round(self, k: int, label: str, state: nested.RoundSummary) -> None:
+        """Show the progress after one round of a run; `k` numbers the hypothesis, `label` names it."""
         depth = -state.log_volume
         if k != self._at or depth < self._depth:  # a new run starts from the whole prior
             self._runs = 1 if k != self._at else self._runs + 1
@@ -202,7 +206,7 @@ class _Bar:
         self._progress(self._stage, done, self._n * _STEPS, f"{label}, run {self._runs}")
 
 
-def _in_words(minutes: tuple[float, float]) -> str:
+def _minutes_in_words(minutes: tuple[float, float]) -> str:
     least, most = minutes
     if most < 1:
         return "a minute"
@@ -229,7 +233,7 @@ def _evidence_near_posterior(
         theta = found.samples(_N_SAMPLES, rng=rng)
 
 
-def _of_laplace(candidate: WeighedFit, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
+def _draw_from_laplace(candidate: WeighedFit, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
     """Draw from Laplace's approximation, (_N_SAMPLES, n_params)."""
     found = candidate.found
     root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.information)

@@ -41,13 +41,13 @@ class Swap:
 
         `usable` are the rows with usable readings, (n_usable,).
         """
-        found = self._fitted(candidate.found, usable)
+        found = self._fit_with_twin(candidate.found, usable)
         if found is None:
             return None
         weights = {self.twin if name == self.name else name: own for name, own in candidate.weights.items()}
         return replace(candidate, found=found, weights=weights)
 
-    def _fitted(self, found: Fit, usable: IntArray) -> Fit | None:
+    def _fit_with_twin(self, found: Fit, usable: IntArray) -> Fit | None:
         effects, of = list(found.model.effects), self.of_first.variants
         pair = next(((i, k) for i, held in enumerate(effects) for k, each in enumerate(of) if each is held), None)
         if pair is None:

@@ -84,10 +84,10 @@ class Unknown:
         named = [c for c in candidates if not out_of_vocabulary(c.names)]
         for known in {c.names for c in named if len(c.names) <= 1}:
             rivals = [c for c in named if set(c.names) > set(known) and len(c.names) <= 2]
-            if any(key[1] == known for key in self.log_z) and self._explained(known, rivals, candidates):
+            if any(key[1] == known for key in self.log_z) and self._is_superfluous(known, rivals, candidates):
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
 
-    def _explained(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
+    def _is_superfluous(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
         """Return whether a candidate makes an unknown effect beside `known` superfluous.
 
         Its evidence is then at most ALIASED_NATS lower, and an unknown effect beside it adds less than that.
@@ -99,15 +99,15 @@ class Unknown:
                 return False
             if self._log_evidence_over_noises(candidate) == -np.inf:
                 self.weigh([candidate])
-            if self._log_evidence_over_noises(candidate) - self._evidence(candidate) < ALIASED_NATS:
+            if self._log_evidence_over_noises(candidate) - self._log_evidence_without_unknown(candidate) < ALIASED_NATS:
                 return True
         return False
 
     def _log_evidence_with_prior(self, candidate: WeighedFit, n_known: int) -> float:
         several = len(candidate.names) - n_known > 1
-        return self._evidence(candidate) - (self.n_choices(candidate.names) if several else 0.0)
+        return self._log_evidence_without_unknown(candidate) - (self.n_choices(candidate.names) if several else 0.0)
 
-    def _evidence(self, candidate: WeighedFit) -> float:
+    def _log_evidence_without_unknown(self, candidate: WeighedFit) -> float:
         return self.noises.over_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
 
     def _log_evidence_over_noises(self, candidate: WeighedFit) -> float:

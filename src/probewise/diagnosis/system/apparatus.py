@@ -160,7 +160,7 @@ class SimulatorApparatus:
         out = {"time" if table.has_time else "row": table.time_s, "level": predicted}
         out |= {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}
-        out["previous"] = _change(predicted, table)
+        out["previous"] = _change_within_runs(predicted, table)
         out["run"] = table.scan.astype(np.float64)
         return out
 
@@ -204,7 +204,7 @@ class SimulatorApparatus:
     in_sequence = staticmethod(in_sequence)
 
 
-def _change(values: FloatArray, table: RunTable) -> FloatArray:
+def _change_within_runs(values: FloatArray, table: RunTable) -> FloatArray:
     """Return the change since the previous row of the run, 0 at its first, (n_points,)."""
     out = np.zeros(len(table))
     for rows in table.rows_by_scan():

@@ -47,7 +47,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     own = cast(RunTable, as_recording(simulator, _without_readings(simulator, table)).plan)
     system = System.of(simulator, own)
     z, predicted, where = _typical_point(system, own)
-    sd, noise = _noise(simulator, own, predicted)
+    sd, noise = _noise_sd_and_source(simulator, own, predicted)
     system = system.with_converged_step(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
@@ -58,7 +58,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     else:
         del on_noise[NoisePerRun.name]
     built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
-    reasons = _reasons(about)
+    reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
     expected = Expected(cast(Any, system), z, (float(predicted.min()), float(predicted.max())), sd)
     stride = -(-len(own) // _MOST_ROWS)
@@ -89,7 +89,7 @@ def _typical_point(system: System, table: RunTable) -> tuple[FloatArray, FloatAr
     raise ParameterError("the table", "one reading in all rows", "rows over which the predicted reading changes")
 
 
-def _noise(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tuple[float, str]:
+def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tuple[float, str]:
     declared = simulator.noise.sd
     if isinstance(declared, str):
         values = table.columns.get(declared)
@@ -100,7 +100,7 @@ def _noise(simulator: Simulator, table: RunTable, predicted: FloatArray) -> tupl
     return _NOISE * float(np.ptp(predicted)), "a hundredth of the range of the readings, since none is declared"
 
 
-def _reasons(about: About) -> dict[str, str]:
+def _reasons_for_absence(about: About) -> dict[str, str]:
     """Return, for every effect of the vocabulary, the reason to give if it cannot act in this table."""
     own, table = about.system.simulator, about.table
     nothing = "it leaves no trace here"

@@ -60,7 +60,7 @@ def run_commands(table: RunTable, reading: str, controls: Sequence[str], time_un
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
         of = f"run {name}" if table.run is not None else "the rows"
         for kind, words, columns, slower in _changed_runs(table, kept, ends, of):
-            made = _run(table, kept, columns, reading, f"{name} {kind}", name, slower)
+            made = _planned_run(table, kept, columns, reading, f"{name} {kind}", name, slower)
             out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
     return out
 
@@ -104,7 +104,7 @@ def _changed_runs(
             yield f"{name} {kind}", f"take {of} with {name} {text}", {name: shape(low, high)}, 1.0
 
 
-def _run(
+def _planned_run(
     table: RunTable,
     rows: IntArray,
     columns: Mapping[str, FloatArray],

@@ -258,28 +258,30 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     table = cast(RunTable, recording.plan)
     law = white_of(recording)
     found = _from_best_start(system, recording, law)
-    sd = _sd(system.simulator, table, recording, found)
+    sd = _noise_sd_of(system.simulator, table, recording, found)
     for _ in range(4):
         finer = system.with_converged_step(table, system.theta(found.z[None, :]), tolerance=_STANDS_STILL * sd)
         if finer is system:
             break
         system = finer
         found = fit(Model(system, (), recording.plan), recording, found.z, law)
-        sd = _sd(system.simulator, table, recording, found)
+        sd = _noise_sd_of(system.simulator, table, recording, found)
     return system, found, sd
 
 
 def _from_best_start(system: System, recording: Recording, law: NoiseLaw) -> Fit:
     """Take a few steps from every start, then continue from the best."""
     model = Model(system, (), recording.plan)
-    tried = sorted(fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_height)[:_BEST_STARTS]
-    longer = _lengthened(model, recording)
+    tried = sorted(fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_finite_objective)[
+        :_BEST_STARTS
+    ]
+    longer = _fits_of_lengthened_runs(model, recording)
     if not longer and all(found.settled for found in tried):
         return tried[0]
-    return min(fits(model, recording, [*(found.z for found in tried), *longer], law), key=_height)
+    return min(fits(model, recording, [*(found.z for found in tried), *longer], law), key=_finite_objective)
 
 
-def _lengthened(model: Model, recording: Recording) -> list[FloatArray]:
+def _fits_of_lengthened_runs(model: Model, recording: Recording) -> list[FloatArray]:
     """Fit the beginning of every run, then more of it: coordinates (n_params,) of the lowest fits.
 
     For an oscillating system the objective has a local minimum for every period by which a run can be wrong; over the
@@ -295,16 +297,16 @@ def _lengthened(model: Model, recording: Recording) -> list[FloatArray]:
         part = recording.with_readings(np.where(begun, recording.readings, np.nan))
         if part.usable.sum() < system.least_readings:
             return []
-        found = sorted(fits(model, part, starts, white_of(part), max_steps=_STEPS_TRIED), key=_height)
+        found = sorted(fits(model, part, starts, white_of(part), max_steps=_STEPS_TRIED), key=_finite_objective)
         starts = [each.z for each in found[:_BEST_STARTS]]
     return starts
 
 
-def _height(found: Fit) -> float:
+def _finite_objective(found: Fit) -> float:
     return found.objective if np.isfinite(found.objective) else np.inf
 
 
-def _sd(simulator: Simulator, table: RunTable, recording: Recording, found: Fit) -> float:
+def _noise_sd_of(simulator: Simulator, table: RunTable, recording: Recording, found: Fit) -> float:
     declared = simulator.noise.sd
     if isinstance(declared, str):
         values: FloatArray = table.covariates[declared]

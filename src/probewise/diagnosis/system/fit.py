@@ -142,9 +142,11 @@ def fit_simulator(
             f"{len(prepared.usable)} usable readings" if len(prepared.usable) < prepared.least_readings else "all equal"
         )
         raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
-    null, noise = _weighed(prepared)
+    null, noise = _null_evidence(prepared)
     samples = sample_model(null.found, noise, prepared.recording, weights={}, rng=rng)
-    evidence = Evidence(noise.log_z + null.log_factor, 0.0, "the Laplace approximation", _why_not(prepared))
+    evidence = Evidence(
+        noise.log_z + null.log_factor, 0.0, "the Laplace approximation", _reason_against_sampling(prepared)
+    )
     if not evidence.reason:
         samples, evidence = _by_nested_sampling(prepared, null, noise, samples, evidence, rng=rng, progress=progress)
     recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
@@ -155,7 +157,7 @@ def fit_simulator(
     return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
 
 
-def _weighed(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
+def _null_evidence(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
     """Compute the evidence of the simulator alone, with white noise."""
     prior = PriorOdds.over({})
     noises, templates = Noises(prepared.recording, {}, prior), TemplateMemory(prepared.usable)
@@ -164,7 +166,7 @@ def _weighed(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
     return state.null, state.null.evidence[()]
 
 
-def _why_not(prepared: Prepared) -> str:
+def _reason_against_sampling(prepared: Prepared) -> str:
     """Return why nested sampling would take too long; "" if it would not."""
     system = cast(SimulatorApparatus, prepared.apparatus).system
     if system.n_params > _MOST_PARAMETERS:
@@ -207,7 +209,7 @@ def _by_nested_sampling(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # the reason is reported below
         found = nested.run(
-            problem, rng=rng, n_live=n_live, max_calls=_most_calls(prepared), progress=_told(progress),
+            problem, rng=rng, n_live=n_live, max_calls=_most_calls(prepared), progress=_sampling_progress(progress),
             max_cost=1.0, return_interrupted=False,
         )  # fmt: skip
     if found.warnings:
@@ -222,7 +224,7 @@ def _by_nested_sampling(
     return replace(samples, theta=theta, noise_sd=noise_sd), evidence
 
 
-def _told(progress: Progress) -> Callable[[nested.RoundSummary], None]:
+def _sampling_progress(progress: Progress) -> Callable[[nested.RoundSummary], None]:
     def tell(state: nested.RoundSummary) -> None:
         to_come = state.log_ratio_remaining
         progress(

@@ -27,15 +27,15 @@ def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
     ParameterError
         If it is not the diagnosis of a simulator.
     """
-    return _fitted(diagnosis, "repaired")
+    return _fitted_system_of(diagnosis, "repaired")
 
 
 def calibrated_of(diagnosis: Diagnosis) -> FittedSystem:
     """Return the calibrated null model of a diagnosis: the simulator alone. Raises as `repaired_of`."""
-    return _fitted(diagnosis, "null")
+    return _fitted_system_of(diagnosis, "null")
 
 
-def _fitted(diagnosis: Diagnosis, which: str) -> FittedSystem:
+def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
     allowed = "the Diagnosis of a simulator, as diagnose_system returns it"
     if isinstance(getattr(diagnosis, "fitted", None), FittedSystem):
         allowed += f"; of this {type(diagnosis).__name__} take its .fitted"

@@ -35,8 +35,10 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "verdict": diagnosis.verdict,
         "reason": diagnosis.reason,
         "p_value": diagnosis.p_value,
-        "combination": _names(diagnosis.combination),
-        "hypotheses": [{"effects": _names(h.effects), "probability": h.probability} for h in diagnosis.hypotheses],
+        "combination": _public_names(diagnosis.combination),
+        "hypotheses": [
+            {"effects": _public_names(h.effects), "probability": h.probability} for h in diagnosis.hypotheses
+        ],
         "effects": [
             {
                 "name": public_name(e.name),
@@ -96,16 +98,16 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     if formula is not None:
         document["formula"] = asdict(formula) | {"parameters": [_parameter(p) for p in formula.parameters]}
     return document | (
-        {"thorough": [_weighing(w) for w in diagnosis.report.weighings]} if diagnosis.report.weighings else {}
+        {"thorough": [_weighing_json(w) for w in diagnosis.report.weighings]} if diagnosis.report.weighings else {}
     )
 
 
-def _names(effects: Iterable[str]) -> list[str]:
+def _public_names(effects: Iterable[str]) -> list[str]:
     """Return the public names of effects; one that occurs twice is listed twice."""
     return sorted(map(public_name, effects))
 
 
-def _weighing(twice: Weighing) -> dict[str, Any]:
+def _weighing_json(twice: Weighing) -> dict[str, Any]:
     return {
         "effects": list(twice.effects),
         "n_gaussians": twice.n_gaussians,

@@ -95,21 +95,21 @@ def effects_found(
             continue
         holder, noise = (best.fit, best.noise) if name in samples.effects else _candidate_with(searched, name)
         if holder is None:
-            effect, values, size = _too_small(searched, effect, rng=rng)
+            effect, values, size = _bounds_of_insignificant(searched, effect, rng=rng)
         else:
             effect = next((e for e in holder.found.model.effects if e.name == name), effect)
             own = samples
             if name not in samples.effects:
                 evidence, weights = holder.evidence[noise], holder.weights
                 own = sample_model(holder.found, evidence, prepared.recording, weights=weights, rng=rng, annealed=False)
-            values, size = own.columns(name), _size(searched, holder, name, noise)
+            values, size = own.columns(name), _lambda_of(searched, holder, name, noise)
         out.append(
             EffectFound(
                 name,
                 min(p, 1.0),
                 size,
                 effect.sentence(values.mean(axis=0), values.std(axis=0)),
-                (*parameters_of(effect, values, unit), *_scans(effect, plan)),
+                (*parameters_of(effect, values, unit), *_scan_numbers(effect, plan)),
                 effect.scans,
             )
         )
@@ -127,7 +127,7 @@ def _candidate_with(searched: Searched, name: str) -> tuple[WeighedFit | None, N
     return None, ()
 
 
-def _too_small(
+def _bounds_of_insignificant(
     searched: Searched, effect: NamedEffect[Any], *, rng: np.random.Generator
 ) -> tuple[NamedEffect[Any], FloatArray, float]:
     """Return bounds of an insignificant effect: amplitudes by the linearised null, other parameters from the prior.
@@ -157,7 +157,7 @@ def _too_small(
     return effect, values, float(np.linalg.norm(projected @ amount))
 
 
-def _size(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
+def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
     """Return lambda: the residual norm on noise-free readings after a full refit without the effect."""
     law = holder.evidence[noise].law
     found, prepared = holder.found, searched.prepared
@@ -208,7 +208,7 @@ def parameters_of(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tu
     )
 
 
-def _scans(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
+def _scan_numbers(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
     """Return the numbers, from 0, of the scans to which an effect is restricted; its sentence names them."""
     numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
     return (_parameter("scans", "scan", numbers),) if numbers.size else ()

@@ -116,16 +116,16 @@ def _cannot_tell(judged: Judged, grounds: Grounds) -> str:
 
 
 def _noise(judged: Judged, grounds: Grounds) -> str:
-    return f"{_stated(judged, grounds)}; nothing is missing from the mean ({p_in_words(judged.p_value)})."
+    return f"{_effect_sentences(judged, grounds)}; nothing is missing from the mean ({p_in_words(judged.p_value)})."
 
 
 def _named(judged: Judged, grounds: Grounds) -> str:
     after = grounds.p_value_after
     more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
-    return f"{_stated(judged, grounds)} ({p_in_words(judged.p_value)}).{more}"
+    return f"{_effect_sentences(judged, grounds)} ({p_in_words(judged.p_value)}).{more}"
 
 
-def _stated(judged: Judged, grounds: Grounds) -> str:
+def _effect_sentences(judged: Judged, grounds: Grounds) -> str:
     said = "; ".join(grounds.sentences[name] for name in judged.combination if name in grounds.sentences)
     return said if _is_of_a_person(said.split()[0], judged.combination) else f"{said[0].upper()}{said[1:]}"
 

@@ -122,7 +122,7 @@ class Caller:
                 return _of_shape(readings, (n_samples, n_points), self.name)
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
-                own = {name: _row(values, k) for name, values in parameters.items()}
+                own = {name: _value_at_row(values, k) for name, values in parameters.items()}
                 table = {
                     name: values[min(k, len(values) - 1)] if np.ndim(values) == 2 else values
                     for name, values in columns.items()
@@ -190,14 +190,14 @@ class CountedCalls:
     def __init__(self, progress: Progress, caller: Caller) -> None:
         self._progress, self._caller = progress, caller
         self._now = ("calling simulate", 0, 0, "")
-        caller.on_call = self._report_again
+        caller.on_call = self._report_call_count
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
         """Report the progress of a stage."""
         self._now = stage, done, total, note
-        self._report_again()
+        self._report_call_count()
 
-    def _report_again(self) -> None:
+    def _report_call_count(self) -> None:
         stage, done, total, note = self._now
         most = "" if self._caller.broadcasts else f" of at most {MOST_CALLS:,}"
         calls = f"{self._caller.n_calls:,}{most} calls of simulate"
@@ -226,7 +226,7 @@ def _taken_by_row(
     return frozenset(taken)
 
 
-def _row(values: FloatArray, k: int) -> Any:
+def _value_at_row(values: FloatArray, k: int) -> Any:
     own = values[min(k, len(values) - 1)]
     return float(own[0]) if own.shape == (1,) else own
 

@@ -177,10 +177,10 @@ class FittedSystem(ShowsItself):
                 samples=samples,
                 noise_sd=np.array(document["noise"]["sd"], dtype=np.float64),
                 effects=tuple(document["effects"]),
-                absent={name: _marks(rows, len(samples)) for name, rows in document["absent"].items()},
+                absent={name: _marked_samples(rows, len(samples)) for name, rows in document["absent"].items()},
                 level=(float(document["level"][0]), float(document["level"][1])),
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
-                known=None if known is None else _known(known, simulator),
+                known=None if known is None else _recorded_from_json(known, simulator),
                 recording=str(document["recording"]["fingerprint"]),
                 source=str(document["recording"]["source"]),
                 notes=tuple(document["notes"]),
@@ -238,8 +238,8 @@ def _column_json(values: NDArray[Any]) -> list[Any]:
     return [value if math.isfinite(value) else None for value in values.tolist()]
 
 
-def _known(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
-    columns = {name: _column(values) for name, values in document["columns"].items()}
+def _recorded_from_json(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
+    columns = {name: _column_from_json(values) for name, values in document["columns"].items()}
     table = RunTable(columns, document["time"], document["run"])
     states = {name: np.array(values, dtype=np.float64) for name, values in document["states"].items()}
     held = document.get("held")  # a file of an earlier version has none: only a law's columns were held then
@@ -248,13 +248,13 @@ def _known(document: Mapping[str, Any], simulator: Simulator) -> Recorded:
     return Recorded(table, np.array(document["predicted"], dtype=np.float64), states, tuple(held))
 
 
-def _column(values: list[Any]) -> NDArray[Any]:
+def _column_from_json(values: list[Any]) -> NDArray[Any]:
     if any(isinstance(value, str) for value in values):
         return np.array([str(value) for value in values])
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def _marks(rows: list[int], n_samples: int) -> BoolArray:
+def _marked_samples(rows: list[int], n_samples: int) -> BoolArray:
     out = np.zeros(n_samples, dtype=np.bool_)
     out[np.array(rows, dtype=np.int64)] = True
     return out

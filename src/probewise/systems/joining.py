@@ -40,7 +40,7 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
     if not tables:
         raise ParameterError("tables", (), "one or more")
     for (one, first), (another, second) in itertools.combinations(zip(sources, tables, strict=True), 2):
-        if _same(first, second):
+        if _same_tables(first, second):
             raise ParameterError("tables", f"{one} and {another}", "tables that differ; these hold the same rows")
     if len(tables) == 1:
         return tables[0], ()
@@ -102,14 +102,14 @@ def unused_name(name: str, taken: Iterable[str]) -> str:
     return next(n for n in itertools.chain([name], numbered) if n not in known)
 
 
-def _same(first: RunTable, second: RunTable) -> bool:
+def _same_tables(first: RunTable, second: RunTable) -> bool:
     """Return whether two tables hold the same rows."""
     if len(first) != len(second) or set(first.columns) != set(second.columns):
         return False
-    return all(_equal(values, second.columns[name]) for name, values in first.columns.items())
+    return all(_equal_columns(values, second.columns[name]) for name, values in first.columns.items())
 
 
-def _equal(first: NDArray[Any], second: NDArray[Any]) -> bool:
+def _equal_columns(first: NDArray[Any], second: NDArray[Any]) -> bool:
     if first.dtype == np.float64 and second.dtype == np.float64:
         return bool(np.array_equal(first, second, equal_nan=True))
     return [str(v) for v in first.tolist()] == [str(v) for v in second.tolist()]

@@ -27,7 +27,7 @@ def mistake_in(what: str, error: Exception, simulator: Simulator, columns: Mappi
     simulator, columns
         The simulator, and the columns passed to the function.
     """
-    where = _files(simulator)
+    where = _function_files(simulator)
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename in where]
     said = " ".join(str(error).split())
     said = said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."
@@ -47,7 +47,7 @@ def mistake_in(what: str, error: Exception, simulator: Simulator, columns: Mappi
     return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
 
 
-def _files(simulator: Simulator) -> set[str]:
+def _function_files(simulator: Simulator) -> set[str]:
     """Return the files that hold the user's functions."""
     functions: list[Any] = [simulator.simulate]
     if simulator.law is not None:

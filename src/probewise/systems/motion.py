@@ -246,7 +246,7 @@ def gaps_of(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArr
 
     An effect on the clock changes the time column, and so these gaps.
     """
-    return np.asarray(np.diff(_at(columns[str(places.table.time)], places.row_at_place), axis=1))
+    return np.asarray(np.diff(_values_at_rows(columns[str(places.table.time)], places.row_at_place), axis=1))
 
 
 def starts_of(
@@ -256,7 +256,9 @@ def starts_of(
     start = {}
     for state, given in law.states.items():
         first = places.row_at_place[:1]
-        at = _at(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
+        at = (
+            _values_at_rows(parameters[given], first)[:, 0] if isinstance(given, str) else np.full((1, 1), float(given))
+        )
         start[state] = np.array(np.broadcast_to(at, (n_samples, first.shape[1])))
     return start
 
@@ -357,26 +359,26 @@ class Given:
         constant: dict[str, Any] = {}
         moving: dict[str, FloatArray] = {}
         for name, values in parameters.items():
-            own = _at(values, rows)
+            own = _values_at_rows(values, rows)
             if own.shape[1] == 1 or not np.ptp(own, axis=1).any():
                 constant[name] = own[:, 0]
             else:
                 moving[name] = own
-        first = {name: _at(values, rows[:1])[:, 0] for name, values in columns.items()}
-        asked = _Asked(first)
+        first = {name: _values_at_rows(values, rows[:1])[:, 0] for name, values in columns.items()}
+        asked = _ReadTracker(first)
         motion.rates(start, {**constant, **{name: values[:, 0] for name, values in moving.items()}}, asked, {})
         sloping: dict[str, FloatArray] = {}
         held: dict[str, NDArray[Any]] = {}
         for name in asked.names:
             slopes = name == time or (law.hold == "linear" and columns[name].dtype == np.float64)
-            (sloping if slopes else held)[name] = _at(columns[name], rows)
+            (sloping if slopes else held)[name] = _values_at_rows(columns[name], rows)
         return cls(constant, moving, held, sloping)
 
     def between(self, k: int) -> Callable[[Any], Pair]:
         """Return a function of the share of the gap from position k to the next, which gives parameters and columns."""
         moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
         sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
-        return _between(self.constant, moving, {name: v[:, k] for name, v in self.held.items()}, sloping)
+        return _values_within_gap(self.constant, moving, {name: v[:, k] for name, v in self.held.items()}, sloping)
 
     def throughout(self, gap: IntArray) -> Callable[[Any], Pair]:
         """Return `between` for many steps at once, that go on from the positions `gap` (n_steps,); runs are within."""
@@ -391,10 +393,10 @@ class Given:
         moving = {name: rising(v) for name, v in self.moving.items()}
         sloping = {name: rising(v) for name, v in self.sloping.items()}
         held = {name: flat(v[:, gap]) for name, v in self.held.items()}
-        return _between(constant, moving, held, sloping)
+        return _values_within_gap(constant, moving, held, sloping)
 
 
-class _Asked(dict[str, Any]):
+class _ReadTracker(dict[str, Any]):
     """A mapping of columns that records which of them a law reads."""
 
     def __init__(self, columns: Mapping[str, Any]) -> None:
@@ -428,7 +430,7 @@ class _Asked(dict[str, Any]):
         return super().items()
 
 
-def _between(
+def _values_within_gap(
     constant: Mapping[str, Any],
     moving: Mapping[str, tuple[Any, Any]],
     held: Mapping[str, Any],
@@ -447,7 +449,7 @@ def _between(
     return at
 
 
-def _at(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
+def _values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:
     """Index values, (n_points,) or (n_samples, n_points), by rows (n_places, n_runs); constants become (n, 1, 1)."""
     if values.ndim == 1:
         return np.asarray(values[rows][None])

@@ -137,9 +137,9 @@ def predict_system(
     own = cast(RunTable, recording.plan)
     system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
     chain = system.chain(own, bound_effects(fitted, own))
-    theta, is_drawn = _theta(fitted, chain, rng=rng)
+    theta, is_drawn = _samples_for_chain(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
-    lost = _lost(chain, theta, own)
+    lost = _unpredictable_rows(chain, theta, own)
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed = 0
     between = _kernel_width(chain, theta, own) if is_drawn else None
@@ -175,7 +175,7 @@ def predict_system(
     return SystemPrediction(own, recording.readings, mean, sd, scores, n_samples, n_failed)
 
 
-def _lost(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
+def _unpredictable_rows(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
     """Return which rows cannot be predicted because a value is missing, (n_points,)."""
     missing = (
         np.any([~np.isfinite(values) for values in table.covariates.values()], axis=0) if table.covariates else False
@@ -236,7 +236,9 @@ def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> Flo
     return np.asarray(0.9 * spread * len(theta) ** -0.2)
 
 
-def _theta(fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator) -> tuple[FloatArray, bool]:
+def _samples_for_chain(
+    fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
+) -> tuple[FloatArray, bool]:
     """Arrange the samples by the columns of a chain, with draws of parameters of runs outside the recording.
 
     Returns

@@ -48,7 +48,7 @@ class RunTable:
         if not hasattr(self.columns, "items"):
             allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
             raise ParameterError("table", self.columns, allowed)
-        columns = {name: _column(name, values) for name, values in self.columns.items()}
+        columns = {name: _as_column(name, values) for name, values in self.columns.items()}
         if not columns:
             raise ParameterError("columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -157,7 +157,7 @@ def relative_sd_of(table: RunTable, column: str, typical: float | None = None) -
     return np.where(there, values, 1.0) / np.where(there, np.median(values[there]) if typical is None else typical, 1.0)
 
 
-def _column(name: str, values: Any) -> NDArray[Any]:
+def _as_column(name: str, values: Any) -> NDArray[Any]:
     array = np.asarray(values)
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")

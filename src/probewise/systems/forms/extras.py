@@ -33,7 +33,7 @@ def forms_of_extras(about: About) -> Iterator[Form]:
                 act,
                 values[seen][:, None, None],
                 (),
-                _saying(extra.says),
+                _sentence_with_value(extra.says),
                 absent={0: extra.null},
             )
 
@@ -45,5 +45,5 @@ def _set_to(name: str) -> Act:
     return act
 
 
-def _saying(says: str) -> Say:
+def _sentence_with_value(says: str) -> Say:
     return lambda mean, sd: says.replace("{value}", with_unit(mean[0], sd[0], ""))

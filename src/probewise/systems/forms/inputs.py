@@ -37,8 +37,8 @@ def driving_columns(about: About) -> list[str]:
         spread = float(np.nanstd(values))
         if name == own.reading or name == own.noise.sd or spread == 0:
             continue
-        rms = about.rms(Stage.INPUT, _on(name, _with_offset), np.array([[_NUDGE * spread]]))
-        wave = about.rms(Stage.INPUT, _on(name, _scaled), np.array([[_NUDGE]]))
+        rms = about.rms(Stage.INPUT, _on_column(name, _with_offset), np.array([[_NUDGE * spread]]))
+        wave = about.rms(Stage.INPUT, _on_column(name, _scaled_column), np.array([[_NUDGE]]))
         if max(float(rms[0]), float(wave[0])) > 0:
             out.append(name)
     return out
@@ -50,29 +50,31 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
     for name in driving_columns(about):
         values = table.covariates[name]
         spread, low, high = float(np.nanstd(values)), float(np.nanmin(values)), float(np.nanmax(values))
-        says = partial(_said, f"the true {name} is the recorded {name} plus {{}}")
-        yield from _linear(about, f"input_offset:{name}", _on(name, _with_offset), 1e-4 * spread, name, says, name)
-        says = partial(_said, f"the true {name} is the recorded {name} times (1 + a), a = {{}}")
-        yield from _linear(about, f"input_gain:{name}", _on(name, _scaled), 1e-4, "1", says, name)
-        yield from _cut_off(about, name, low, high)
-        says = partial(_said, f"{name} has no effect within {{}} of 0")
+        says = partial(_sentence_of, f"the true {name} is the recorded {name} plus {{}}")
+        yield from _linear_forms(
+            about, f"input_offset:{name}", _on_column(name, _with_offset), 1e-4 * spread, name, says, name
+        )
+        says = partial(_sentence_of, f"the true {name} is the recorded {name} times (1 + a), a = {{}}")
+        yield from _linear_forms(about, f"input_gain:{name}", _on_column(name, _scaled_column), 1e-4, "1", says, name)
+        yield from _cut_off_forms(about, name, low, high)
+        says = partial(_sentence_of, f"{name} has no effect within {{}} of 0")
         if float(np.nanmin(np.abs(values))) <= _NEAR_ZERO * (high - low):  # if larger, it is an offset
             yield from _form_with_sizes(
-                about, f"dead_zone:{name}", "width", _on(name, _dead_zone), high - low, name, says, name
+                about, f"dead_zone:{name}", "width", _on_column(name, _dead_zone), high - low, name, says, name
             )
         if _turns_back(values, table):
-            says = partial(_said, f"{name} has {{}} of play")
+            says = partial(_sentence_of, f"{name} has {{}} of play")
             yield from _form_with_sizes(
-                about, f"backlash:{name}", "width", _on(name, play), high - low, name, says, "previous", name
+                about, f"backlash:{name}", "width", _on_column(name, play), high - low, name, says, "previous", name
             )
-        yield from _wave(about, name)
+        yield from _wave_forms(about, name)
         if table.has_time:
-            says = partial(_said, f"{name} acts with a delay of {{}} {about.time_unit}")
+            says = partial(_sentence_of, f"{name} acts with a delay of {{}} {about.time_unit}")
             yield from _form_with_sizes(
                 about,
                 f"input_delay:{name}",
                 "tau_s",
-                _on(name, delayed_while_held if about.holds(name) else delayed),
+                _on_column(name, delayed_while_held if about.holds(name) else delayed),
                 about.duration,
                 about.time_unit,
                 says,
@@ -80,11 +82,11 @@ def forms_on_inputs(about: About) -> Iterator[Form]:
                 name,
             )
     if time is not None:
-        says = partial(_said, "the true time is the recorded time times (1 + a), a = {}")
-        yield from _linear(about, "clock_drift", _on(time, _scaled), 1e-5, "1", says, "time")
+        says = partial(_sentence_of, "the true time is the recorded time times (1 + a), a = {}")
+        yield from _linear_forms(about, "clock_drift", _on_column(time, _scaled_column), 1e-5, "1", says, "time")
 
 
-def _said(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
+def _sentence_of(sentence: str, mean: FloatArray, sd: FloatArray) -> str:
     return sentence.format(with_unit(mean[0], sd[0], ""))
 
 
@@ -92,15 +94,17 @@ def _with_offset(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArra
     return np.asarray(c + theta[:, :1])
 
 
-def _scaled(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+def _scaled_column(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(c * (1 + theta[:, :1]))
 
 
-def _on(name: str, change: Change) -> Act:
+def _on_column(name: str, change: Change) -> Act:
     return lambda value, theta, table: {**value, name: np.asarray(change(value[name], theta, table))}
 
 
-def _linear(about: About, name: str, act: Act, guess: float, unit: str, says: Say, *covariates: str) -> Iterator[Form]:
+def _linear_forms(
+    about: About, name: str, act: Act, guess: float, unit: str, says: Say, *covariates: str
+) -> Iterator[Form]:
     typical = about.typical(Stage.INPUT, act, np.full((1, 1, 1), guess), guess)
     if typical is not None:
         yield Form(
@@ -125,7 +129,7 @@ def _form_with_sizes(
         yield Form(name, Stage.INPUT, {parameter: prior}, (unit,), covariates, act, entries, (), says, absent={0: 0.0})
 
 
-def _cut_off(about: About, name: str, low: float, high: float) -> Iterator[Form]:
+def _cut_off_forms(about: About, name: str, low: float, high: float) -> Iterator[Form]:
     ends = clipping_levels(low, high)
     if ends is None:
         return
@@ -134,7 +138,7 @@ def _cut_off(about: About, name: str, low: float, high: float) -> Iterator[Form]
         level = theta[:, :1]
         return np.asarray(np.where(level > ends.middle, np.minimum(c, level), np.maximum(c, level)))
 
-    act = _on(name, change)
+    act = _on_column(name, change)
     if np.nanmax(about.rms(Stage.INPUT, act, ends.levels[:, None]), initial=0.0) > 0.05:
         yield Form(
             f"input_saturation:{name}",
@@ -152,7 +156,7 @@ def _cut_off(about: About, name: str, low: float, high: float) -> Iterator[Form]
         )
 
 
-def _wave(about: About, name: str) -> Iterator[Form]:
+def _wave_forms(about: About, name: str) -> Iterator[Form]:
     values = about.table.covariates[name]
     if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
         return
@@ -160,7 +164,7 @@ def _wave(about: About, name: str) -> Iterator[Form]:
     def change(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
 
-    act = _on(name, change)
+    act = _on_column(name, change)
     most = _MOST_WAVES if about.system.caller is not None and about.system.in_bulk else _MOST_WAVES_OF_A_LAW
     waves = wave_numbers(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE)
     guess, n = 1e-4 * float(np.nanstd(values)), len(waves)

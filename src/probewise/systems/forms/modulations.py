@@ -37,7 +37,7 @@ class Modulation:
     joined: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
 
-def _one(size: float) -> FloatArray:
+def _single_entry(size: float) -> FloatArray:
     return np.full((1, 1, 1), size)
 
 
@@ -46,7 +46,7 @@ def drift(table: RunTable, time_unit: str) -> Modulation:
     return Modulation(
         over=lambda theta, rows: theta[:, :1] * rows.time_s,
         marginals=lambda a: {"a": a},
-        entries=_one,
+        entries=_single_entry,
         units=lambda unit: (f"{unit}/{time_unit}",),
         says=lambda what, unit, mean, sd: f"{what} drifts by {with_unit(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
@@ -64,7 +64,7 @@ def column(name: str, table: RunTable) -> Modulation:
     return Modulation(
         over=over,
         marginals=lambda a: {"a": a},
-        entries=_one,
+        entries=_single_entry,
         units=lambda unit: (f"{unit} per {name}",),
         says=lambda what, unit, mean, sd: f"{what} changes by {with_unit(mean[0], sd[0], unit)} per unit of {name}",
         covariates=(name,),

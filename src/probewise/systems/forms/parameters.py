@@ -31,16 +31,18 @@ def forms_on_parameters(about: About) -> Iterator[Form]:
             each["differs"] = modulations.per_run(table)
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)
-            yield from modulated(about, f"{kind}:{name}", Stage.PARAMETER, how, _shifting(name, how), size, name, "")
+            yield from modulated(
+                about, f"{kind}:{name}", Stage.PARAMETER, how, _shift_parameter(name, how), size, name, ""
+            )
         for column in columns:
             how = modulations.column(column, table)
             size = guess / float(np.nanstd(table.covariates[column]))
             yield from modulated(
-                about, f"depends:{name}:{column}", Stage.PARAMETER, how, _shifting(name, how), size, name, ""
+                about, f"depends:{name}:{column}", Stage.PARAMETER, how, _shift_parameter(name, how), size, name, ""
             )
 
 
-def _shifting(name: str, how: Modulation) -> Act:
+def _shift_parameter(name: str, how: Modulation) -> Act:
     return lambda value, theta, table: {**value, name: value[name] + how.over(theta, table)}
 
 

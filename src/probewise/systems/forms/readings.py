@@ -60,7 +60,7 @@ def forms_on_readings(about: About) -> Iterator[Form]:
     if about.tells_runs_apart:
         over["per_run"] = modulations.per_run(table)
     for kind, how in over.items():
-        yield from modulated(about, f"offset_{kind}", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)
+        yield from modulated(about, f"offset_{kind}", Stage.OFFSET, how, _add_to_readings(how), about.sd, reading, unit)
         yield from modulated(
             about,
             f"gain_{kind}",
@@ -74,20 +74,22 @@ def forms_on_readings(about: About) -> Iterator[Form]:
         )
     if table.has_time:
         how = modulations.wave(table, about.time_unit)
-        yield from modulated(about, "interference", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)
+        yield from modulated(about, "interference", Stage.OFFSET, how, _add_to_readings(how), about.sd, reading, unit)
         yield from _settling(about)
         yield from _lag(about)
         yield from _delay(about)
     for name, values in table.covariates.items():
         if name not in (reading, about.system.simulator.noise.sd) and np.nanstd(values) > 0:
             how = modulations.column(name, table)
-            yield from modulated(about, f"sensitivity:{name}", Stage.OFFSET, how, _adding(how), about.sd, reading, unit)
+            yield from modulated(
+                about, f"sensitivity:{name}", Stage.OFFSET, how, _add_to_readings(how), about.sd, reading, unit
+            )
     yield from _hysteresis(about)
     yield from _bend(about)
     yield from _ceiling(about)
 
 
-def _adding(how: Modulation) -> Act:
+def _add_to_readings(how: Modulation) -> Act:
     return lambda value, theta, table: value + how.over(theta, table)
 
 
@@ -157,7 +159,7 @@ def _lag(about: About) -> Iterator[Form]:
             (time_unit,),
             ("previous",),
             act,
-            _between(prior),
+            _sizes_between(prior),
             (),
             lambda mean, sd: (
                 f"{about.system.simulator.reading} lags with a time constant of {with_unit(mean[0], sd[0], time_unit)}"
@@ -183,7 +185,7 @@ def _delay(about: About) -> Iterator[Form]:
             (time_unit,),
             ("previous",),
             act,
-            _between(prior),
+            _sizes_between(prior),
             (),
             lambda mean, sd: f"{about.system.simulator.reading} is delayed by {with_unit(mean[0], sd[0], time_unit)}",
             absent={0: 0.0},
@@ -323,7 +325,7 @@ def _ceiling(about: About) -> Iterator[Form]:
     )
 
 
-def _between(prior: LogUniform) -> FloatArray:
+def _sizes_between(prior: LogUniform) -> FloatArray:
     return np.asarray(np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None])
 
 

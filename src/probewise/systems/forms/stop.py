@@ -96,13 +96,13 @@ def find_meter_stop(recording: Recording, reading: str = "the reading") -> tuple
         elsewhere = steps[~stands[1:][in_turn]]
         if level in recording.plan.instrumentation.ends or np.mean(elsewhere == 0) > _OFTEN:
             continue
-        if stands.sum() >= _LEAST_IN_ALL and _longest(stands, in_turn) >= _LEAST_IN_TURN:
+        if stands.sum() >= _LEAST_IN_ALL and _longest_streak(stands, in_turn) >= _LEAST_IN_TURN:
             unit = recording.plan.instrumentation.unit
             return MeterStop(level, is_ceiling, reading, unit), recording.readings == level
     return None
 
 
-def _longest(stands: BoolArray, in_turn: BoolArray) -> int:
+def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:
     """Return the largest number of successive rows at the stop."""
     longest = current = int(stands[0])
     for at, follows in zip(stands[1:].tolist(), in_turn.tolist(), strict=True):

@@ -25,9 +25,9 @@ def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> Float
         case Uniform() | Ramp() | Image():
             return np.full(x_mm.shape, np.inf)
         case HalfPlane():
-            return np.abs(_along(surface.normal_rad, x_mm, y_mm) - surface.offset_mm)
+            return np.abs(_place_along_normal(surface.normal_rad, x_mm, y_mm) - surface.offset_mm)
         case Stripes():
-            since = np.mod(_along(surface.normal_rad, x_mm, y_mm) - surface.phase_mm, surface.period_mm)
+            since = np.mod(_place_along_normal(surface.normal_rad, x_mm, y_mm) - surface.phase_mm, surface.period_mm)
             edges = surface.period_mm * np.array([0.0, surface.duty, 1.0])
             return np.asarray(np.abs(since[:, None] - edges).min(axis=1))
         case Quadrant():
@@ -43,9 +43,9 @@ def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> Float
             p, q = surface.half_axes_mm[0] * np.cos(turn), surface.half_axes_mm[1] * np.sin(turn)
             cos, sin = math.cos(surface.angle_rad), math.sin(surface.angle_rad)
             corners = np.stack([p * cos - q * sin, p * sin + q * cos], axis=-1) + surface.center_mm
-            return _to_outline(corners, x_mm, y_mm)
+            return _distance_to_outline(corners, x_mm, y_mm)
         case Polygon():
-            return _to_outline(np.array(surface.vertices_mm), x_mm, y_mm)
+            return _distance_to_outline(np.array(surface.vertices_mm), x_mm, y_mm)
 
 
 def across_edge(surface: Surface) -> tuple[float, float]:
@@ -57,11 +57,11 @@ def across_edge(surface: Surface) -> tuple[float, float]:
             return 1.0, 0.0
 
 
-def _along(normal_rad: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _place_along_normal(normal_rad: float, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return np.asarray(x_mm * math.cos(normal_rad) + y_mm * math.sin(normal_rad))
 
 
-def _to_outline(corners: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _distance_to_outline(corners: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the smallest distance to the sides of a polygon, corners (n, 2) in order."""
     sides = np.roll(corners, -1, axis=0) - corners
     lengths = np.hypot(*sides.T)

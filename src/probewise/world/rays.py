@@ -71,11 +71,13 @@ def seen_white(
     per_block = max(1, _BLOCK // spot.weights.size)
     for start in range(0, len(rest), per_block):
         part = rest[start : start + per_block]
-        seen[part] = _block(surface, spot, poses[:, part], retouch, n_rays)
+        seen[part] = _seen_white_of_block(surface, spot, poses[:, part], retouch, n_rays)
     return seen[again.ravel()]
 
 
-def _block(surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | None, n_rays: int) -> FloatArray:
+def _seen_white_of_block(
+    surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | None, n_rays: int
+) -> FloatArray:
     x_mm, y_mm, turn, scale, pattern_x, pattern_y = poses[:, :, None, None]
     cos, sin = scale * np.cos(turn), scale * np.sin(turn)
     u, v = spot.edges_mm()
@@ -93,7 +95,7 @@ def _block(surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | N
         per_block = max(1, _BLOCK // n_rays)
         for start in range(0, mixed_at[0].size, per_block):
             at = pose, row, column = tuple(index[start : start + per_block] for index in mixed_at)
-            first_u, first_v = _shift(row, column)
+            first_u, first_v = _ray_shift(row, column)
             ray_u = u[column][:, None] + spot.pixel_mm * np.mod(first_u[:, None] + np.arange(n_rays) * _STEP_U, 1.0)
             ray_v = v[row][:, None] + spot.pixel_mm * np.mod(first_v[:, None] + np.arange(n_rays) * _STEP_V, 1.0)
             c, s = cos[pose, 0], sin[pose, 0]
@@ -106,7 +108,7 @@ def _block(surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | N
     return np.asarray(np.einsum("kvu,vu->k", albedo, spot.weights))
 
 
-def _shift(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
+def _ray_shift(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return each pixel's shift of the ray sequence: fixed per pixel, spread evenly along rows and columns."""
     golden = 0.6180339887498949
     return np.mod(row * golden + column * _STEP_V, 1.0), np.mod(column * golden + row * _STEP_U, 1.0)

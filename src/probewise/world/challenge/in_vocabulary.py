@@ -20,7 +20,7 @@ from probewise.world.challenge.effect_samplers import (
 )
 
 
-def _sloping(make: Callable[[float, float], concealed.Concealed]) -> Draw:
+def _draw_of_gradient(make: Callable[[float, float], concealed.Concealed]) -> Draw:
     """Make the `Draw` of a gradient: its direction, within 60 degrees of X, which every plan moves along."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
@@ -78,18 +78,18 @@ def _in_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> 
     return draw
 
 
-def _place(rng: np.random.Generator) -> tuple[float, float, float]:
+def _draw_patch_place(rng: np.random.Generator) -> tuple[float, float, float]:
     """Draw the place x, y of a stain or glint, near the scans along X, and its sd."""
     return rng.uniform(-40, 40), rng.uniform(-4, 4), log_uniform(rng, 3.0, 10.0)
 
 
 def _albedo_patch(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, (x, y, r) = sign(rng), _place(rng)
+    s, (x, y, r) = sign(rng), _draw_patch_place(rng)
     return lambda a: concealed.AlbedoPatch(s * a, x, y, r)
 
 
 def _glint(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    x, y, r = _place(rng)
+    x, y, r = _draw_patch_place(rng)
     return lambda a: concealed.Glint(a, x, y, r)
 
 
@@ -120,7 +120,7 @@ def _dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 INSIDE: Mapping[str, EffectSampler] = {
-    "ambient_gradient": EffectSampler(("place",), _sloping(concealed.AmbientGradient), 0.01, 2.0),
+    "ambient_gradient": EffectSampler(("place",), _draw_of_gradient(concealed.AmbientGradient), 0.01, 2.0),
     "ambient_step": EffectSampler(("time",), _ambient_step, 0.5, 30.0),
     "offset_drift": EffectSampler(("time",), random_sign(concealed.OffsetDrift), 5.0, 500.0),
     "gain_drift": EffectSampler(("time",), _gain_drift, 0.03, 0.9),
@@ -138,10 +138,10 @@ INSIDE: Mapping[str, EffectSampler] = {
     "scan_misplacement": EffectSampler(("slope", "scan"), _scan_misplacement, 0.3, 8.0),
     "scan_angle_error": EffectSampler(("scan", "orientation"), _in_scans(concealed.ScanAngleError), 5.0, 45.0),
     "orientation_error": EffectSampler(("orientation",), random_sign(concealed.OrientationError), 5.0, 45.0),
-    "sensor_tilt": EffectSampler(("orientation", "slope"), _sloping(concealed.SensorTilt), 0.3, 8.0),
+    "sensor_tilt": EffectSampler(("orientation", "slope"), _draw_of_gradient(concealed.SensorTilt), 0.3, 8.0),
     "height_gradient": EffectSampler(("place",), random_sign(concealed.HeightGradient), 0.01, 0.12),
     "height_offset": EffectSampler(("scan",), _in_scans(concealed.HeightOffset), 0.3, 8.0),
-    "albedo_gradient": EffectSampler(("place",), _sloping(concealed.AlbedoGradient), 5e-4, 0.012),
+    "albedo_gradient": EffectSampler(("place",), _draw_of_gradient(concealed.AlbedoGradient), 5e-4, 0.012),
     "albedo_patch": EffectSampler(("place",), _albedo_patch, 0.05, 1.0),
     "edge_blur": EffectSampler(("edge_distance",), amplitude_only(concealed.EdgeBlur), 1.0, 8.0),
     "edge_shadow": EffectSampler(("edge_distance",), _edge_shadow, 0.02, 0.6),

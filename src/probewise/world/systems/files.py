@@ -57,7 +57,7 @@ def truth_of(case: SystemCase) -> dict[str, Any]:
     seen = case.drawn.kept_rows
     later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
     pair = len(case.effects) == 2
-    effects = [_effect(effect) for effect in case.effects]
+    effects = [_effect_json(effect) for effect in case.effects]
     if case.noise.name not in ("white", "quantised", "t4"):
         effects.append(
             {
@@ -69,8 +69,8 @@ def truth_of(case: SystemCase) -> dict[str, Any]:
         )
     return {
         "effects": effects,
-        "rivals": [] if pair or not case.effects else _named(case.effects[0]),
-        "rivals_of": {effect.name: _named(effect) for effect in case.effects} if pair else {},
+        "rivals": [] if pair or not case.effects else _rival_rows(case.effects[0]),
+        "rivals_of": {effect.name: _rival_rows(effect) for effect in case.effects} if pair else {},
         "covariates": list(case.effects[0].covariates) if len(case.effects) == 1 else [],
         "parameters": dict(case.drawn.shared),
         "noise_sd": case.drawn.kind.sd,
@@ -84,12 +84,12 @@ def truth_of(case: SystemCase) -> dict[str, Any]:
     }
 
 
-def _effect(effect: SystemEffect) -> dict[str, Any]:
+def _effect_json(effect: SystemEffect) -> dict[str, Any]:
     own = {"name": effect.name, "side": effect.form.side, "parameters": effect.parameters, "lambda": effect.size_lambda}
     return (
         own if effect.in_vocabulary else {**own, "side": "strange", "on_the_list": False, "formula": effect.form.shape}
     )
 
 
-def _named(effect: SystemEffect) -> list[list[Any]]:
+def _rival_rows(effect: SystemEffect) -> list[list[Any]]:
     return [[name, round(nats, 3)] for name, nats in effect.rivals.items()]

@@ -207,7 +207,7 @@ class _Integration:
             hair = 1e-8 if len(edges) > 2 else 0.0
             begin, end = low + hair, high - hair
             at_begin = free(begin, s) if hard else {}
-            modes = [_mode(f, size, s[names.index(f.target)], at_begin[f.target]) for f, size in hard]
+            modes = [_mode_of_motion(f, size, s[names.index(f.target)], at_begin[f.target]) for f, size in hard]
 
             n_calls = 0
 
@@ -302,7 +302,7 @@ class _Integration:
             for _ in range(_MOST_EVENTS):
                 rates = free(share, s)
                 modes = [
-                    forced.get(m, int(_mode(f, size, s[names.index(f.target)], rates[f.target])))
+                    forced.get(m, int(_mode_of_motion(f, size, s[names.index(f.target)], rates[f.target])))
                     for m, (f, size) in enumerate(hard)
                 ]
 
@@ -322,7 +322,10 @@ class _Integration:
                     rtol=_RTOL,
                     atol=_ATOL,
                     first_step=high - share,
-                    events=[_event(f, size, mode, names, free) for (f, size), mode in zip(hard, modes, strict=True)],
+                    events=[
+                        _event_of_mode_end(f, size, mode, names, free)
+                        for (f, size), mode in zip(hard, modes, strict=True)
+                    ],
                 )
                 s, share = solved.y[:, -1].copy(), float(solved.t[-1])
                 if solved.status != 1 or share >= high:
@@ -356,7 +359,7 @@ def _intervals_between(edges: Sequence[float]) -> Iterator[tuple[float, float]]:
     return ((low, high) for low, high in pairwise(edges) if high - low > _CLOSE)
 
 
-def _mode(form: Form, size: Any, value: Any, rate: Any) -> Any:
+def _mode_of_motion(form: Form, size: Any, value: Any, rate: Any) -> Any:
     """Return the mode: for friction, the direction of motion, 0 at rest; for a bound, 1 if free, 0 if held."""
     if form.sticks:
         return np.where(value != 0, np.sign(value), np.where(np.abs(rate) > size, np.sign(rate), 0.0))
@@ -370,7 +373,7 @@ def _mode_ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
     return np.where(mode == 0, rate < 0, value > size)
 
 
-def _event(form: Form, size: float, mode: int, names: list[str], free: Any) -> Any:
+def _event_of_mode_end(form: Form, size: float, mode: int, names: list[str], free: Any) -> Any:
     """Return the event function for the end of a mode: coming to rest, breaking loose, reaching or leaving a bound."""
     i = names.index(form.target)
     if form.sticks:

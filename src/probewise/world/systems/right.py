@@ -35,7 +35,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     x = fitted.coordinates + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
     for k, name in enumerate(name for b in beside for name in b.free):
         if name == "tau_s" and kind.law is not None:
-            x[:, model.n_nominal + k] = _to_quantiles(x[:, model.n_nominal + k])
+            x[:, model.n_nominal + k] = _rounded_to_quantiles(x[:, model.n_nominal + k])
     later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
     ahead = Model(kind, later, beside)
     n_shared = len(kind.shared)
@@ -68,7 +68,7 @@ def _of_unseen_run(numbers: Numbers, free: Sequence[str]) -> Numbers:
     return {k: typical if k.startswith("values[") and k not in free else v for k, v in numbers.items()}
 
 
-def _to_quantiles(values: FloatArray) -> FloatArray:
+def _rounded_to_quantiles(values: FloatArray) -> FloatArray:
     """Round each value (n_samples,) to the nearest of a few quantiles."""
     few = np.quantile(values, (np.arange(_MOMENTS) + 0.5) / _MOMENTS)
     return np.asarray(few[np.searchsorted(0.5 * (few[1:] + few[:-1]), values)])

@@ -32,7 +32,7 @@ def short_name(form: Form) -> str:
     return form.name.removesuffix(" (floor)")
 
 
-def _is_hard(form: Form) -> bool:
+def _sticks_stops_or_delays(form: Form) -> bool:
     return form.sticks or form.stops or bool(form.late)
 
 
@@ -66,9 +66,9 @@ def rivals_of(
     Loss of log likelihood in nats by name, for those below TELLING_NATS, the best first.
     """
     left = project_out((target - fitted.readings) / true.sd, fitted.slopes)
-    near = _screened(true, [f for f in forms if short_name(f) not in without], left, fitted, model)
+    near = _best_by_linearisation(true, [f for f in forms if short_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
-    hard = any(_is_hard(b.form) for b in model.added)
+    hard = any(_sticks_stops_or_delays(b.form) for b in model.added)
     for candidate in near:
         name = short_name(candidate.form)
         if hard:  # fits with dry friction or a bound take minutes: the linearised result is used
@@ -84,7 +84,9 @@ def rivals_of(
             nats = (
                 0.5
                 * wider.fit(
-                    target, np.concatenate([fitted.coordinates, own]), max_calls=5 if _is_hard(candidate.form) else 7
+                    target,
+                    np.concatenate([fitted.coordinates, own]),
+                    max_calls=5 if _sticks_stops_or_delays(candidate.form) else 7,
                 ).chi_square
             )
         except NotConvergedError:
@@ -94,7 +96,7 @@ def rivals_of(
     return dict(sorted(close.items(), key=lambda item: item[1]))
 
 
-def _screened(
+def _best_by_linearisation(
     true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model
 ) -> list[_StartOfFit]:
     """Return the best candidates by linearisation, with each form's best two starts."""
@@ -135,22 +137,24 @@ def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model:
             out[form] = (
                 with_reading_effects(unread, true.rows, [*outer, (form, as_numbers(settings[form]))]) - fitted.readings
             )
-        alone, together = _apart(true, [f for f in forms if f.side != "reading"])
+        alone, together = _alone_and_together(true, [f for f in forms if f.side != "reading"])
         for form in alone:
-            found = _simulated(true, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form]))
+            found = _simulated_or_nan(
+                true, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form])
+            )
             out[form] = found - fitted.readings
-        for chunk in _chunks(together, settings):
+        for chunk in _chunks_of_forms(together, settings):
             out |= _simulated_together(true, chunk, settings, fitted, model)
     return out
 
 
-def _apart(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
+def _alone_and_together(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
     """Divide forms into those to be simulated each alone, and those of one integration together."""
     alone = [f for f in forms if f.sticks or f.stops or true.kind.law is None]
     return alone, [f for f in forms if f not in alone]
 
 
-def _chunks(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]]) -> list[list[Form]]:
+def _chunks_of_forms(forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]]) -> list[list[Form]]:
     out: list[list[Form]] = []
     n = _CHUNK
     for form in forms:
@@ -178,7 +182,7 @@ def _simulated_together(
             numbers[name] = whole
         # For screening, a delayed column may be interpolated; a full fit treats its jumps exactly.
         placed.append((replace(form, late=""), numbers))
-    found = _simulated(true, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
+    found = _simulated_or_nan(true, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
     if len(forms) > 1 and not np.isfinite(found).all():  # one of them diverges, which stops the integration of all
         return {
             form: each
@@ -188,7 +192,9 @@ def _simulated_together(
     return {form: found[end - len(settings[form]) : end] for form, end in zip(forms, ends, strict=True)}
 
 
-def _simulated(true: TrueSystem, parameters: Mapping[str, FloatArray], effects: Sequence[Placed], n: int) -> FloatArray:
+def _simulated_or_nan(
+    true: TrueSystem, parameters: Mapping[str, FloatArray], effects: Sequence[Placed], n: int
+) -> FloatArray:
     """Simulate; NaN if a law diverges."""
     try:
         return simulate(true.kind, true.rows, parameters, effects).readings

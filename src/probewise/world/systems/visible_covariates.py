@@ -31,7 +31,7 @@ def covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[
     pooled |= {f"state:{name}": values for name, values in true.states.items()}
     if rows.time is not None:
         pooled["time"] = rows.t
-    shares = {name: _explained_share(residuals, _binned(values)) for name, values in pooled.items()}
+    shares = {name: _explained_share(residuals, _bin_numbers(values)) for name, values in pooled.items()}
     if len(rows.by_run) > 1:
         shares["run"] = _explained_share(residuals, rows.run)
     best = max(shares.values())
@@ -46,7 +46,7 @@ def _change_of_reading(true: TrueSystem) -> FloatArray:
     return out
 
 
-def _binned(values: FloatArray) -> FloatArray:
+def _bin_numbers(values: FloatArray) -> FloatArray:
     edges = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
     return np.asarray(np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
 

@@ -149,7 +149,10 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
 
 
 def play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-    """Apply play to a column: no motion until it is taken up; a run starts with the direction of its first motion."""
+    """Return a column behind gear play: it rests until the play is taken up.
+
+    At the start of each run, the play is taken up in the direction of the first motion.
+    """
     half = 0.5 * np.maximum(v["width"][:, 0], 0.0)
     out = np.empty((max(len(c), len(half)), c.shape[1]))
     for own in rows.by_run:

@@ -30,7 +30,7 @@ class Modulation:
     signed: bool = True
 
 
-def _nothing(rng: np.random.Generator) -> dict[str, float]:
+def _no_values(rng: np.random.Generator) -> dict[str, float]:
     return {}
 
 
@@ -39,13 +39,13 @@ def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[s
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
-def _plain(
+def _of_amplitude_alone(
     over: Callable[[Instants, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
 ) -> Modulation:
     return Modulation(
         over,
         lambda a, drawn: {"a": a},
-        _nothing,
+        _no_values,
         lambda a: [[{"a": a}]],
         one_by_one,
         lambda a: {"a": a},
@@ -58,13 +58,15 @@ def _plain(
 def along_time(true: TrueSystem) -> Modulation:
     """Return a linear drift in recorded time."""
     names = ("time",) if true.rows.time in (None, "time") else ("time", str(true.rows.time))
-    return _plain(lambda now, v: v["a"] * now.t, names, float(np.abs(true.rows.t).max()))
+    return _of_amplitude_alone(lambda now, v: v["a"] * now.t, names, float(np.abs(true.rows.t).max()))
 
 
 def with_column(true: TrueSystem, column: str) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording."""
     middle = true.mean_of(column)
-    return _plain(lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.sd_of(column), (column,))
+    return _of_amplitude_alone(
+        lambda now, v: v["a"] * (now.u[column] - middle), (column,), true.sd_of(column), (column,)
+    )
 
 
 def step(true: TrueSystem) -> Modulation:

@@ -45,10 +45,10 @@ def forms_out_of_vocabulary(true: TrueSystem, rng: np.random.Generator) -> Itera
         state = str(rng.choice(list(true.states)))
         yield _spring(true, state)
         yield _leak(true, state)
-        yield _driven(true, state, first)
+        yield _column_times_state(true, state, first)
 
 
-def _added(
+def _added_to_reading(
     true: TrueSystem,
     name: str,
     shape: str,
@@ -80,7 +80,7 @@ def _added(
 def _product(true: TrueSystem, one: str, other: str) -> Form:
     a, b = true.mean_of(one), true.mean_of(other)
     scale = true.sd_of(one) * true.sd_of(other)
-    return _added(
+    return _added_to_reading(
         true,
         f"product:{one}:{other}",
         "y + a (C - mean C)(D - mean D) / (sd C sd D)",
@@ -91,7 +91,7 @@ def _product(true: TrueSystem, one: str, other: str) -> Form:
 
 def _switch(true: TrueSystem, column: str, share: float) -> Form:
     at = float(np.quantile(true.rows.columns[column], share))
-    return _added(
+    return _added_to_reading(
         true,
         f"switch:{column}",
         "y + a 1(C > c)",
@@ -110,7 +110,7 @@ def _memory(true: TrueSystem, column: str) -> Form:
             out[own] = np.tanh(np.cumsum(np.abs(rows.columns[column][own] - middle)) / spread / 12)
         return out
 
-    return _added(
+    return _added_to_reading(
         true,
         f"memory:{column}",
         "y + a tanh(sum of abs(C - mean C) since the start of the run)",
@@ -131,7 +131,9 @@ def _fading(true: TrueSystem, column: str) -> Form:
         z = np.clip((y - low) / (high - low), 0, 1)
         return np.asarray(4 * z * (1 - z) * (rows.columns[column] - middle) / spread)
 
-    return _added(true, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", over, (column, "level"))
+    return _added_to_reading(
+        true, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", over, (column, "level")
+    )
 
 
 def _square(true: TrueSystem, rng: np.random.Generator) -> Form:
@@ -140,7 +142,7 @@ def _square(true: TrueSystem, rng: np.random.Generator) -> Form:
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         return np.where((hz * rows.t) % 1.0 < 0.3, 1.0, 0.0)
 
-    return _added(
+    return _added_to_reading(
         true, "square_wave", "y + a while (t / P) mod 1 < 0.3", over, ("time", str(true.rows.time)), {"hz": hz}
     )
 
@@ -152,7 +154,7 @@ def _chirp(true: TrueSystem) -> Form:
         z = (rows.t - begin) / (end - begin)
         return np.asarray(np.sin(2 * np.pi * (3 * z + 8 * z**2)))
 
-    return _added(
+    return _added_to_reading(
         true, "chirp", "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time", over, ("time", str(true.rows.time))
     )
 
@@ -164,7 +166,7 @@ def _two_settlings(true: TrueSystem) -> Form:
         since = Instants.at_rows(rows).since[0]
         return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
 
-    return _added(
+    return _added_to_reading(
         true,
         "two_settlings",
         "y + a (exp(-t / tau) - 1.5 exp(-t / (7 tau)))",
@@ -204,7 +206,7 @@ def _leak(true: TrueSystem, state: str) -> Form:
     )
 
 
-def _driven(true: TrueSystem, state: str, column: str) -> Form:
+def _column_times_state(true: TrueSystem, state: str, column: str) -> Form:
     middle, spread, most = true.mean_of(column), true.sd_of(column), float(np.abs(true.states[state]).max())
     return term_in_rate(
         true,

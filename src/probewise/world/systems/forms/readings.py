@@ -128,7 +128,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
             "saturation" if upper else "saturation (floor)",
             "reading",
             _clipped(upper),
-            _level(end, sign),
+            _clipping_level(end, sign),
             lambda rng: {},
             [[{"level": float(level)}] for level in levels],
             lambda group, amounts: dict(group[0]),
@@ -147,7 +147,7 @@ def _clipped(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatAr
     return lambda y, rows, v: np.asarray(bound(y, v["level"]))
 
 
-def _level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
+def _clipping_level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
     """Return the level that clips by an amplitude."""
     return lambda a, drawn: {"level": end + sign * a}
 

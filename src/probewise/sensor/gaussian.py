@@ -151,8 +151,8 @@ def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArr
     for i, j in np.ndindex(*shape):
         cov = np.array(
             [
-                [_at(gaussian.var_x, i, j), _at(gaussian.cov_xy, i, j)],
-                [_at(gaussian.cov_xy, i, j), _at(gaussian.var_y, i, j)],
+                [_entry(gaussian.var_x, i, j), _entry(gaussian.cov_xy, i, j)],
+                [_entry(gaussian.cov_xy, i, j), _entry(gaussian.var_y, i, j)],
             ]
         )
         variance, axes = np.linalg.eigh(cov)
@@ -170,11 +170,11 @@ def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArr
     return out
 
 
-def _at(array: FloatArray, i: int, j: int) -> float:
+def _entry(array: FloatArray, i: int, j: int) -> float:
     return float(array[i if array.shape[0] > 1 else 0, j if array.shape[1] > 1 else 0])
 
 
-def _between(outside: float, inside: float, share: FloatArray) -> FloatArray:
+def _mix_by_share(outside: float, inside: float, share: FloatArray) -> FloatArray:
     if (outside, inside) == (0.0, 1.0):
         return share
     return outside + (inside - outside) * share
@@ -193,7 +193,7 @@ def _(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArra
     shift = cosine * gaussian.dx_mm + sine * gaussian.dy_mm
     variance = cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + 2 * cosine * sine * gaussian.cov_xy
     per_sd = 1 / np.sqrt(variance)
-    return _between(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
+    return _mix_by_share(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
 
 
 @seen_by_one.register
@@ -232,7 +232,7 @@ def _(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         for k in range(-4, 6):  # 8 sd are at most 3.2 periods
             total += normal_cdf((a - k) / s) - normal_cdf((a - k - d) / s)
         share[coarse] = total
-    return _between(region.outside, region.inside, share)
+    return _mix_by_share(region.outside, region.inside, share)
 
 
 _FAR = 26.0  # sds: the mass beyond is 0, and exp is ten times slower where it underflows
@@ -276,7 +276,7 @@ def beyond_corner(z1: FloatArray, z2: FloatArray, rho: FloatArray) -> tuple[Floa
 def _(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     corner, direction = region.corner_mm, region.direction
     share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], gaussian)
-    return _between(region.outside, region.inside, share)
+    return _mix_by_share(region.outside, region.inside, share)
 
 
 def mass_in_quadrant(
@@ -319,7 +319,7 @@ def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         near = (np.abs(height) < _REACH) & (start < _REACH) & (end > -_REACH) & (height != 0)
         angle[near] -= 2 * np.pi * _mass_beyond(height[near], start[near], end[near])
         turning += angle
-    return _between(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
+    return _mix_by_share(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
 
 
 @seen_by_one.register
@@ -373,7 +373,7 @@ def _(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         var_q = (sine**2 * gaussian.var_x + cosine**2 * gaussian.var_y - cross) / b**2
         twist = cosine * sine * (gaussian.var_y - gaussian.var_x) + (cosine**2 - sine**2) * gaussian.cov_xy
         cov_pq = twist / (a * b)
-    return _between(region.outside, region.inside, _seen_of_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes))
+    return _mix_by_share(region.outside, region.inside, _seen_of_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes))
 
 
 def _seen_of_unit_disc(
@@ -444,15 +444,15 @@ def _mass_in_disc(
         inside = np.abs(mean_y) + _hermite(n)[0][-1] * sd_y < 1
         rows = np.flatnonzero(left & inside & (curvature < most))
         left[rows] = False
-        for r in _blocks(rows, n):
+        for r in _blocks_of_rows(rows, n):
             found[r] = _skewed_chords(mean_x[r], mean_y[r], sd_y[r], per_sd[r], tilt[r], n)
     rule = _legendre(n_nodes)
-    for r in _blocks(np.flatnonzero(left), n_nodes):
+    for r in _blocks_of_rows(np.flatnonzero(left), n_nodes):
         found[r] = _long_chords(d[r], var_r[r], var_t[r], cov[r], reach, rule)
     return found
 
 
-def _blocks(rows: IntArray, n_nodes: int) -> Iterator[IntArray]:
+def _blocks_of_rows(rows: IntArray, n_nodes: int) -> Iterator[IntArray]:
     step = max(1, _BLOCK // n_nodes)
     return (rows[start : start + step] for start in range(0, len(rows), step))
 
@@ -552,9 +552,9 @@ def _(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
             region,
             float(x[i, j]),
             float(y[i, j]),
-            _at(gaussian.var_x, i, j),
-            _at(gaussian.var_y, i, j),
-            _at(gaussian.cov_xy, i, j),
+            _entry(gaussian.var_x, i, j),
+            _entry(gaussian.var_y, i, j),
+            _entry(gaussian.cov_xy, i, j),
         )
     return out
 

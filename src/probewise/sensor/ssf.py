@@ -328,21 +328,21 @@ def total_variation(mixture: FixedMixture, field: SSFField) -> float:
 
     Both are compared on the field's pixels; the mixture's mass outside them counts in full.
     """
-    sampled = _density(mixture, field.centers_mm) * field.pixel_mm**2
+    sampled = _mixture_density(mixture, field.centers_mm) * field.pixel_mm**2
     missing = max(0.0, 1.0 - float(sampled.sum()))
     return 0.5 * (float(np.abs(sampled - field.values.ravel()).sum()) + missing)
 
 
-def _density(mixture: FixedMixture, points: FloatArray) -> FloatArray:
+def _mixture_density(mixture: FixedMixture, points: FloatArray) -> FloatArray:
     total = np.zeros(len(points))
     for w, mean, cov in zip(mixture.weights, mixture.means_mm, mixture.covs_mm2, strict=True):
         off = points - mean
-        quadratic = _quadratic(off, np.linalg.inv(cov))
+        quadratic = _quadratic_form(off, np.linalg.inv(cov))
         total += w * np.exp(-0.5 * quadratic) / (2 * np.pi * np.sqrt(np.linalg.det(cov)))
     return total
 
 
-def _quadratic(off: FloatArray, matrix: FloatArray) -> FloatArray:
+def _quadratic_form(off: FloatArray, matrix: FloatArray) -> FloatArray:
     """Compute the quadratic form off' matrix off of each row, off (n, 2)."""
     x, y = off[:, 0], off[:, 1]
     return np.asarray(matrix[0, 0] * x * x + matrix[1, 1] * y * y + 2 * matrix[0, 1] * x * y)
@@ -377,7 +377,7 @@ def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gauss
         log_p = np.empty((len(w), n_gaussians))
         for k in range(n_gaussians):
             inverse = np.linalg.inv(shapes[k])
-            quadratic = _quadratic(means - centers[k], inverse) + flat_covs @ inverse.ravel()
+            quadratic = _quadratic_form(means - centers[k], inverse) + flat_covs @ inverse.ravel()
             log_p[:, k] = np.log(weights[k]) - 0.5 * (quadratic + np.log(np.linalg.det(shapes[k])))
         top = log_p.max(axis=1, keepdims=True)
         p = np.exp(log_p - top)

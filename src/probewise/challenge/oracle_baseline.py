@@ -26,7 +26,7 @@ Hidden = Mapping[str, Any]
 
 def oracle_name_rate(hidden: Hidden) -> float:
     """Return the probability that the right name or an alias of it ranks before its most similar rival."""
-    return _against_the_hardest(hidden, right_names(hidden))
+    return _rate_against_closest_rival(hidden, right_names(hidden))
 
 
 def oracle_covariate_rate(hidden: Hidden) -> float:
@@ -35,7 +35,7 @@ def oracle_covariate_rate(hidden: Hidden) -> float:
     named = [name for name in hidden["cosines"] if name in VOCABULARY]
     covariates = {name: cast(tuple[str, ...], VOCABULARY[name].covariates) for name in named}
     covariates["ssf_order"] = ("edge_distance",)
-    return _against_the_hardest(hidden, {name for name, own in covariates.items() if shown & set(own)})
+    return _rate_against_closest_rival(hidden, {name for name, own in covariates.items() if shown & set(own)})
 
 
 def oracle_set_size(hidden: Hidden) -> float:
@@ -64,7 +64,7 @@ def readings_by_repeating(result: Mapping[str, Any]) -> float:
     return float(result["readings"]) * HONEST_NATS / apart if apart > 0 else np.inf
 
 
-def _against_the_hardest(hidden: Hidden, right: Set[str]) -> float:
+def _rate_against_closest_rival(hidden: Hidden, right: Set[str]) -> float:
     return min(
         (float(ndtr(d / 2)) for name, d in _distances_of_rivals(hidden).items() if name not in right), default=1.0
     )

@@ -39,12 +39,12 @@ def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
 def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
     """Estimate the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
     found = bootstrapped(
-        np.array([leading_probability(result) for result in results], dtype=np.float64).reshape(-1, 2), _error
+        np.array([leading_probability(result) for result in results], dtype=np.float64).reshape(-1, 2), _error_of_rows
     )
     return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found
 
 
-def _error(said: FloatArray) -> float:
+def _error_of_rows(said: FloatArray) -> float:
     """Return the calibration error of rows (probability, right or not), (n, 2)."""
     off = np.bincount(_bins_of(said[:, 0]), said[:, 0] - said[:, 1])
     return float(np.abs(off).sum()) / len(said)

@@ -87,19 +87,21 @@ def _share_detected(results: list[Result]) -> Estimate:
     return rejection_rate([r for r in singles_of(results, 8.0) if acts_on_mean(r)], 0.01)
 
 
-def _pairs(results: list[Result]) -> list[Result]:
+def _pair_results(results: list[Result]) -> list[Result]:
     return [r for r in results if r["kind"] == "pair"]
 
 
 def _pairs_named(results: list[Result]) -> Estimate:
-    return share([leading_name_right(r) for r in _pairs(results)])
+    return share([leading_name_right(r) for r in _pair_results(results)])
 
 
 def _pairs_extra(results: list[Result]) -> Estimate:
     def named(r: Result) -> list[str]:
         return [name for name in leading(r, clean=True)[0] if name not in NOISE]
 
-    return share([bool(count_extras(named(r), effects_to_name(r, merged=True, noise=False))) for r in _pairs(results)])
+    return share(
+        [bool(count_extras(named(r), effects_to_name(r, merged=True, noise=False))) for r in _pair_results(results)]
+    )
 
 
 def _physics_on_clean(results: list[Result]) -> Estimate:

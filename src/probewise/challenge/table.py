@@ -222,12 +222,12 @@ def _held_out_rows(done: list[Result]) -> list[Row]:
     gains = _gains_of([r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right")
     white = [r for r in inside if r["noise_model"] == "white"]
     outside = [r for r in done if r["kind"] == "outside" and r["noise_model"] == "white"]
-    worse = [_gains(r, _SCANS, "true")[0] < -1.0 for r in done]
+    worse = [_gains_over_null(r, _SCANS, "true")[0] < -1.0 for r in done]
     return [
-        Row("held-out gain, share of the right model's", bootstrapped(gains, _ratio), 0.98),
-        *(Row(f"  a new {scan}", bootstrapped(gains[:, k], _ratio)) for k, scan in enumerate(_SCANS)),
-        Row("  share of what the truth itself would gain", bootstrapped(_gains_of(white, "true"), _ratio)),
-        Row("  the same, outside the vocabulary", bootstrapped(_gains_of(outside, "true"), _ratio)),
+        Row("held-out gain, share of the right model's", bootstrapped(gains, _ratio_of_gains), 0.98),
+        *(Row(f"  a new {scan}", bootstrapped(gains[:, k], _ratio_of_gains)) for k, scan in enumerate(_SCANS)),
+        Row("  share of what the truth itself would gain", bootstrapped(_gains_of(white, "true"), _ratio_of_gains)),
+        Row("  the same, outside the vocabulary", bootstrapped(_gains_of(outside, "true"), _ratio_of_gains)),
         Row("held-out worse than the null by over 1 nat", share(worse), most=0.01),
         # The scatter that noise alone causes in the best gain possible with these readings.
         Row(
@@ -238,16 +238,16 @@ def _held_out_rows(done: list[Result]) -> list[Row]:
 
 def _gains_of(results: Sequence[Result], best: str) -> FloatArray:
     """Return the gains of the repaired and the best model over the null, (n_cases, n_scans, 2)."""
-    gains = [[_gains(r, [scan], best) for scan in _SCANS] for r in results]
+    gains = [[_gains_over_null(r, [scan], best) for scan in _SCANS] for r in results]
     return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
 
 
-def _gains(result: Result, scans: Sequence[str], best: str) -> tuple[float, float]:
+def _gains_over_null(result: Result, scans: Sequence[str], best: str) -> tuple[float, float]:
     own = [result["held_out"][scan] for scan in scans]
     return sum(s["repaired"] - s["null"] for s in own), sum(s[best] - s["null"] for s in own)
 
 
-def _ratio(gains: FloatArray) -> float:
+def _ratio_of_gains(gains: FloatArray) -> float:
     repaired, true = gains.reshape(-1, 2).sum(axis=0)
     return float(repaired / true)
 

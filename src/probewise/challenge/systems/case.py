@@ -38,7 +38,7 @@ def run_system_case(task: Task) -> dict[str, Any]:
         warnings.simplefilter("ignore", DoubtfulResultWarning)  # doubtful results are scored like the others
         try:
             case = draw_system_case(task.seed, task.number)
-            result |= _truth(case)
+            result |= _truth_json(case)
             at = "diagnosis"
             result |= _diagnosed(case, task)
         # A campaign survives a case that breaks the diagnosis, and reports it.
@@ -55,7 +55,7 @@ def run_system_case(task: Task) -> dict[str, Any]:
     return result
 
 
-def _truth(case: SystemCase) -> dict[str, Any]:
+def _truth_json(case: SystemCase) -> dict[str, Any]:
     kind = case.drawn.kind
     of_noise = {"white": [], "quantised": [], "t4": ["outliers"]}.get(case.noise.name, [case.noise.name])
     names = [effect.name for effect in case.effects]
@@ -67,13 +67,13 @@ def _truth(case: SystemCase) -> dict[str, Any]:
         "noise_text": case.noise_text,
         "readings": len(case.drawn.kept_rows),
         "truth": ["unknown"] if strange else sorted([*names, *of_noise]),
-        "hidden": [_effect(effect) for effect in case.effects],
+        "hidden": [_effect_json(effect) for effect in case.effects],
         "alias": None,
         "cosine": case.cosine,
     }
 
 
-def _effect(effect: SystemEffect) -> dict[str, Any]:
+def _effect_json(effect: SystemEffect) -> dict[str, Any]:
     """Describe one effect; a rival's loss in nats is converted to a cosine."""
     squared = effect.size_lambda**2
     return {

@@ -133,7 +133,7 @@ def gains_of(result: Result, best: str) -> tuple[float, float] | None:
     return min(repaired, _MOST_NATS), min(most, _MOST_NATS)
 
 
-def _shares(results: Sequence[Result]) -> FloatArray:
+def _gain_shares(results: Sequence[Result]) -> FloatArray:
     gains = [g for g in (gains_of(r, "right") for r in results) if g is not None and g[1] >= _LEAST_NATS]
     return np.array([[repaired / right] for repaired, right in gains]).reshape(-1, 1)
 
@@ -143,7 +143,7 @@ def _held_out_rows(done: list[Result]) -> list[Row]:
     clean = [g[0] for g in (gains_of(r, "true") for r in done if r["kind"] == "clean") if g is not None]
     every = [g[0] for g in (gains_of(r, "true") for r in done) if g is not None]
     return [
-        Row("held-out runs: median share of the right model's gain", bootstrapped(_shares(named), _median), 0.95),
+        Row("held-out runs: median share of the right model's gain", bootstrapped(_gain_shares(named), _median), 0.95),
         Row("held-out worse than the null by over 3 nats", share([bool(g < -3.0) for g in every])),
         Row("  of clean ones", share([bool(g < -3.0) for g in clean])),
     ]

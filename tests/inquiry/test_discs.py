@@ -51,7 +51,7 @@ def test_the_weights_of_levels_are_those_of_asking_every_hypothesis(made, turn):
     """On a subset of places: by rounding a hypothesis may count for the next level, but the mean stays."""
     theta, grid = made.circles(300), Grid()
     weight = rng(2).dirichlet(np.ones(300))
-    mass = DiscTable.of(made.chain()).mass(theta, weight, grid, LEVELS, np.full(grid.n_places, turn))
+    mass = DiscTable.of(made.chain()).level_histogram(theta, weight, grid, LEVELS, np.full(grid.n_places, turn))
     rows = rng(3).integers(grid.n_places, size=300)
     answers = made.chain().predict(theta, grid.plan("field", orientation_rad=turn).take(rows))
     np.testing.assert_allclose(mass.sum(axis=1), 1.0, atol=1e-12)
@@ -67,7 +67,7 @@ def test_an_orientation_of_each_place_is_that_place_turned(made):
     theta, grid = made.circles(100), Grid()
     weight = np.full(100, 0.01)
     turn = rng(4).uniform(-3, 3, grid.n_places)
-    mass = DiscTable.of(made.chain()).mass(theta, weight, grid, LEVELS, turn)
+    mass = DiscTable.of(made.chain()).level_histogram(theta, weight, grid, LEVELS, turn)
     rows = rng(5).integers(grid.n_places, size=200)
     plan = Designs(grid).plan("field")
     answers = made.chain().predict(theta, type(plan)(**{**vars(plan), "orientation_rad": turn}).take(rows))
@@ -76,7 +76,7 @@ def test_an_orientation_of_each_place_is_that_place_turned(made):
 
 def test_the_naive_sensor_is_counted_exactly(made):
     theta, grid = made.circles(200), Grid()
-    mass = DiscTable.of(made.naive()).mass(
+    mass = DiscTable.of(made.naive()).level_histogram(
         theta, np.full(200, 0.005), grid, np.array([10.0, 60.0]), np.zeros(grid.n_places)
     )
     share = (made.naive().predict(theta, grid.plan("field")) > 35).mean(axis=0)
@@ -86,7 +86,7 @@ def test_the_naive_sensor_is_counted_exactly(made):
 def test_discs_that_leave_the_field_or_lie_between_its_rows_are_counted(made):
     theta = np.array([[0.0, 0.0, 20.0], [1048.0, 520.0, 150.0], [500.3, 260.9, 20.0], [524.0, -10.0, 20.0]])
     grid = Grid()
-    mass = DiscTable.of(made.chain()).mass(theta, np.full(4, 0.25), grid, LEVELS, np.zeros(grid.n_places))
+    mass = DiscTable.of(made.chain()).level_histogram(theta, np.full(4, 0.25), grid, LEVELS, np.zeros(grid.n_places))
     expected = made.chain().predict(theta, grid.plan("field")).mean(axis=0)
     np.testing.assert_allclose(mass @ LEVELS, expected, atol=0.25)  # one hypothesis a place: its level is rounded
 

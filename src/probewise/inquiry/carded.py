@@ -29,7 +29,10 @@ def cards_of(model: SensorModel) -> tuple[Card, ...]:
 
 @dataclass(frozen=True, eq=False)
 class CardedModel:
-    """A sensor model without effects: the shape by tables, known cards in closed form."""
+    """A sensor model without effects, for a shape partly covered by known cards.
+
+    `plain` predicts the shape alone, and `chain` the share of the footprint on each card.
+    """
 
     chain: Chain
     plain: SensorModel
@@ -114,7 +117,7 @@ class CardedForecast:
 
 @dataclass(frozen=True, eq=False)
 class _AsModel:
-    """A forecast's predictions as a sensor model's."""
+    """Adapter that makes a forecast a sensor model."""
 
     forecast: Forecast
 

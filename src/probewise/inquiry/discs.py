@@ -143,7 +143,7 @@ class DiscTable:
         np.put(out, near, low + along_bend * (ring(corner + n_directions * n_distances) - low))
         return out
 
-    def mass(
+    def level_histogram(
         self, theta: FloatArray, weight: FloatArray, grid: Grid, levels: FloatArray, turn_rad: FloatArray
     ) -> FloatArray:
         """Return the weighted histogram of predicted levels at every place of a grid.
@@ -182,6 +182,8 @@ class DiscTable:
             rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
             mass[rows] = spans.histogram(weight, ring, level, (dark, bright), n_levels)
         return mass
+
+    mass = level_histogram  # its old name
 
     def _margin_of(self, nearest: IntArray, ends: tuple[int, int]) -> float:
         """Return the distance from an edge beyond which the nearest of a list of levels is constant."""

@@ -61,7 +61,7 @@ class Ellipses:
         )
 
     def along(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
-        """Intersect ellipses with rows of places, both (n_crossings,)."""
+        """Intersect ellipse number `which` with the row of places at `y_mm`; both (n_crossings,)."""
         lab, grows, off, into, axes = (
             values.take(which, axis=-1) for values in (self.lab, self.grows, self.off, self.into, self.axes)
         )

@@ -65,7 +65,7 @@ class EdgesInFootprintSds:
         )
 
     def along(self, which: IntArray, y_mm: FloatArray) -> CrossedPolygons:
-        """Intersect polygons with rows of places, both (n_crossings,)."""
+        """Intersect polygon number `which` with the row of places at `y_mm`; both (n_crossings,)."""
         slope, up, offset = (values.take(which, axis=-1) for values in (self.across, self.up, self.offset))
         return CrossedPolygons(self.share, slope, up * y_mm + offset, self.opening, which)
 

@@ -78,7 +78,10 @@ class _DiscPredictive:
         for number, at, places in by_combination(self.rows, self.grid.n_places):
             turn = self.turns_rad[number]
             if stood is None or not np.array_equal(stood, turn):
-                stood, mass = turn, self.table.mass(self.theta[some], weight[some], self.grid, self.levels, turn)
+                stood, mass = (
+                    turn,
+                    self.table.level_histogram(self.theta[some], weight[some], self.grid, self.levels, turn),
+                )
             yield at, mass if len(places) == len(mass) else mass[places]
 
 
@@ -206,7 +209,7 @@ class _TabulatedPredictive:
             if stood != self.ways[number]:
                 stood = self.ways[number]
                 shapes, dark, bright = self.shapes_at[stood]
-                mass = shapes.mass(weight, self.grid, dark, bright, self.levels)
+                mass = shapes.level_histogram(weight, self.grid, dark, bright, self.levels)
             yield at, mass if len(places) == len(mass) else mass[places]
 
 

@@ -78,7 +78,9 @@ class TabulatedShapes:
             out[rows] = seen.reshape(len(rows), len(x_mm))
         return out
 
-    def mass(self, weight: FloatArray, grid: Grid, dark: float, bright: float, levels: FloatArray) -> FloatArray:
+    def level_histogram(
+        self, weight: FloatArray, grid: Grid, dark: float, bright: float, levels: FloatArray
+    ) -> FloatArray:
         """Return the weighted histogram of predicted levels at every place of a grid.
 
         Parameters

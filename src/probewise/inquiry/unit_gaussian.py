@@ -49,7 +49,9 @@ def _index_of(distance: FloatArray) -> IntArray:
 
 @cache
 def _corners() -> FloatArray:
-    """Tabulate the bivariate normal CDF (N_OPENINGS, n, n), by Plackett's integral over the correlation's arc sine.
+    """Tabulate the bivariate normal CDF F(h, k; r) for correlations r and distances h, k: (N_OPENINGS, n, n).
+
+    Plackett's integral over t, the correlation's arc sine:
 
     d/dt F(h, k; sin t) = exp(-(h^2 - 2 h k sin t + k^2) / (2 cos^2 t)) / 2 pi (Plackett 1954), from F(h, k; 0), the
     product; and F(h, k; -r) = F(h) - F(h, -k; r).

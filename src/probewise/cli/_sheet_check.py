@@ -53,7 +53,10 @@ class SheetCheck:
             self._shades[rows] = shades(plan.patterns[name], places[rows])
 
     def check_reading(self, row: int, value: float) -> str | None:
-        """Check the reading of a plan's row; return a complaint, at most once per sheet and shade, or None."""
+        """Return a complaint if the reading of a plan's row contradicts its sheet's pattern, else None.
+
+        There is at most one complaint for each sheet and shade, white or black.
+        """
         shade = self._shades[row]
         if math.isnan(shade) or math.isnan(value):
             return None

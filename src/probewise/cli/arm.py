@@ -191,7 +191,7 @@ def _task(
 
 
 def _add_arm(parser: argparse.ArgumentParser, arms: str | None = None) -> None:
-    """Add --arm with its help; by default only a real brick is allowed."""
+    """Add --arm; `arms` is its help, by default that of a real brick."""
     if arms is None:
         parser.add_argument("--arm", metavar="nxt:PORT", help="the brick, such as nxt:/dev/rfcomm0 or nxt:COM5")
     else:

@@ -42,7 +42,7 @@ class OrientationError(LinearEffect[Poses]):
         return True
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"in all scans the sensor is turned {_too_far(mean[0], sd[0])}"
+        return f"in all scans the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}"
 
 
 @dataclass(frozen=True)
@@ -71,9 +71,9 @@ class ScanAngleError(OneScanEffect[Poses]):
         return entries(self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0]))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"in {scans_in_words(self.scans)} the sensor is turned {_too_far(mean[0], sd[0])}"
+        return f"in {scans_in_words(self.scans)} the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}"
 
 
-def _too_far(deg: float, sd: float) -> str:
+def _extra_turn_in_words(deg: float, sd: float) -> str:
     way = "anticlockwise" if deg > 0 else "clockwise"
     return f"{give_or_take(abs(deg), sd)} degrees further {way} than commanded"

@@ -120,7 +120,7 @@ class Output:
         if self.run_state == RunState.RAMP_DOWN:
             self._ramp_down()
         if self.run_state == RunState.RUNNING:
-            self._run()
+            self._run_until_limit()
         if self.run_state == RunState.IDLE:
             self._fade()
 
@@ -219,7 +219,7 @@ class Output:
             self.run_state, self._regulation = RunState.IDLE, 0
         self._drive_unregulated()
 
-    def _run(self) -> None:
+    def _run_until_limit(self) -> None:
         """Check for the limit; without one, carry the goal along."""
         if self._endless:
             if self.target_power:

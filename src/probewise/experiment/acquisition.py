@@ -57,11 +57,15 @@ def inquire(
     drawn
         A few equally weighted posterior samples, (n_samples, n_params).
     field
-        Reach of the arm.
+        The places that the arm reaches, with its travel times.
     at
-        The last reading, at whose place the arm is; None before the first, when travel times do not count.
+        The last reading, which says where the arm is. None before the first reading, which costs no travel time.
     goal
         What the readings have to reach; None: the experiment's own.
+
+    Returns
+    -------
+    What is expected of each available reading, and their utilities.
     """
     designs = experiment.designs
     rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.combinations))

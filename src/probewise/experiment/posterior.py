@@ -227,7 +227,11 @@ def reconsidered(
     rng: np.random.Generator,
     from_scratch: FromScratch,
 ) -> Posterior:
-    """Sample every rival again that might matter, unless it already was; called before a run ends."""
+    """Return the posterior with rivals sampled again; called before a run ends.
+
+    Left as they are: rivals that were sampled in this way before and have followed the readings since, and rivals that
+    are hopelessly improbable.
+    """
     problems = [kind.problem(recording) for kind in posterior.kinds]
     now = replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
     return _reestimated_where_doubtful(

@@ -176,7 +176,10 @@ class Ellipse:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over centre, major axis and angle; the minor axis uniform below the major."""
+        """Uniform over the semi-major axis, the angle and the places of the centre; semi-minor axis uniform below it.
+
+        With `inside`, the places are those that keep this ellipse on the field.
+        """
         return PlacedPrior(self.field, _EllipseOwnPrior(self.semi_axes_mm), _ellipse_extent if self.inside else None)
 
     def region(self, theta: FloatArray) -> EllipseRegion:

@@ -216,7 +216,7 @@ class PooledSigma:
         object.__setattr__(self, "square", frozen(self.square))
 
     def log_density(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the marginal log density of new readings, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
+        """Return new readings' marginal log density, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
         square = self.square[:, None]
         more = log_sigma_integral(
             square + residuals(readings, predicted) ** 2, self.n + 1, self.sd_floor, self.sd_ceiling

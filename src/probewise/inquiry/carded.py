@@ -29,9 +29,9 @@ def cards_of(model: SensorModel) -> tuple[Card, ...]:
 
 @dataclass(frozen=True, eq=False)
 class CardedModel:
-    """A sensor model without effects, for a shape partly covered by known cards.
+    """A sensor model without effects, for a shape and known cards on the field.
 
-    `plain` predicts the shape alone, and `chain` the share of the footprint on each card.
+    `plain` predicts the shape alone, `chain` in closed form the share of the footprint on each card.
     """
 
     chain: Chain

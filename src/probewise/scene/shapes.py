@@ -176,9 +176,9 @@ class Ellipse:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over the semi-major axis, the angle and the places of the centre; semi-minor axis uniform below it.
+        """Uniform over centre, semi-major axis and angle; the semi-minor axis uniform below the semi-major.
 
-        With `inside`, the places are those that keep this ellipse on the field.
+        With `inside`, the centre is uniform over the places that keep the ellipse on the field.
         """
         return PlacedPrior(self.field, _EllipseOwnPrior(self.semi_axes_mm), _ellipse_extent if self.inside else None)
 

@@ -8,7 +8,7 @@ import pytest
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, FittedSensor, calibrate, choose_pixel_mm, default_prior, mean_field
 from probewise.calibration.compensation import Compensation
-from probewise.calibration.posing import Posing
+from probewise.calibration.order_problems import OrderProblems
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FreeLevels, FreeMixture, mixture_names
@@ -82,9 +82,9 @@ def make_compensation(recording: Recording) -> Callable[..., Compensation]:
         theta = np.concatenate([shapes, np.tile([11.0, 58.0], (300, 1))], axis=1)
         theta *= 1.0 + spread * rng.standard_normal(theta.shape)
         rest = below.coordinates.leave(below.coordinates.enter(theta))[0]
-        posing = Posing(recording, default_prior)
+        problems = OrderProblems(recording, default_prior)
         return Compensation.of(
-            posing.problem(n - 1), below.coordinates, posing.problem(1), rest, rng=rng, n_pool=n_pool
+            problems.problem(n - 1), below.coordinates, problems.problem(1), rest, rng=rng, n_pool=n_pool
         )
 
     return make

@@ -12,10 +12,10 @@ from probewise._arrays import FloatArray
 from probewise.calibration import Climb, Rung, calibrate, default_prior
 from probewise.calibration.climb import climb
 from probewise.calibration.compensation import Compensation
-from probewise.calibration.ladder import climb_orders
+from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import search_order
 from probewise.calibration.parts import WholeFrame
-from probewise.calibration.posing import Posing
+from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.calibration.reference import Reference
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError
@@ -102,18 +102,18 @@ def test_other_priors_of_light_are_searched_in_full(recording: Recording) -> Non
         return replace(default_prior(given, n), i_min=Uniform(-1.0 * n, 40.0))
 
     for prior, why in ((paper, "not uniform"), (growing, "differs from order to order")):
-        posing = Posing(recording, prior)
-        search = partial(search_order, posing, n_live=50)
-        found, notes = climb_orders(posing, (1, 2), search=search, rng=np.random.default_rng(0))
+        problems = OrderProblems(recording, prior)
+        search = partial(search_order, problems, n_live=50)
+        found, notes = fit_orders_quickly(problems, (1, 2), search=search, rng=np.random.default_rng(0))
         assert not found
         assert why in notes[0]
 
 
 def test_few_readings_are_searched_in_full(recording: Recording) -> None:
     few = Recording(recording.plan.take(np.arange(0, 135, 2)), recording.readings[::2])
-    posing = Posing(few, default_prior)
-    search = partial(search_order, posing, n_live=50)
-    found, notes = climb_orders(posing, (1, 2), search=search, rng=np.random.default_rng(0))
+    problems = OrderProblems(few, default_prior)
+    search = partial(search_order, problems, n_live=50)
+    found, notes = fit_orders_quickly(problems, (1, 2), search=search, rng=np.random.default_rng(0))
     assert not found
     assert "68 usable readings" in notes[0]
 

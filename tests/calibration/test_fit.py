@@ -11,7 +11,7 @@ import pytest
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
 from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth, wilson_interval
-from probewise.calibration.distinct import DistinctRows
+from probewise.calibration.distinct_rows import DistinctRows
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import EvidenceChange, RoundSummary
@@ -191,8 +191,9 @@ def test_a_simulated_recording_holds_the_readings_of_its_truth() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::probewise.errors.DoubtfulResultWarning")
 def test_orders_run_elsewhere_give_the_same_result(recording):
-    """Every order has a stream of its own: here one after another, there on an executor."""
+    """Every order has a stream of its own: here one after another, there on an executor. Thirty live points are few."""
     here, there = (
         calibrate(recording, orders=(1, 2), n_live=30, rng=np.random.default_rng(3), executor=executor)
         for executor in (None, ThreadPoolExecutor(2))

@@ -7,8 +7,8 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import default_prior
-from probewise.calibration.around_peak import PeakDensity, StudentTDensity, share_missed_about
 from probewise.calibration.peak_coordinates import PeakCoordinates
+from probewise.calibration.peak_density import PeakDensity, StudentTDensity, share_missed_about
 from probewise.inference import SensorProblem
 from probewise.recordings import Recording
 

@@ -8,12 +8,12 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SSFPrior, default_prior
-from probewise.calibration.around_peak import PeakDensity, StudentTDensity
 from probewise.calibration.compensation import Compensation
+from probewise.calibration.mixed_reference import MixedReference
+from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.peak_coordinates import PeakCoordinates
-from probewise.calibration.posing import Posing
+from probewise.calibration.peak_density import PeakDensity, StudentTDensity
 from probewise.calibration.reference import Reference, has_reference
-from probewise.calibration.seeded import SeededReference
 from probewise.calibration.whole_coordinates import FAINT, count_bright
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
@@ -87,7 +87,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
         PeakDensity(space, StudentTDensity(y.mean(axis=0), width * np.linalg.cholesky(np.cov(y, rowvar=False))))
         for width in (0.4, 0.9)
     )
-    seeded = SeededReference(references[2, 1], peaks, 0.0)
+    seeded = MixedReference(references[2, 1], peaks, 0.0)
     drawn = seeded.draw(_sorted_draws(default_prior(recording, 1), 10_000, 1, rng)[0], rng=rng)
     weight = np.zeros(len(drawn))
     alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
@@ -96,10 +96,10 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
     weight[alive] = np.exp(-seeded.log_over_prior(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
     # The lighter of two uniform numbers is below a tenth of the other.
     assert abs(weight.mean() - FAINT) < 4 * weight.std() / np.sqrt(len(weight)) < 0.04
-    there, log_drawn = seeded.redrawn(drawn[alive], rng=rng)
+    there, log_drawn = seeded.propose(drawn[alive], rng=rng)
     assert there.shape == (len(alive), 14)
     assert np.isfinite(log_drawn).mean() > 0.1
-    assert seeded.redrawn(drawn[:0], rng=rng)[0].shape == (0, 14)
+    assert seeded.propose(drawn[:0], rng=rng)[0].shape == (0, 14)
 
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
@@ -122,8 +122,8 @@ def test_undoing_a_compensated_gaussian_gives_the_others_back(
 def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth: FloatArray, noise_sd: float) -> None:
     """Two routes: covariances over posterior samples, and the normal equations with a numerical derivative."""
     rng = np.random.default_rng(34)
-    posing = Posing(recording, default_prior)
-    problem, space = posing.problem(1), default_prior(recording, 1).coordinates
+    problems = OrderProblems(recording, default_prior)
+    problem, space = problems.problem(1), default_prior(recording, 1).coordinates
     truth = truth.copy()
     truth[0] = 0.5  # changes no reading; below the prior's bound
 
@@ -200,7 +200,7 @@ def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
     here, _ = _sorted_draws(prior, 3000, m, rng)
     start = here
     for _ in range(12):
-        there, log_drawn = reference.redrawn(here, rng=rng)
+        there, log_drawn = reference.propose(here, rng=rng)
         moved = np.isfinite(there).all(axis=1)
         moved[moved] = np.isfinite(prior.log_prob(there[moved])) & (count_bright(there[moved]) == m)
         moved &= np.log(rng.random(len(here))) < log_drawn

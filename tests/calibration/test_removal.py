@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.calibration import default_prior
-from probewise.calibration.posing import Posing
+from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.removal import Removal, bridged
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.recordings import Recording
@@ -22,24 +22,24 @@ def _near_truth(truth: FloatArray, n: int, rng: np.random.Generator) -> FloatArr
 def _by_grid(recording: Recording, theta: FloatArray, k: int) -> float:
     """Integrate the likelihood over the light of Gaussian k, by problems of N and of N - 1 on a fine grid."""
     n = (len(theta) - 2) // 6
-    posing = Posing(recording, default_prior)
+    problems = OrderProblems(recording, default_prior)
     g = theta[:-2].reshape(n, 6)
     light = g[:, 0] / np.sqrt(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
     most = np.delete(light, k).max()
     t = np.geomspace(1e-7, FAINT, 3_000)
     many = np.tile(theta, (len(t), 1))
     many[:, 6 * k] *= t * most / light[k]
-    log_likelihood = posing.problem(n).log_likelihood(many)
+    log_likelihood = problems.problem(n).log_likelihood(many)
     log_cell = np.log(t * np.log(t[1] / t[0]))
     log_cell[[0, -1]] -= np.log(2.0)
-    without = posing.problem(n - 1).log_likelihood(np.delete(theta, slice(6 * k, 6 * k + 6))[None])[0]
+    without = problems.problem(n - 1).log_likelihood(np.delete(theta, slice(6 * k, 6 * k + 6))[None])[0]
     return float(logsumexp(log_likelihood + log_cell) + np.log((n - 1) / n) - without)
 
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_light_is_integrated_as_on_a_fine_grid(recording: Recording, truth: FloatArray, n: int) -> None:
     theta = _near_truth(truth, n, np.random.default_rng(4))
-    removal = Removal(default_prior(recording, n), Posing(recording, default_prior).problem(1), 1)
+    removal = Removal(default_prior(recording, n), OrderProblems(recording, default_prior).problem(1), 1)
     taken = removal.taken(theta)
     for k in range(1, n):
         assert taken[0, k - 1] == pytest.approx(_by_grid(recording, theta[0], k), abs=5e-3)
@@ -47,7 +47,7 @@ def test_light_is_integrated_as_on_a_fine_grid(recording: Recording, truth: Floa
 
 def test_adding_is_taking_away_seen_from_below(recording: Recording, truth: FloatArray) -> None:
     theta = _near_truth(truth, 3, np.random.default_rng(5))
-    removal = Removal(default_prior(recording, 3), Posing(recording, default_prior).problem(1), 1)
+    removal = Removal(default_prior(recording, 3), OrderProblems(recording, default_prior).problem(1), 1)
     added = removal.added(np.delete(theta, slice(12, 18), axis=1), theta[:, 12:18])
     np.testing.assert_allclose(added, removal.taken(theta)[:, 1], atol=1e-9)
 

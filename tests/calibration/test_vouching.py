@@ -6,10 +6,10 @@ from functools import partial
 import numpy as np
 import pytest
 
-from probewise.calibration import Calibration, Climb, Found, calibrate, default_prior, ladder
-from probewise.calibration.ladder import climb_orders
+from probewise.calibration import Calibration, Climb, Found, calibrate, default_prior, quick_fit
+from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import search_order
-from probewise.calibration.posing import Posing
+from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.calibration.vouching import part_missed, share_apart
 from probewise.recordings import Disc, HalfPlane, Plan, Recording
 from probewise.world import Blob, World, gaussian_spot
@@ -48,23 +48,23 @@ def test_samples_of_a_part_that_is_not_known_lie_apart() -> None:
 
 @pytest.mark.slow
 def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording) -> None:
-    posing, rng = Posing(mirrored, default_prior), np.random.default_rng(3)
+    problems, rng = OrderProblems(mirrored, default_prior), np.random.default_rng(3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ladder, "part_missed", lambda *_, **__: "")
-        found, why = climb_orders(posing, (1,), search=partial(search_order, posing, n_live=50), rng=rng)
+        patch.setattr(quick_fit, "part_missed", lambda *_, **__: "")
+        found, why = fit_orders_quickly(problems, (1,), search=partial(search_order, problems, n_live=50), rng=rng)
     made = found[1].result
     assert not why
     assert isinstance(made, Climb)
     correlated = made.theta[:, 5] < 0.0
     assert correlated.all() or not correlated.any()
-    assert "lie apart" in part_missed(posing, 1, made, rng=rng)
+    assert "lie apart" in part_missed(problems, 1, made, rng=rng)
 
 
 @pytest.fixture(scope="module")
 def vouched(recording: Recording) -> Found:
-    posing = Posing(recording, default_prior)
-    search = partial(search_order, posing, n_live=50)
-    return climb_orders(posing, (1,), search=search, rng=np.random.default_rng(4))[0][1]
+    problems = OrderProblems(recording, default_prior)
+    search = partial(search_order, problems, n_live=50)
+    return fit_orders_quickly(problems, (1,), search=search, rng=np.random.default_rng(4))[0][1]
 
 
 def test_a_search_vouches_for_a_climb_that_missed_nothing(vouched: Found) -> None:
@@ -85,9 +85,9 @@ def test_the_order_that_missed_a_peak_and_those_above_are_searched(
     made = vouched.result
     assert isinstance(made, Climb)
     low = Found(replace(made, log_z_of_clouds=made.log_z_of_clouds - 90.0), None)
-    monkeypatch.setattr(ladder, "part_missed", lambda *_, **__: "it lies elsewhere")
-    found = ladder._vouched_for(
-        Posing(recording, default_prior),
+    monkeypatch.setattr(quick_fit, "part_missed", lambda *_, **__: "it lies elsewhere")
+    found = quick_fit._vouched_for(
+        OrderProblems(recording, default_prior),
         {1: low, 2: vouched, 3: low},
         np.random.default_rng(0),
         search=search,

@@ -8,8 +8,8 @@ from probewise.calibration.climb import Climb, Rung
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
 from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
+from probewise.calibration.order_problems import problem_for
 from probewise.calibration.order_search import Found
-from probewise.calibration.posing import problem_for
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (
     PriorRow,

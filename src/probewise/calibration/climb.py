@@ -12,14 +12,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
-from probewise.calibration.priors import SSFPrior
+from probewise.calibration.known_density import KnownDensity
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective, resampled
 from probewise.priors import Coordinates
@@ -45,27 +44,6 @@ _MOST_ERROR = 0.5
 _LEAST_CLOUDS = 0.3
 _LEAST_ACCEPTED = 0.02
 _LEAST_OVERLAP = 0.02
-
-
-class KnownDensity(Protocol):
-    """A normalised density of N Gaussians that particles start from."""
-
-    @property
-    def prior(self) -> SSFPrior:
-        """Of N Gaussians."""
-        ...
-
-    def log_over_prior(self, theta: FloatArray) -> FloatArray:
-        """Log of the density over the prior's sorted one, up to what `log_z_below` counts; (n, 6 N + 2) -> (n,)."""
-        ...
-
-    def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw one for each sample of the order below, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
-        ...
-
-    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose afresh, (n, 6 N + 2); and log density of the old over that of the new, over the prior's, (n,)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -412,7 +390,7 @@ def _moved_afresh(
     rng: np.random.Generator,
 ) -> _Cloud:
     """Propose to each particle a fresh one from the reference's density: only the rest of the target counts."""
-    there, log_drawn = reference.redrawn(space.leave(now.x)[0], rng=rng)
+    there, log_drawn = reference.propose(space.leave(now.x)[0], rng=rng)
     with np.errstate(invalid="ignore"):
         new = known(space.enter(there))
         log_accept = new.tempered(beta) - now.tempered(beta) + log_drawn + now.log_prior - new.log_prior

@@ -17,7 +17,7 @@ from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
-from probewise.calibration.lone import LoneResponses, light_of
+from probewise.calibration.gaussian_responses import LoneResponses, light_of
 from probewise.calibration.whole_coordinates import WholeCoordinates
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled

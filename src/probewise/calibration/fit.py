@@ -18,11 +18,11 @@ from probewise._display import ShowsItself
 from probewise._kinds import require_flag, require_rng, require_whole
 from probewise.calibration.climb import Climb
 from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field, mixture_moments
-from probewise.calibration.ladder import climb_orders
 from probewise.calibration.noise import noise_by_scan, pooled_sd
+from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import Found, Progress, search_order
-from probewise.calibration.posing import Posing
 from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
+from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
@@ -189,15 +189,15 @@ def calibrate(
     require_flag("quick", quick)
     if quick and not refined:
         raise ParameterError("refined", refined, "True with quick=True, or leave quick out")
-    posing = Posing(recording, prior, data_sets)
-    search = partial(search_order, posing, n_live=n_live, stop=stop, refined=refined, progress=progress)
-    one = partial(_fit_order, posing, search, pixel_mm=pixel_mm, n_samples=n_samples)
+    problems = OrderProblems(recording, prior, data_sets)
+    search = partial(search_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
+    one = partial(_fit_order, problems, search, pixel_mm=pixel_mm, n_samples=n_samples)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
     climbed: dict[int, Found] = {}
     why: tuple[str, ...] = ()
     if quick:
         climbing = rng.spawn(1)[0]
-        climbed, why = climb_orders(posing, wanted, search=search, rng=climbing, progress=progress)
+        climbed, why = fit_orders_quickly(problems, wanted, search=search, rng=climbing, progress=progress)
     each = {n: partial(one, n, streams[n], found=climbed.get(n), why=why) for n in wanted}
     if executor is None:
         fits = [fit() for fit in each.values()]
@@ -227,7 +227,7 @@ def _orders(orders: object) -> tuple[int, ...]:
 
 
 def _fit_order(
-    posing: Posing,
+    problems: OrderProblems,
     search: Callable[[int, np.random.Generator], Found],
     n_gaussians: int,
     rng: np.random.Generator,
@@ -238,7 +238,7 @@ def _fit_order(
     n_samples: int,
 ) -> OrderFit:
     """Fit one order, searching it if it is not found yet; at module level, so that another process can run it."""
-    recording = posing.recording
+    recording = problems.recording
     geometry = scan_geometry(recording)
     n_usable = int(recording.usable.sum())
     notes: tuple[str, ...] = ()
@@ -250,7 +250,7 @@ def _fit_order(
         notes = (*notes, *why)
     sensor = _fitted_sensor(
         recording,
-        posing.problem(n_gaussians),
+        problems.problem(n_gaussians),
         found.result,
         n_samples=n_samples,
         pixel_mm=pixel_mm,
@@ -258,7 +258,7 @@ def _fit_order(
         notes=(*notes, *found.notes),
         rng=rng,
     )
-    return OrderFit(n_gaussians, posing.prior_of(n_gaussians), found, sensor)
+    return OrderFit(n_gaussians, problems.prior_of(n_gaussians), found, sensor)
 
 
 def _fitted_sensor(

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise.calibration.climb import Climb, Rung
-from probewise.calibration.posing import Posing
+from probewise.calibration.order_problems import OrderProblems
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 
 Progress = Callable[[int, RoundSummary | Rung], None]
@@ -41,7 +41,7 @@ Search = Callable[[int, np.random.Generator], Found]
 
 
 def search_order(
-    posing: Posing,
+    problems: OrderProblems,
     n_gaussians: int,
     rng: np.random.Generator,
     *,
@@ -51,7 +51,7 @@ def search_order(
     progress: Progress | None = None,
 ) -> Found:
     """Search the prior of an order by nested sampling, and refine the evidence unless asked not to."""
-    problem = posing.problem(n_gaussians)
+    problem = problems.problem(n_gaussians)
     report = None if progress is None else report_of(progress, n_gaussians)
     result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)
     if not refined:

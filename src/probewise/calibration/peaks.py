@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from probewise._arrays import FloatArray
-from probewise.calibration.lone import LoneResponses, light_of
+from probewise.calibration.gaussian_responses import LoneResponses, light_of
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray, floats
-from probewise.calibration.distinct import DistinctRows
+from probewise.calibration.distinct_rows import DistinctRows
 from probewise.calibration.sensor_file import FittedSensor, require_sensor
 from probewise.effects import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError

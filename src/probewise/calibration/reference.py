@@ -144,7 +144,7 @@ class Reference:
             out[which == k] = proposal.draw(rest[which == k], rng=rng)
         return out
 
-    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Draw one faint Gaussian afresh: the others shift to compensate, or a bright one gives way.
 
         Returns the new parameters, (n, 6 N + 2), nan where there are none; and the log of the density of the old over
@@ -288,7 +288,7 @@ class Reference:
         return rest, self._log_split(rest, self.without_last(theta), label, theta[:, -8:-2], most)
 
     def _resplit(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Give a faint Gaussian's light to a bright one, and take another out of a bright one; as `redrawn`."""
+        """Give a faint Gaussian's light to a bright one, and take another out of a bright one; as `propose`."""
         m, n = len(here), self.prior.n_gaussians
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         label = rng.integers(self.n_bright, n, size=m)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import expit
 
 from probewise._arrays import FloatArray
-from probewise.calibration.lone import LoneResponses, light_of
+from probewise.calibration.gaussian_responses import LoneResponses, light_of
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError

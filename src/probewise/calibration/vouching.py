@@ -13,8 +13,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.calibration.climb import Climb
+from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import Progress, report_of
-from probewise.calibration.posing import Posing
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested import NestedResult, run
 
@@ -27,13 +27,13 @@ _N_SAMPLES, _N_OWN, _N_OTHERS = 300, 500, 2000
 
 
 def part_missed(
-    posing: Posing, n: int, climbed: Climb, *, rng: np.random.Generator, progress: Progress | None = None
+    problems: OrderProblems, n: int, climbed: Climb, *, rng: np.random.Generator, progress: Progress | None = None
 ) -> str:
     """Say in words what a climb missed; empty where a search of the prior vouches for it.
 
     Parameters
     ----------
-    posing
+    problems
         Of the recording.
     n
         Number of Gaussians.
@@ -44,24 +44,24 @@ def part_missed(
     progress
         Told of each round.
     """
-    problem = posing.problem(n)
+    problem = problems.problem(n)
     n_live = max(_LEAST_LIVE, _LIVE_PER_PARAM * len(problem.prior.names))
     report = None if progress is None else report_of(progress, n)
     with warnings.catch_warnings():
         # So few live points are rough, which is known; nobody sees this run.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         found = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
-    return _missed_part(posing, n, climbed, found, rng)
+    return _missed_part(problems, n, climbed, found, rng)
 
 
-def _missed_part(posing: Posing, n: int, climbed: Climb, found: NestedResult, rng: np.random.Generator) -> str:
+def _missed_part(problems: OrderProblems, n: int, climbed: Climb, found: NestedResult, rng: np.random.Generator) -> str:
     error = float(np.hypot(found.log_z_error, climbed.log_z_error))
     if found.log_z - climbed.log_z > _N_ERRORS * error:
         return (
             f"ln Z is {found.log_z:.2f} ± {found.log_z_error:.2f} by a search of the whole prior, "
             f"{climbed.log_z:.2f} ± {climbed.log_z_error:.2f} by the quick way"
         )
-    coordinates = posing.prior_of(n).coordinates
+    coordinates = problems.prior_of(n).coordinates
     share = share_apart(
         coordinates.enter(climbed.theta), coordinates.enter(found.samples(_N_SAMPLES, rng=rng)), rng=rng
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates, kinds_of
-from probewise.calibration.lone import light_of
+from probewise.calibration.gaussian_responses import light_of
 from probewise.calibration.priors import SSFPrior
 
 # A Gaussian is faint where it holds at most this share of the light of the heaviest; the others are bright.

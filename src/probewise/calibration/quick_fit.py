@@ -17,17 +17,18 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.around_peak import PeakDensity, around_peak, share_missed_about
-from probewise.calibration.climb import N_SNAPSHOTS, Climb, KnownDensity, Rung, climb
+from probewise.calibration.climb import N_SNAPSHOTS, Climb, Rung, climb
 from probewise.calibration.compensation import Compensation
+from probewise.calibration.known_density import KnownDensity
+from probewise.calibration.mixed_reference import MixedReference
+from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import Found, Progress, Search
 from probewise.calibration.parts import Part, WholeFrame, held_shares, joined, split_by_bright
+from probewise.calibration.peak_density import PeakDensity, density_about_peak, share_missed_about
 from probewise.calibration.peaks import Peak, find_peaks
-from probewise.calibration.posing import Posing
 from probewise.calibration.reference import Reference, has_reference
 from probewise.calibration.removal import Removal, bridged
-from probewise.calibration.seeded import SeededReference
-from probewise.calibration.sharing import SharingDensity
+from probewise.calibration.shared_light import SharedLightDensity
 from probewise.calibration.vouching import part_missed
 from probewise.calibration.whole_coordinates import count_bright
 
@@ -63,8 +64,8 @@ _BRIGHT_HELD = 0.03
 _TWO_BRIGHT, _MORE_BRIGHT = (15, 0.6), (6, 0.4)
 
 
-def climb_orders(
-    posing: Posing,
+def fit_orders_quickly(
+    problems: OrderProblems,
     orders: Sequence[int],
     *,
     search: Search,
@@ -78,27 +79,27 @@ def climb_orders(
     What was found, by order; and why an order that is lacking must be searched in full.
     """
     highest = max(orders)
-    n_usable = int(posing.recording.usable.sum())
+    n_usable = int(problems.recording.usable.sum())
     if n_usable < _LEAST_READINGS:
         return {}, (f"searched in full: {n_usable} usable readings, fewer than {_LEAST_READINGS}",)
-    unlike = _why_not_climbable(posing, highest)
+    unlike = _why_not_climbable(problems, highest)
     if unlike:
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
-    peaks = find_peaks(posing.problem, highest, rng=climbing)
+    peaks = find_peaks(problems.problem, highest, rng=climbing)
     whole = WholeFrame.of(peaks[1].theta)
     found: dict[int, Found] = {}
     parts: dict[int, Part] = {}
     for n in range(1, highest + 1):
         needed = n == 1 or peaks[n].log_likelihood - peaks[n - 1].log_likelihood > _NEEDED
         found[n], parts = next_order(
-            posing, n, parts, peaks[n], climbing, whole=whole, needed=needed, search=search, progress=progress
+            problems, n, parts, peaks[n], climbing, whole=whole, needed=needed, search=search, progress=progress
         )
-    return _vouched_for(posing, {n: found[n] for n in orders}, climbing, search=search, progress=progress), ()
+    return _vouched_for(problems, {n: found[n] for n in orders}, climbing, search=search, progress=progress), ()
 
 
 def _vouched_for(
-    posing: Posing,
+    problems: OrderProblems,
     found: dict[int, Found],
     rng: np.random.Generator,
     *,
@@ -116,7 +117,7 @@ def _vouched_for(
         if chosen in asked or not isinstance(made, Climb):
             return found
         asked.add(chosen)
-        why = part_missed(posing, chosen, made, rng=rng, progress=progress)
+        why = part_missed(problems, chosen, made, rng=rng, progress=progress)
         if why:
             note = f"searched in full, since the quick way missed a peak of order {chosen}: {why}"
             for n in (n for n in found if n >= chosen):
@@ -124,9 +125,9 @@ def _vouched_for(
                 found[n] = replace(full, notes=(*full.notes, f"order {n} was {note}"))
 
 
-def _why_not_climbable(posing: Posing, highest: int) -> str:
+def _why_not_climbable(problems: OrderProblems, highest: int) -> str:
     """Say why no order can be climbed to, if so."""
-    priors = [posing.prior_of(n) for n in range(1, highest + 1)]
+    priors = [problems.prior_of(n) for n in range(1, highest + 1)]
     if not all(has_reference(prior) for prior in priors):
         return "searched in full: the prior of a Gaussian's light is not uniform from 0"
     if any(replace(prior, n_gaussians=1) != priors[0] for prior in priors):
@@ -135,7 +136,7 @@ def _why_not_climbable(posing: Posing, highest: int) -> str:
 
 
 def next_order(
-    posing: Posing,
+    problems: OrderProblems,
     n: int,
     below: dict[int, Part],
     peak: Peak,
@@ -150,7 +151,7 @@ def next_order(
 
     Parameters
     ----------
-    posing
+    problems
         Of the recording.
     n
         Number of Gaussians.
@@ -174,15 +175,15 @@ def next_order(
     What was found, and the parts of its posterior.
     """
     told: Callable[[Rung], None] | None = None if progress is None else partial(progress, n)
-    about = partial(_about_peak, posing, n, peak, rng, told)
-    from_below = partial(_from_below, posing, n, below, peak, whole, rng, told) if below else None
+    about = partial(_about_peak, problems, n, peak, rng, told)
+    from_below = partial(_from_below, problems, n, below, peak, whole, rng, told) if below else None
     ways = [about, from_below] if needed else [from_below, about]
     notes: list[str] = []
     for way in ways:
         if way is None:
             continue
         made, parts = way()
-        made = _searched_for_missed_peaks(posing, n, made, peak, rng)
+        made = _with_doubt_of_missed_peaks(problems, n, made, peak, rng)
         if not made.warnings:
             return Found(made, None), parts or split_by_bright(made, rng)
         notes.extend(made.warnings)
@@ -193,11 +194,11 @@ def next_order(
 
 
 def _about_peak(
-    posing: Posing, n: int, peak: Peak, rng: np.random.Generator, told: Callable[[Rung], None] | None
+    problems: OrderProblems, n: int, peak: Peak, rng: np.random.Generator, told: Callable[[Rung], None] | None
 ) -> tuple[Climb, dict[int, Part]]:
     """Carry particles from a density about the peak to the posterior."""
-    problem = posing.problem(n)
-    density, n_calls = around_peak(problem, peak.theta, rng=rng)
+    problem = problems.problem(n)
+    density, n_calls = density_about_peak(problem, peak.theta, rng=rng)
     density = density.widened(_WIDENED)
     nothing = np.empty((_N_PARTICLES, 0))
     clouds = np.zeros(_N_CLOUDS)
@@ -228,7 +229,7 @@ def _about_peak(
 
 
 def _from_below(
-    posing: Posing,
+    problems: OrderProblems,
     n: int,
     below: dict[int, Part],
     peak: Peak,
@@ -238,7 +239,8 @@ def _from_below(
 ) -> tuple[Climb, dict[int, Part]]:
     """Climb to each part of the posterior: from that below with a faint Gaussian more, or to where all are bright."""
     about = [
-        around_peak(posing.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in (peak.theta, *peak.others)
+        density_about_peak(problems.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0]
+        for theta in (peak.theta, *peak.others)
     ]
     bright = count_bright(np.array([peak.theta, *peak.others]))
     held = held_shares(below)
@@ -247,15 +249,15 @@ def _from_below(
         near = tuple(density for density, own in zip(about, bright, strict=True) if own == m)
         if held[m] > _LEAST_HELD:
             many = held[m] > _MUCH_HELD
-            made[m] = _one_faint_more(posing, n, m, part, near, whole, many=many, rng=rng, told=told)
+            made[m] = _one_faint_more(problems, n, m, part, near, whole, many=many, rng=rng, told=told)
     if held.get(n - 1, 0.0) > _BRIGHT_HELD:
         near = tuple(density for density, own in zip(about, bright, strict=True) if own == n)
-        made[n] = _all_bright(posing, n, below[n - 1], near, whole, rng=rng, told=told)
+        made[n] = _all_bright(problems, n, below[n - 1], near, whole, rng=rng, told=told)
     return joined(made, rng), {m: Part.of(climbed) for m, climbed in made.items()}
 
 
 def _one_faint_more(
-    posing: Posing,
+    problems: OrderProblems,
     n: int,
     n_bright: int,
     below: Part,
@@ -267,35 +269,35 @@ def _one_faint_more(
     told: Callable[[Rung], None] | None,
 ) -> Climb:
     """Carry particles from a part of the posterior of n - 1, and some from peaks; bridge the two parts."""
-    problem_below = posing.problem(n - 1)
-    coordinates = whole.coordinates(posing.prior_of(n - 1), n_bright)
+    problem_below = problems.problem(n - 1)
+    coordinates = whole.coordinates(problems.prior_of(n - 1), n_bright)
     rest = below.theta
     n_particles = _N_PARTICLES if many else _FEW_PARTICLES
     few = rest[np.arange(n_particles) * len(rest) // n_particles]
     compensation = Compensation.of(
         problem_below,
         coordinates,
-        posing.problem(1, n_nodes=_FEW_NODES),
+        problems.problem(1, n_nodes=_FEW_NODES),
         few,
         rng=rng,
         n_pool=_POOL if many else _SMALL_POOL,
     )
-    reference: KnownDensity = Reference(posing.prior_of(n), problem_below, compensation, n_bright)
+    reference: KnownDensity = Reference(problems.prior_of(n), problem_below, compensation, n_bright)
     if about:
-        reference = SeededReference(reference, about, below.log_z)
+        reference = MixedReference(reference, about, below.log_z)
     made = climb(
-        posing.problem(n),
+        problems.problem(n),
         reference,
         few,
         log_z_below=below.log_z_of_clouds,
         error_below=below.start_error,
         rng=rng,
-        space=whole.coordinates(posing.prior_of(n), n_bright),
+        space=whole.coordinates(problems.prior_of(n), n_bright),
         at_once_from=_AT_ONCE_FROM,
         told=told,
     )
-    removal = Removal(posing.prior_of(n), posing.problem(1), n_bright)
-    gaussian = posing.prior_of(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
+    removal = Removal(problems.prior_of(n), problems.problem(1), n_bright)
+    gaussian = problems.prior_of(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
     # Any of the n - n_bright faint Gaussians may be the one that is added.
     labels = math.log(n / (n - n_bright))
     log_z = below.log_z_of_clouds + labels
@@ -303,7 +305,7 @@ def _one_faint_more(
 
 
 def _all_bright(
-    posing: Posing,
+    problems: OrderProblems,
     n: int,
     below: Part,
     about: tuple[PeakDensity, ...],
@@ -313,14 +315,14 @@ def _all_bright(
     told: Callable[[Rung], None] | None,
 ) -> Climb:
     """Carry particles from a wide density to where all Gaussians are bright."""
-    space = whole.coordinates(posing.prior_of(n), n)
-    fewer = whole.coordinates(posing.prior_of(n - 1), n - 1).enter(below.theta)
-    reference: KnownDensity = SharingDensity.of(space, fewer)
+    space = whole.coordinates(problems.prior_of(n), n)
+    fewer = whole.coordinates(problems.prior_of(n - 1), n - 1).enter(below.theta)
+    reference: KnownDensity = SharedLightDensity.of(space, fewer)
     if about:
-        reference = SeededReference(reference, about, 0.0)
+        reference = MixedReference(reference, about, 0.0)
     n_steps, least_effective = _TWO_BRIGHT if n == 2 else _MORE_BRIGHT
     return climb(
-        posing.problem(n),
+        problems.problem(n),
         reference,
         np.empty((_N_PARTICLES if n == 2 else _FEW_PARTICLES, 0)),
         log_z_below=np.zeros(_N_CLOUDS),
@@ -363,12 +365,14 @@ def _with_bridged_evidence(made: Climb, log_z: FloatArray, added: FloatArray, ta
     return replace(found, doubts=(*found.doubts, f"two estimates of ln Z disagree: {words} by a bridge"))
 
 
-def _searched_for_missed_peaks(posing: Posing, n: int, made: Climb, peak: Peak, rng: np.random.Generator) -> Climb:
+def _with_doubt_of_missed_peaks(
+    problems: OrderProblems, n: int, made: Climb, peak: Peak, rng: np.random.Generator
+) -> Climb:
     """Doubt a climb that missed a peak which holds a part of the evidence."""
     if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:
         return made
-    problem = posing.problem(n)
-    density, _ = around_peak(problem, peak.theta, rng=rng, n_pilots=_N_PILOTS)
+    problem = problems.problem(n)
+    density, _ = density_about_peak(problem, peak.theta, rng=rng, n_pilots=_N_PILOTS)
     share = share_missed_about(problem, density, made.theta, made.log_z, n_draws=_N_WEIGHED, rng=rng)
     if share < _MISSED:
         return made

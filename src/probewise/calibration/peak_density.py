@@ -13,6 +13,7 @@ import numpy as np
 from scipy.special import fdtri, gammaln, logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
+from probewise.calibration.known_density import independent_proposal
 from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
@@ -107,20 +108,16 @@ class PeakDensity:
         y = self.space.enter(theta)
         return self._log_density(y) - self.space.leave(y)[1]
 
-    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Draw afresh, and the log density of the old over that of the new, over the prior's."""
-        there = self.draw(here, rng=rng)
-        log_drawn = np.full(len(here), -np.inf)
-        rows = np.flatnonzero(np.isfinite(there).all(axis=1))
-        log_drawn[rows] = self.log_over_prior(here[rows]) - self.log_over_prior(there[rows])
-        return there, log_drawn
+    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Propose draws of it, as `independent_proposal` says."""
+        return independent_proposal(self, here, rng=rng)
 
     def _log_density(self, y: FloatArray) -> FloatArray:
         each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.relabelled]
         return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
 
 
-def around_peak(
+def density_about_peak(
     problem: SensorProblem, peak: FloatArray, *, rng: np.random.Generator, n_pilots: int = _N_PILOTS
 ) -> tuple[PeakDensity, int]:
     """Shape a density to the posterior about a peak.

@@ -13,15 +13,15 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.calibration.around_peak import PeakDensity
-from probewise.calibration.climb import KnownDensity
+from probewise.calibration.known_density import KnownDensity
+from probewise.calibration.peak_density import PeakDensity
 from probewise.calibration.priors import SSFPrior
 
 _SHARE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
-class SeededReference:
+class MixedReference:
     """A reference mixed with densities about peaks: a `KnownDensity`.
 
     Parameters
@@ -56,11 +56,11 @@ class SeededReference:
             out[rows] = density.draw(rest[rows], rng=rng)
         return out
 
-    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose afresh by either, as `KnownDensity.redrawn` says."""
+    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Propose afresh by either, as `KnownDensity.propose` says."""
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
         for density, rows in self._shared_out(len(here), rng):
-            there[rows], log_drawn[rows] = density.redrawn(here[rows], rng=rng)
+            there[rows], log_drawn[rows] = density.propose(here[rows], rng=rng)
         return there, log_drawn
 
     def _shared_out(self, n: int, rng: np.random.Generator) -> list[tuple[KnownDensity, IntArray]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.calibration.distinct import DistinctRows
+from probewise.calibration.distinct_rows import DistinctRows
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError, ShapeError
 from probewise.inference import SensorProblem, student_t
@@ -18,7 +18,7 @@ from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
 
 @dataclass(frozen=True, eq=False)
-class Posing:
+class OrderProblems:
     """A recording, the prior of each order, and which readings share a noise sd."""
 
     recording: Recording

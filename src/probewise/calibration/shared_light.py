@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.around_peak import StudentTDensity
+from probewise.calibration.known_density import independent_proposal
+from probewise.calibration.peak_density import StudentTDensity
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.whole_coordinates import WholeCoordinates
 
@@ -24,14 +25,14 @@ _WIDENED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class SharingDensity:
+class SharedLightDensity:
     """A Student-t in coordinates of the whole: a `KnownDensity`."""
 
     space: WholeCoordinates
     one: StudentTDensity
 
     @classmethod
-    def of(cls, space: WholeCoordinates, fewer: FloatArray) -> SharingDensity:
+    def of(cls, space: WholeCoordinates, fewer: FloatArray) -> SharedLightDensity:
         """Make it of N Gaussians from samples of N - 1 in coordinates of their whole, (n, 6 N - 4)."""
         d = fewer.shape[1] + 6
         own, last = np.r_[: d - 8, d - 2, d - 1], np.arange(d - 8, d - 2)
@@ -62,10 +63,6 @@ class SharingDensity:
         theta[~np.isfinite(log_prior)] = np.nan
         return theta
 
-    def redrawn(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Draw afresh, and the log density of the old over that of the new, over the prior's."""
-        there = self.draw(here, rng=rng)
-        log_drawn = np.full(len(here), -np.inf)
-        rows = np.flatnonzero(np.isfinite(there).all(axis=1))
-        log_drawn[rows] = self.log_over_prior(here[rows]) - self.log_over_prior(there[rows])
-        return there, log_drawn
+    def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Propose draws of it, as `independent_proposal` says."""
+        return independent_proposal(self, here, rng=rng)

@@ -88,7 +88,7 @@ def carry_out(
     arm = instrument_of(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
     require_reach(bounds_of(arm), places, "row of the plan", way_out="; move the plan's origin")
-    _require_settings(arm, plan)
+    _require_feasible_settings(arm, plan)
     row_reader = _LegoRowReader(arm) if isinstance(arm, LegoArm) else _OwnRowReader(arm)
     turns = row_reader.hand_turns_rad(plan, places)
     mounted, lying = 0.0, -1
@@ -235,7 +235,8 @@ def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
             return arm
 
 
-def _require_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -> None:
+def _require_feasible_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan: Plan) -> None:
+    """Raise ParameterError if the plan needs the LED off, or a height at which this arm does not read."""
     there = {"led": 1.0}
     if isinstance(arm, LegoArm):
         there["height_mm"] = arm.geometry.read_height_mm

@@ -106,15 +106,15 @@ def fit_geometry(
     if len(marks) < LEAST_MARKS:
         raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
     before = values_of(geometry)
-    values, total, jacobian = _most_probable(geometry, before, turned, marks, touch_mm)
+    values, total, jacobian = _most_probable_parameters(geometry, before, turned, marks, touch_mm)
     n = int(np.isfinite(marks).sum())
     p_value = float(chdtrc(n, total))
     residuals = marks - places_of(geometry, values, turned)
     if p_value < LEAST_P:
         raise MarksDisagreeError(_disagreement_message(geometry, before, turned, marks, touch_mm, residuals))
     covariance: FloatArray = np.asarray(np.linalg.inv(jacobian.T @ jacobian), dtype=np.float64)
-    fitted = _with_values(geometry, values)
-    accuracy = _accuracy(fitted, covariance, len(marks))
+    fitted = _geometry_with_values(geometry, values)
+    accuracy = _accuracy_of_fit(fitted, covariance, len(marks))
     if accuracy.height_sd_mm > MOST_HEIGHT_SD_MM or accuracy.place_sd_mm > MOST_PLACE_SD_MM:
         raise ParameterError(
             "marks",
@@ -128,7 +128,7 @@ def fit_geometry(
     )
 
 
-def _most_probable(
+def _most_probable_parameters(
     geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
 ) -> tuple[FloatArray, float, FloatArray]:
     """Return the most probable parameters, chi-square there, and the Jacobian of the residuals, (n_residuals, 9)."""
@@ -155,7 +155,7 @@ def _disagreement_message(
     off = f"the marks disagree: {rms:.1f} mm root mean square, where each is good to {touch_mm:g} mm"
     for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
         others = np.arange(len(marks)) != k
-        values, total, _ = _most_probable(geometry, before, turned[others], marks[others], touch_mm)
+        values, total, _ = _most_probable_parameters(geometry, before, turned[others], marks[others], touch_mm)
         if chdtrc(int(np.isfinite(marks[others]).sum()), total) >= LEAST_P:
             away = float(np.sqrt(np.nansum((marks[k] - places_of(geometry, values, turned[[k]])[0]) ** 2)))
             return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"
@@ -165,7 +165,8 @@ def _disagreement_message(
     )
 
 
-def _accuracy(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accuracy:
+def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accuracy:
+    """Propagate the parameters' covariance, (9, 9), to sds of place, height and scale over the field."""
     places = geometry.places_over_field_mm
     if not len(places):
         raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
@@ -183,7 +184,7 @@ def _accuracy(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accur
     )
 
 
-def _with_values(geometry: Geometry, values: Sequence[float] | FloatArray) -> Geometry:
+def _geometry_with_values(geometry: Geometry, values: Sequence[float] | FloatArray) -> Geometry:
     """Return the geometry with fitted values; limits and stops are counted by the motors, so they shift with home."""
     joints = []
     for joint, home in zip(geometry.joints, values[:3], strict=True):

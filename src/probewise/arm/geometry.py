@@ -254,12 +254,12 @@ class Geometry:
     @property
     def nearest_mm(self) -> float:
         """Smallest distance from the axis at which the sensor can read."""
-        return float(self._ring_mm()[0])
+        return float(self._radii_with_room_mm()[0])
 
     @property
     def farthest_mm(self) -> float:
         """Largest distance from the axis at which the sensor can read."""
-        return float(self._ring_mm()[1])
+        return float(self._radii_with_room_mm()[1])
 
     @property
     def rest_mm(self) -> tuple[float, float]:
@@ -300,7 +300,7 @@ class Geometry:
 
     def height_slopes_mm_rad(self, angles_rad: FloatArray) -> FloatArray:
         """Return the derivative of the sensor's height with each joint angle: (n, 3) to (n, 3), mm per radian."""
-        _, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
+        _, shoulder, elbow = np.moveaxis(_checked_rows(angles_rad, 3), -1, 0)
         lower = shoulder + elbow if self.elbow_is_relative else elbow
         upper_rise, lower_rise = self.links_mm[0] * np.cos(shoulder), self.links_mm[1] * np.cos(lower)
         both = upper_rise + lower_rise if self.elbow_is_relative else upper_rise
@@ -320,7 +320,7 @@ class Geometry:
         -------
         Joint angles, shape (n, 3); NaN for places too far, too near, or beyond a joint's limits.
         """
-        places = _columns(places_mm, 2)
+        places = _checked_rows(places_mm, 2)
         dx, dy = places[:, 0] - self.axis_mm[0], places[:, 1] - self.axis_mm[1]
         # Any equivalent angle within the base's limits will do: -190 and 170 degrees are one direction.
         base = self.base.low_rad + np.mod(np.arctan2(dy, dx) - self.base.low_rad, 2 * math.pi)
@@ -339,13 +339,13 @@ class Geometry:
 
     def holds(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n, 2), are on the field with room for the motors to approach: shape (n,)."""
-        places = _columns(places_mm, 2)
+        places = _checked_rows(places_mm, 2)
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
-        return np.asarray(on_field & self._leaves_room(places))
+        return np.asarray(on_field & self._leaves_room_to_approach(places))
 
     def allows(self, angles_rad: FloatArray) -> BoolArray:
         """Return which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""
-        angles = _columns(angles_rad, 3)
+        angles = _checked_rows(angles_rad, 3)
         low = np.array([joint.low_rad for joint in self.joints])
         high = np.array([joint.high_rad for joint in self.joints])
         with np.errstate(invalid="ignore"):
@@ -356,7 +356,7 @@ class Geometry:
 
         It turns with the base: mounting + base - a right angle.
         """
-        places = _columns(places_mm, 2)
+        places = _checked_rows(places_mm, 2)
         base = np.arctan2(places[:, 1] - self.axis_mm[1], places[:, 0] - self.axis_mm[0])
         return wrapped(self.mounting_rad + base - math.pi / 2)
 
@@ -368,19 +368,19 @@ class Geometry:
             f"{self.farthest_mm:.0f} mm from the arm's axis at ({x_mm:g}, {y_mm:g}) mm, within its joints' limits"
         )
 
-    def _leaves_room(self, places_mm: FloatArray) -> BoolArray:
+    def _leaves_room_to_approach(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, (n, 2), leave the motors room to approach at both heights, shape (n,)."""
         room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
         read, travel = (self.angles_rad(places_mm, height) for height in (self.read_height_mm, self.travel_height_mm))
         roomy = [self.allows(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
         return np.asarray(np.all(roomy, axis=0))
 
-    def _ring_mm(self) -> tuple[float, float]:
+    def _radii_with_room_mm(self) -> tuple[float, float]:
         """Return the least and greatest distance from the axis, in whole mm, with room for the motors; NaN: no room."""
         middle = (self.base.low_rad + self.base.high_rad) / 2
         away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
-        within = away[self._leaves_room(places)]
+        within = away[self._leaves_room_to_approach(places)]
         return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
 
 
@@ -394,7 +394,7 @@ def forward_kinematics_mm(
     elbow_is_relative: bool,
 ) -> FloatArray:
     """Compute place and height of the sensor in the lab frame from joint angles, both (n, 3), for given lengths."""
-    base, shoulder, elbow = np.moveaxis(_columns(angles_rad, 3), -1, 0)
+    base, shoulder, elbow = np.moveaxis(_checked_rows(angles_rad, 3), -1, 0)
     lower = shoulder + elbow if elbow_is_relative else elbow
     away = shoulder_mm[0] + links_mm[0] * np.cos(shoulder) + links_mm[1] * np.cos(lower) + sensor_mm[0]
     height = shoulder_mm[1] + links_mm[0] * np.sin(shoulder) + links_mm[1] * np.sin(lower) - sensor_mm[1]
@@ -406,7 +406,7 @@ def wrapped(angle_rad: FloatArray) -> FloatArray:
     return np.asarray(np.mod(angle_rad + math.pi, 2 * math.pi) - math.pi)
 
 
-def _columns(values: FloatArray, n: int) -> FloatArray:
+def _checked_rows(values: FloatArray, n: int) -> FloatArray:
     rows = np.asarray(values, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != n:
         raise ShapeError(f"the rows have shape {rows.shape}; allowed: (n, {n})")

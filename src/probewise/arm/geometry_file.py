@@ -44,20 +44,20 @@ def read_geometry(path: str | Path) -> Geometry:
         raise FileError(path, "tables or lists nested too deep", "an arm's geometry, TOML") from error
     except ValueError as error:  # not TOML, or a number of thousands of digits
         raise FileError(path, f"not TOML ({error})", "an arm's geometry, TOML") from error
-    top = _Table(path, "", content)
-    if top.take("format") != FORMAT:
-        raise top.fail("format", f'"{FORMAT}"')
+    top = _TomlTable(path, "", content)
+    if top.take_entry("format") != FORMAT:
+        raise top.error_at("format", f'"{FORMAT}"')
     field, base, links, sensor = (top.table(name) for name in ("field", "base", "links", "sensor"))
     joints = top.table("joints")
-    elbow = links.take("elbow")
+    elbow = links.take_entry("elbow")
     if elbow not in ELBOWS:
-        raise links.fail("elbow", " or ".join(f'"{name}"' for name in ELBOWS))
-    port = sensor.take("port")
+        raise links.error_at("elbow", " or ".join(f'"{name}"' for name in ELBOWS))
+    port = sensor.take_entry("port")
     if port not in (1, 2, 3, 4) or isinstance(port, bool | float):
-        raise sensor.fail("port", "1, 2, 3 or 4")
-    whole = sensor.take("whole_percent")
+        raise sensor.error_at("port", "1, 2, 3 or 4")
+    whole = sensor.take_entry("whole_percent")
     if not isinstance(whole, bool):
-        raise sensor.fail("whole_percent", "true or false")
+        raise sensor.error_at("whole_percent", "true or false")
     tables = {name: joints.table(name) for name in JOINTS}
     known = top.table("accuracy") if "accuracy" in content else None
     try:
@@ -73,17 +73,17 @@ def read_geometry(path: str | Path) -> Geometry:
             read_height_mm=sensor.number("read_height_mm"),
             travel_height_mm=sensor.number("travel_height_mm"),
             lowest_mm=sensor.number("lowest_mm"),
-            base=_joint(tables["base"]),
-            shoulder=_joint(tables["shoulder"]),
-            elbow=_joint(tables["elbow"]),
+            base=_parse_joint(tables["base"]),
+            shoulder=_parse_joint(tables["shoulder"]),
+            elbow=_parse_joint(tables["elbow"]),
             whole_percent=whole,
-            accuracy=None if known is None else _accuracy(known),
+            accuracy=None if known is None else _parse_accuracy(known),
             light_per_mm=sensor.number("light_per_mm") if "light_per_mm" in sensor.content else None,
         )
     except ParameterError as error:
         raise FileError(path, f"{error.name} is {shown(error.value)}", error.allowed) from error
     for table in (top, field, base, links, sensor, joints, *tables.values(), *([] if known is None else [known])):
-        table.finish()
+        table.require_all_taken()
     return geometry
 
 
@@ -137,54 +137,54 @@ def with_fitted(text: str, geometry: Geometry) -> str:
     return "\n".join(lines) + "\n"
 
 
-class _Table:
+class _TomlTable:
     """One table of the file; entries are removed as they are read, and none may remain."""
 
     def __init__(self, path: Path, where: str, content: dict[str, Any]) -> None:
         self.path, self.where, self.content = path, where, content
         self._left = set(content)
 
-    def fail(self, name: str, allowed: str) -> FileError:
+    def error_at(self, name: str, allowed: str) -> FileError:
         return FileError(self.path, f"{self.where}{name} is {shown(self.content[name])}", allowed)
 
-    def take(self, name: str) -> Any:
+    def take_entry(self, name: str) -> Any:
         if name not in self.content:
             raise FileError(self.path, f"{self.where}{name} is missing", "every entry of the shipped lego_arm.toml")
         self._left.discard(name)
         return self.content[name]
 
-    def table(self, name: str) -> _Table:
-        content = self.take(name)
+    def table(self, name: str) -> _TomlTable:
+        content = self.take_entry(name)
         if not isinstance(content, dict):
-            raise self.fail(name, f"a table [{self.where}{name}]")
-        return _Table(self.path, f"{self.where}{name}.", content)
+            raise self.error_at(name, f"a table [{self.where}{name}]")
+        return _TomlTable(self.path, f"{self.where}{name}.", content)
 
     def number(self, name: str) -> float:
-        value = self.take(name)
+        value = self.take_entry(name)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-            raise self.fail(name, f"a number of magnitude up to {LARGEST:g}")
+            raise self.error_at(name, f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
     def matrix(self, name: str) -> tuple[tuple[float, ...], ...]:
-        rows = self.take(name)
+        rows = self.take_entry(name)
         if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
-            raise self.fail(name, "rows of numbers, [[...], [...], ...]")
+            raise self.error_at(name, "rows of numbers, [[...], [...], ...]")
         numbers = [number for row in rows for number in row]
         if any(isinstance(n, bool) or not isinstance(n, int | float) or not abs(n) <= LARGEST for n in numbers):
-            raise self.fail(name, f"rows of numbers of magnitude up to {LARGEST:g}")
+            raise self.error_at(name, f"rows of numbers of magnitude up to {LARGEST:g}")
         return tuple(tuple(float(number) for number in row) for row in rows)
 
-    def finish(self) -> None:
+    def require_all_taken(self) -> None:
         if self._left:
             name = min(self._left)
             known = ", ".join(sorted(set(self.content) - self._left))
             raise FileError(self.path, f"{self.where}{name} is not known", f"the entries {known}")
 
 
-def _joint(table: _Table) -> Joint:
-    port = table.take("port")
+def _parse_joint(table: _TomlTable) -> Joint:
+    port = table.take_entry("port")
     if port not in ("A", "B", "C"):
-        raise table.fail("port", '"A", "B" or "C"')
+        raise table.error_at("port", '"A", "B" or "C"')
     ratio = table.number("gear_ratio")
     home, low, high, play = (math.radians(table.number(f"{name}_deg")) for name in ("home", "low", "high", "play"))
     stop = math.radians(table.number("stop_deg")) if "stop_deg" in table.content else None
@@ -194,10 +194,10 @@ def _joint(table: _Table) -> Joint:
         raise FileError(table.path, f"{table.where}{error.name} is {shown(error.value)}", error.allowed) from error
 
 
-def _accuracy(table: _Table) -> Accuracy:
-    marks = table.take("marks")
+def _parse_accuracy(table: _TomlTable) -> Accuracy:
+    marks = table.take_entry("marks")
     if not isinstance(marks, int) or isinstance(marks, bool):
-        raise table.fail("marks", "a whole number, 1 or more")
+        raise table.error_at("marks", "a whole number, 1 or more")
     place, height, scale = (table.number(name) for name in ("place_sd_mm", "height_sd_mm", "scale_sd"))
     if "covariance" not in table.content:
         again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"

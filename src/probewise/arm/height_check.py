@@ -83,7 +83,7 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     low, high = int(height.argmin()), int(height.argmax())
     fall, noise = value[low] - value[high], float(np.hypot(error[low], error[high]))
     if fall < _TELLS * noise or min(look.value for look in (*curve, *others)) <= 0:
-        raise _uninformative_readings(curve[low], curve[high], noise)
+        raise _uninformative_readings_error(curve[low], curve[high], noise)
     # The logarithm by that of the height: light that falls with its square is a straight line, other light bends it.
     lowest_mm, y = float(height.min()), np.log(value)
 
@@ -100,7 +100,7 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     own = error / value
     coefficients, covariance = fitted(np.hypot(own, ROUNDING_MM * steepness(fitted(own)[0], height)))
     if (steepness(coefficients, height) >= 0).any():
-        raise _uninformative_readings(curve[low], curve[high], noise)
+        raise _uninformative_readings_error(curve[low], curve[high], noise)
     told, read = (np.array([getattr(look, name) for look in others]) for name in ("height_mm", "value"))
     steep = steepness(coefficients, told)
     basis = np.vander(np.log(told / lowest_mm), _DEGREE + 1)
@@ -112,7 +112,7 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     return HeightCheck(float(-steepness(coefficients, height[[low]])[0]), off, np.sqrt(np.diagonal(joint)), p_value)
 
 
-def _uninformative_readings(low: HeightReading, high: HeightReading, noise: float) -> ParameterError:
+def _uninformative_readings_error(low: HeightReading, high: HeightReading, noise: float) -> ParameterError:
     return ParameterError(
         "readings over white",
         f"{low.value:.3g} at {low.height_mm:.0f} mm and {high.value:.3g} at {high.height_mm:.0f} mm",

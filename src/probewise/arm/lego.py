@@ -167,11 +167,11 @@ class LegoArm:
         ReachError
             If the place is out of reach.
         """
-        goals = self._goals(x_mm, y_mm, self.geometry.travel_height_mm)
+        goals = self._goals_at_place(x_mm, y_mm, self.geometry.travel_height_mm)
         self.rise()
-        self._turn_to(BASE, goals[BASE])
+        self._turn_joint_to(BASE, goals[BASE])
         for joint in self._link_order(goals):
-            self._move_near(joint, goals[joint].counts)
+            self._move_joint_near(joint, goals[joint].counts)
 
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
         """Move the sensor over a place and lower it, by default to reading height.
@@ -192,12 +192,13 @@ class LegoArm:
         self._lower_to(x_mm, y_mm, read_mm if height_mm is None else height_mm)
 
     def _lower_to(self, x_mm: float, y_mm: float, height_mm: float) -> None:
-        goals = self._goals(x_mm, y_mm, height_mm)
+        """Raise the sensor, turn the base, then lower the sensor over a place to a height."""
+        goals = self._goals_at_place(x_mm, y_mm, height_mm)
         self.rise()
-        self._turn_to(BASE, goals[BASE])
+        self._turn_joint_to(BASE, goals[BASE])
         self._is_down = True
         for joint in self._link_order(goals):
-            self._turn_to(joint, goals[joint])
+            self._turn_joint_to(joint, goals[joint])
 
     def rise(self) -> None:
         """Raise the sensor to about travel height, if it is lower, by the link that needs the smaller turn.
@@ -215,7 +216,7 @@ class LegoArm:
                 stand = np.degrees(self.angles_rad).round(1).tolist()
                 raise ReachError("joints", stand, "angles from which the sensor can rise; bring the arm home by hand")
             _, joint, goal = min(ways)
-            self._move_near(joint, goal)
+            self._move_joint_near(joint, goal)
         self._is_down = False
 
     def home(self) -> None:
@@ -237,9 +238,9 @@ class LegoArm:
                 stopped.append(joint)
         self.rise()
         goals = [Goal(0, side) for side in self._sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))]
-        self._turn_to(BASE, goals[BASE])
+        self._turn_joint_to(BASE, goals[BASE])
         for joint in self._link_order(goals):
-            self._turn_to(joint, goals[joint])
+            self._turn_joint_to(joint, goals[joint])
         if stopped:
             self._machine.reset(stopped)
 
@@ -271,7 +272,7 @@ class LegoArm:
         """Turn one joint by an angle, subject to the limits."""
         angles = self.angles_rad
         angles[joint] += by_rad
-        self._turn_to(joint, self._goals_at(angles)[joint])
+        self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
 
     def _pose(self) -> Pose:
         """Return the sensor's pose by the motors' counters."""
@@ -280,13 +281,14 @@ class LegoArm:
         standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
         return Pose(float(x_mm), float(y_mm), float(wrapped(standing)))
 
-    def _goals(self, x_mm: float, y_mm: float, height_mm: float) -> list[Goal]:
+    def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[Goal]:
+        """Return the joints' goals for the sensor at a place and height; raise ReachError if it is out of reach."""
         angles = self.geometry.angles_rad(np.array([[x_mm, y_mm]]), height_mm)[0]
         if not np.isfinite(angles).all():
             raise ReachError("the place (mm)", (round(x_mm, 1), round(y_mm, 1)), self.geometry.sentence())
-        return self._goals_at(angles)
+        return self._goals_at_angles(angles)
 
-    def _goals_at(self, angles_rad: FloatArray) -> list[Goal]:
+    def _goals_at_angles(self, angles_rad: FloatArray) -> list[Goal]:
         return [
             Goal(joint.counts_at(float(angle), side), side)
             for joint, angle, side in zip(self.geometry.joints, angles_rad, self._sides_of(angles_rad), strict=True)
@@ -309,14 +311,14 @@ class LegoArm:
         """
         orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
         ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
-        lowest_mm = [self._heights_mm(way).min() for way in ways]
-        end_mm = self._heights_mm(ways[0])[-1]
+        lowest_mm = [self._heights_along_mm(way).min() for way in ways]
+        end_mm = self._heights_along_mm(ways[0])[-1]
         if max(lowest_mm) > end_mm - CLEAR_MM:
             return orders[int(np.argmax(lowest_mm))]
-        self._move_near(SHOULDER, self.geometry.shoulder.counts_at(math.pi / 2))
+        self._move_joint_near(SHOULDER, self.geometry.shoulder.counts_at(math.pi / 2))
         return ELBOW, SHOULDER
 
-    def _heights_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
+    def _heights_along_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
         """Return the heights of the sensor along a path from the current counts through successive counts."""
         counts = list(self._machine.limits.counts)
         heights = []
@@ -341,12 +343,12 @@ class LegoArm:
         end = sorted(mechanics.counts_at(angle) - here for angle in (mechanics.low_rad, mechanics.high_rad))
         return abs(way), joint, here + min(max(far, end[0]), end[1])
 
-    def _turn_to(self, joint: int, goal: Goal) -> None:
+    def _turn_joint_to(self, joint: int, goal: Goal) -> None:
         with_gears = self.geometry.joints[joint].gear_ratio > 0
         side: Side = 1 if (goal.side > 0) == with_gears else -1
         self._machine.move_to(joint, goal.counts, side)
         self._arrived[joint] = goal.side
 
-    def _move_near(self, joint: int, counts: int) -> None:
+    def _move_joint_near(self, joint: int, counts: int) -> None:
         self._machine.move_near(joint, counts)
         self._arrived[joint] = 0

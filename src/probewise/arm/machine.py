@@ -79,11 +79,11 @@ class Rehearsal:
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
         """Print the command."""
-        self._move(joint, goal, "up" if side > 0 else "down")
+        self._print_move(joint, goal, "up" if side > 0 else "down")
 
     def move_near(self, joint: int, goal: int) -> None:
         """Print the command."""
-        self._move(joint, goal, "roughly")
+        self._print_move(joint, goal, "roughly")
 
     def release(self) -> None:
         """Print the command."""
@@ -112,7 +112,7 @@ class Rehearsal:
     def keep_awake(self) -> None:
         """Do nothing."""
 
-    def _move(self, joint: int, goal: int, how: str) -> None:
+    def _print_move(self, joint: int, goal: int, how: str) -> None:
         here = self.limits.counts[joint]
         self.limits.check(joint, here, goal)
         self.limits.record(joint, goal)

@@ -159,7 +159,7 @@ class OwnInstrument:
             return np.asarray(away / self._speed.move_mm_s + self._speed.read_s)
         with self._errors_located("travel_s"):
             allowed = "seconds, finite, 0 or more; nan out of reach"
-            seconds = _numbers("travel_s", own(start, places_mm), len(places_mm), allowed)
+            seconds = _floats_per_place("travel_s", own(start, places_mm), len(places_mm), allowed)
             wrong = ~((seconds >= 0) & (seconds < math.inf))
             if wrong.any() and (wrong[self.reachable(places_mm)].any() or (seconds[wrong] < math.inf).any()):
                 raise ParameterError("what travel_s returned", float(seconds[wrong][0]), allowed)
@@ -174,22 +174,22 @@ class OwnInstrument:
             If the result is not a valid reading; LinkError for an instrument from a file.
         """
         with self._errors_located("measure"):
-            return self._reading(self._own.measure(pose), pose)
+            return self._as_reading(self._own.measure(pose), pose)
 
-    def _reading(self, found: object, pose: Pose) -> Reading:
+    def _as_reading(self, found: object, pose: Pose) -> Reading:
         if isinstance(found, Reading):
             return found
         now_s = self._clock.monotonic() - self._zero_s
         if not isinstance(found, Mapping):
-            return Reading(_value("what measure returned", found), pose, now_s)
+            return Reading(_checked_value("what measure returned", found), pose, now_s)
         if "value" not in found:
             raise ParameterError("what measure returned", found, f'a dict with "value", or a number: {_A_READING}')
-        known = {name: _covariate(name, number) for name, number in found.items() if name != "value"}
+        known = {name: _checked_covariate(name, number) for name, number in found.items() if name != "value"}
         time_s = known.pop("time_s", now_s)
         place = {name: known.pop(name, getattr(pose, name)) for name in _OF_THE_POSE}
         for name, number in (("time_s", time_s), *place.items()):
             require_finite_number(f"{name} of what measure returned", number)
-        value = _value("value of what measure returned", found["value"])
+        value = _checked_value("value of what measure returned", found["value"])
         return Reading(value, Pose(**place, height_mm=pose.height_mm), time_s, known)
 
     @contextlib.contextmanager
@@ -254,7 +254,7 @@ def require_measures(name: str, own: object) -> None:
     require_callable(f"measure of {name}", getattr(own, "measure", None), "a method measure(pose)")
 
 
-def _value(name: str, found: object) -> float:
+def _checked_value(name: str, found: object) -> float:
     """Return a reading as a float; NumPy scalars and arrays of one element are accepted."""
     number = found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
     if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
@@ -262,7 +262,7 @@ def _value(name: str, found: object) -> float:
     return float(number)
 
 
-def _covariate(name: object, number: object) -> float:
+def _checked_covariate(name: object, number: object) -> float:
     """Return a further number of a reading as a float; NaN if missing."""
     if not isinstance(name, str) or not name.isprintable() or name != name.strip() or name in ("", *_TAKEN):
         taken = "no name that a recording has a column for" if name in _TAKEN else "a printable text"
@@ -283,7 +283,7 @@ def _per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
     return array
 
 
-def _numbers(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+def _floats_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
     array = _per_place(name, found, n_places, allowed)
     if array.dtype.kind not in "biuf":
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
@@ -291,7 +291,7 @@ def _numbers(name: str, found: object, n_places: int, allowed: str) -> FloatArra
 
 
 def _finite_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
-    array = _numbers(name, found, n_places, allowed)
+    array = _floats_per_place(name, found, n_places, allowed)
     if not np.isfinite(array).all():
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
     return array

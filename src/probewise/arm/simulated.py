@@ -37,7 +37,7 @@ class Speed:
 
 
 class SimulatedArm:
-    """An Instrument that simulates moving, lowering to 14 mm, reading and raising, with a simulated clock.
+    """An Instrument that simulates moving, lowering, reading and raising, with a simulated clock.
 
     Parameters
     ----------

@@ -150,8 +150,8 @@ def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[Int
     The number of each reading's scan, (n_points,), and the scans' names.
     """
     if names is None or isinstance(names, str):
-        return np.zeros(n_points, dtype=np.int64), (_text("scan", names or "scan"),)
-    cells = _texts("scan", names, n_points)
+        return np.zeros(n_points, dtype=np.int64), (_printable_name("scan", names or "scan"),)
+    cells = _names_per_reading("scan", names, n_points)
     starts = [k for k in range(n_points) if k == 0 or cells[k] != cells[k - 1]]
     begins = np.zeros(n_points, dtype=np.int64)
     begins[starts[1:]] = 1
@@ -192,7 +192,7 @@ def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, P
                 "pattern", None, f"the name of each reading's pattern, since there are several: {listed}"
             )
         return np.zeros(n_points, dtype=np.int64)
-    cells = [names] * n_points if isinstance(names, str) else _texts("pattern", names, n_points)
+    cells = [names] * n_points if isinstance(names, str) else _names_per_reading("pattern", names, n_points)
     code = {name: k for k, name in enumerate(known)}
     for cell in cells:
         if cell not in code:
@@ -206,7 +206,8 @@ def how_to_describe(name: str, known: Sequence[str]) -> str:
     return f"one that is described ({listed}); {name!r} is named but not described: pass patterns={{{name!r}: ...}}"
 
 
-def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
+def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> list[str]:
+    """Return one name per reading, checked."""
     if not isinstance(values, Iterable):
         raise ParameterError(name, values, "a text, or one per reading")
     cells = list(values)
@@ -215,10 +216,10 @@ def _texts(name: str, values: Iterable[object], n_points: int) -> list[str]:
     for k, cell in enumerate(cells):
         if _is_missing(cell):
             raise ParameterError(f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
-    return [_text(name, str(cell)) for cell in cells]
+    return [_printable_name(name, str(cell)) for cell in cells]
 
 
-def _text(what: str, text: str) -> str:
+def _printable_name(what: str, text: str) -> str:
     """Return a name as a file would hold it: without surrounding blanks."""
     if not text.strip().isprintable():
         raise ParameterError(what, text, "a printable text, without line ends")

@@ -54,7 +54,7 @@ def degrees_of(angle_rad: float) -> float:
     return next((c for c in candidates if math.radians(c) == angle_rad), plain)
 
 
-class _Fields:
+class _CheckedFields:
     """A JSON object whose fields are checked as they are read; messages give the field's path."""
 
     def __init__(self, path: Path, where: str, content: object) -> None:
@@ -63,7 +63,7 @@ class _Fields:
         self.path, self.where, self.content = path, where, content
         self.used: set[str] = set()
 
-    def fail(self, name: str, value: object, allowed: str) -> FileError:
+    def error_at(self, name: str, value: object, allowed: str) -> FileError:
         return FileError(self.path, f"{self.where}.{name} is {_shortened_json(value)}".lstrip("."), allowed)
 
     def get(self, name: str, allowed: str) -> Any:
@@ -79,7 +79,7 @@ class _Fields:
     def number(self, name: str, allowed: str = "a finite number", ok: Callable[[float], bool] | None = None) -> float:
         value = self.get(name, allowed)
         if not _is_number(value) or (ok is not None and not ok(float(value))):
-            raise self.fail(name, value, allowed)
+            raise self.error_at(name, value, allowed)
         return float(value)
 
     def positive(self, name: str) -> float:
@@ -89,16 +89,16 @@ class _Fields:
         allowed = "two finite numbers [x, y]"
         value = self.get(name, allowed)
         if not _is_pair(value):
-            raise self.fail(name, value, allowed)
+            raise self.error_at(name, value, allowed)
         return float(value[0]), float(value[1])
 
     def text(self, name: str, allowed: str = "a text") -> str:
         value = self.get(name, allowed)
         if not isinstance(value, str):
-            raise self.fail(name, value, allowed)
+            raise self.error_at(name, value, allowed)
         return value
 
-    def levels(self) -> tuple[float, float]:
+    def shades(self) -> tuple[float, float]:
         inside = self.number("inside") if "inside" in self.content else 1.0
         outside = self.number("outside") if "outside" in self.content else 0.0
         return inside, outside
@@ -116,64 +116,64 @@ def _shortened_json(value: object) -> str:
     return shortened(json.dumps(value, ensure_ascii=False, default=str), 60)
 
 
-def _uniform(f: _Fields) -> Pattern:
+def _parse_uniform(f: _CheckedFields) -> Pattern:
     return Uniform(f.number("albedo"))
 
 
-def _half_plane(f: _Fields) -> Pattern:
-    return HalfPlane(math.radians(f.number("normal_deg")), f.number("offset_mm"), *f.levels())
+def _parse_half_plane(f: _CheckedFields) -> Pattern:
+    return HalfPlane(math.radians(f.number("normal_deg")), f.number("offset_mm"), *f.shades())
 
 
-def _quadrant(f: _Fields) -> Pattern:
+def _parse_quadrant(f: _CheckedFields) -> Pattern:
     direction = f.pair("direction")
     if any(abs(d) != 1 for d in direction):
-        raise f.fail("direction", f.content["direction"], "[1, 1], [1, -1], [-1, 1] or [-1, -1]")
-    return Quadrant(f.pair("corner_mm"), (int(direction[0]), int(direction[1])), *f.levels())
+        raise f.error_at("direction", f.content["direction"], "[1, 1], [1, -1], [-1, 1] or [-1, -1]")
+    return Quadrant(f.pair("corner_mm"), (int(direction[0]), int(direction[1])), *f.shades())
 
 
-def _disc(f: _Fields) -> Pattern:
-    return Disc(f.pair("center_mm"), f.positive("radius_mm"), *f.levels())
+def _parse_disc(f: _CheckedFields) -> Pattern:
+    return Disc(f.pair("center_mm"), f.positive("radius_mm"), *f.shades())
 
 
-def _polygon(f: _Fields) -> Pattern:
+def _parse_polygon(f: _CheckedFields) -> Pattern:
     allowed = "a list of at least three corners [x, y]"
     vertices = f.get("vertices_mm", allowed)
     if not isinstance(vertices, list) or len(vertices) < 3 or not all(_is_pair(v) for v in vertices):
-        raise f.fail("vertices_mm", vertices, allowed)
-    return Polygon(tuple((float(x), float(y)) for x, y in vertices), *f.levels())
+        raise f.error_at("vertices_mm", vertices, allowed)
+    return Polygon(tuple((float(x), float(y)) for x, y in vertices), *f.shades())
 
 
-def _stripes(f: _Fields) -> Pattern:
+def _parse_stripes(f: _CheckedFields) -> Pattern:
     duty = f.number("duty", "a number from 0 to 1", lambda v: 0 <= v <= 1)
     return Stripes(
-        math.radians(f.number("normal_deg")), f.positive("period_mm"), duty, f.number("phase_mm"), *f.levels()
+        math.radians(f.number("normal_deg")), f.positive("period_mm"), duty, f.number("phase_mm"), *f.shades()
     )
 
 
-def _ramp(f: _Fields) -> Pattern:
+def _parse_ramp(f: _CheckedFields) -> Pattern:
     return Ramp(math.radians(f.number("normal_deg")), f.number("per_mm"))
 
 
-def _image(f: _Fields) -> Pattern:
+def _parse_image(f: _CheckedFields) -> Pattern:
     name = f.text("file", "the name of a PNG or .npy file in the same folder")
     # Security: a recording may only refer to files in its own folder.
     if not name or name in (".", "..") or PurePosixPath(name).name != name or PureWindowsPath(name).name != name:
-        raise f.fail("file", name, "the name of a PNG or .npy file in the same folder, without a path")
+        raise f.error_at("file", name, "the name of a PNG or .npy file in the same folder, without a path")
     picture = f.path.parent / name
     if not picture.is_file():  # the error names the JSON that refers to the picture
-        raise f.fail("file", name, "the name of a PNG or .npy file that lies in the same folder")
+        raise f.error_at("file", name, "the name of a PNG or .npy file that lies in the same folder")
     return Image(read_image(picture), f.positive("pixel_mm"), f.pair("origin_mm"), name)
 
 
-_KINDS: dict[str, Callable[[_Fields], Pattern]] = {
-    "uniform": _uniform,
-    "half_plane": _half_plane,
-    "quadrant": _quadrant,
-    "disc": _disc,
-    "polygon": _polygon,
-    "stripes": _stripes,
-    "ramp": _ramp,
-    "image": _image,
+_KINDS: dict[str, Callable[[_CheckedFields], Pattern]] = {
+    "uniform": _parse_uniform,
+    "half_plane": _parse_half_plane,
+    "quadrant": _parse_quadrant,
+    "disc": _parse_disc,
+    "polygon": _parse_polygon,
+    "stripes": _parse_stripes,
+    "ramp": _parse_ramp,
+    "image": _parse_image,
 }
 _KIND_OF = {
     Uniform: "uniform",
@@ -194,28 +194,28 @@ def read_description(path: Path) -> Description:
     """
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
     content = json_of(path, text, "strict JSON, each name once")
-    top = _Fields(path, "", content)
+    top = _CheckedFields(path, "", content)
     if top.text("format", f'"{FORMAT}"') != FORMAT:
-        raise top.fail("format", content["format"], f'"{FORMAT}"')
+        raise top.error_at("format", content["format"], f'"{FORMAT}"')
     patterns: dict[str, Pattern] = {}
     notes: list[str] = []
     listed = top.get("patterns", "at least one pattern by name")
-    for name, fields_of_it in _Fields(path, "patterns", listed).content.items():
+    for name, fields_of_it in _CheckedFields(path, "patterns", listed).content.items():
         if name != name.strip() or not name.isprintable():
             raise FileError(
                 path, f"patterns has a name {_shortened_json(name)}", "a printable text without blanks around it"
             )
-        f = _Fields(path, f"patterns.{name}", fields_of_it)
+        f = _CheckedFields(path, f"patterns.{name}", fields_of_it)
         kind = f.text("kind", f"one of {', '.join(_KINDS)}")
         if kind not in _KINDS:
-            raise f.fail("kind", kind, f"one of {', '.join(_KINDS)}")
+            raise f.error_at("kind", kind, f"one of {', '.join(_KINDS)}")
         patterns[name] = _KINDS[kind](f)
         unused = [key for key in fields_of_it if key not in f.used | {"inside", "outside"}]
         if unused:
             notes.append(f"pattern {name}: {', '.join(unused)} not used, no field of kind {kind}")
     if not patterns:
         raise FileError(path, "patterns is empty", "at least one pattern by name")
-    instrumentation = _instrumentation(top)
+    instrumentation = _parse_instrumentation(top)
     notes += [
         f"controls: {name} is not used, none of {', '.join(_CONTROLS)}"
         for name in instrumentation.controls
@@ -224,16 +224,16 @@ def read_description(path: Path) -> Description:
     return Description(instrumentation, patterns, tuple(notes))
 
 
-def _instrumentation(top: _Fields) -> Instrumentation:
-    reading = _Fields(top.path, "reading", top.content.get("reading", {}))
-    sensor = _Fields(top.path, "sensor", top.content.get("sensor", {}))
+def _parse_instrumentation(top: _CheckedFields) -> Instrumentation:
+    reading = _CheckedFields(top.path, "reading", top.content.get("reading", {}))
+    sensor = _CheckedFields(top.path, "sensor", top.content.get("sensor", {}))
     low = reading.number("min") if reading.has("min") else None
     high = reading.number("max") if reading.has("max") else None
     if low is not None and high is not None and low >= high:
-        raise reading.fail("max", high, f"greater than reading.min, {low:g}")
+        raise reading.error_at("max", high, f"greater than reading.min, {low:g}")
     controls = top.content.get("controls", [])
     if not isinstance(controls, list) or not all(isinstance(name, str) for name in controls):
-        raise top.fail("controls", controls, "a list of texts")
+        raise top.error_at("controls", controls, "a list of texts")
     return Instrumentation(
         unit=reading.text("unit") if reading.has("unit") else "",
         min=low,

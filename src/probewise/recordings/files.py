@@ -40,7 +40,7 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, notes = _read(_table_path(path), progress)
+    plan, readings, notes = _read_with_json(_table_path(path), progress)
     if readings is None:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
@@ -61,7 +61,7 @@ def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    return _read(_table_path(path), progress)[0]
+    return _read_with_json(_table_path(path), progress)[0]
 
 
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
@@ -72,7 +72,7 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, _ = _read(_table_path(path), progress)
+    plan, readings, _ = _read_with_json(_table_path(path), progress)
     return plan, readings
 
 
@@ -89,8 +89,8 @@ def write_recording(recording: Recording, path: PathLike) -> None:
     require_recording(recording)
     inst = recording.plan.instrumentation
     largest = math.inf if inst.min is not None and inst.max is not None else LARGEST
-    readings = _cells("readings", recording.readings, largest)
-    _write(recording.plan, require_path("path", path), plan_columns(recording.plan) | {"reading": readings})
+    readings = _number_cells("readings", recording.readings, largest)
+    _write_with_json(recording.plan, require_path("path", path), plan_columns(recording.plan) | {"reading": readings})
 
 
 def write_plan(plan: Plan, path: PathLike) -> None:
@@ -104,7 +104,7 @@ def write_plan(plan: Plan, path: PathLike) -> None:
         If the files cannot be written.
     """
     require_plan(plan)
-    _write(plan, require_path("path", path), plan_columns(plan))
+    _write_with_json(plan, require_path("path", path), plan_columns(plan))
 
 
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
@@ -126,12 +126,12 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
-        "x_mm": _cells("x_mm", plan.x_mm, _LARGEST_PLACE_MM),
-        "y_mm": _cells("y_mm", plan.y_mm, _LARGEST_PLACE_MM),
-        "orientation_deg": _in_degrees(plan.orientation_rad),
-        "time_s": _cells("time_s", plan.time_s),
+        "x_mm": _number_cells("x_mm", plan.x_mm, _LARGEST_PLACE_MM),
+        "y_mm": _number_cells("y_mm", plan.y_mm, _LARGEST_PLACE_MM),
+        "orientation_deg": _degree_cells(plan.orientation_rad),
+        "time_s": _number_cells("time_s", plan.time_s),
     }
-    return columns | {name: _cells(name, values) for name, values in plan.covariates.items()}
+    return columns | {name: _number_cells(name, values) for name, values in plan.covariates.items()}
 
 
 def _table_path(path: object) -> Path:
@@ -142,13 +142,13 @@ def _table_path(path: object) -> Path:
     return require_path("path", path, allowed)
 
 
-def _in_degrees(angles_rad: FloatArray) -> list[str]:
+def _degree_cells(angles_rad: FloatArray) -> list[str]:
     distinct, which = np.unique(angles_rad, return_inverse=True)  # few: each conversion is a search
     cells = [number_text(degrees_of(angle)) for angle in distinct.tolist()]
     return [cells[k] for k in which.reshape(-1).tolist()]
 
 
-def _cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]:
+def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> list[str]:
     bad = np.isinf(values) | (np.abs(values) > largest)
     if bad.any():
         raise ParameterError(name, float(values[bad][0]), f"finite numbers of magnitude up to {largest:g}")
@@ -167,7 +167,8 @@ def _distinct_scan_names(plan: Plan) -> dict[int, str]:
     return names
 
 
-def _write(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
+def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
+    """Write the images, the description, then the table, each atomically."""
     if path.suffix.lower() == ".json":
         raise ParameterError("path", str(path), "the name of the CSV; the JSON goes beside it")
     used = {name for name, _ in plan.rows_by_pattern()}
@@ -184,7 +185,8 @@ def _write(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) -> None:
     write_text_atomically(path, csv_text(columns))
 
 
-def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:
+def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:
+    """Read a table and its description: the plan, the readings or None, and notes."""
     if path.suffix.lower() == ".json":
         raise FileError(path, "this is a description", "the name of the CSV beside it")
     table = read_table(path, progress=progress)
@@ -193,7 +195,7 @@ def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
     description = read_description(path.with_suffix(".json"))
     notes = list(description.notes)
-    scan, scan_names = _scans(table)
+    scan, scan_names = _scan_codes_in_file(table)
     time_s = table.numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     for k, name in enumerate(scan_names):
         if not name.isprintable():
@@ -210,14 +212,14 @@ def _read(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list
         time_s=time_s,
         scan=scan,
         scan_names=scan_names,
-        pattern=_patterns(table, description),
+        pattern=_pattern_codes_in_file(table, description),
         pattern_names=tuple(description.patterns),
         patterns=description.patterns,
-        covariates=_covariates(table, notes),
+        covariates=_covariate_columns(table, notes),
         instrumentation=description.instrumentation,
     )
     notes += [*_note_on_far_place(table, "x_mm", plan.x_mm), *_note_on_far_place(table, "y_mm", plan.y_mm)]
-    readings = _readings(table, description) if "reading" in table.columns else None
+    readings = _readings_column(table, description) if "reading" in table.columns else None
     return plan, readings, notes
 
 
@@ -230,14 +232,14 @@ def _note_on_far_place(table: Table, name: str, places_mm: FloatArray) -> list[s
     return [f"row {table.row(k)}: {name} is {places_mm[k]:g}, nine in ten of the others {low:g} to {high:g}: mistyped?"]
 
 
-def _readings(table: Table, description: Description) -> FloatArray:
+def _readings_column(table: Table, description: Description) -> FloatArray:
     inst = description.instrumentation
     # With a declared range a huge number is only unusable; without one it would spoil every sum.
     bounded = inst.min is not None and inst.max is not None
     return table.numbers("reading", missing=True, largest=None if bounded else LARGEST)
 
 
-def _scans(table: Table) -> tuple[IntArray, tuple[str, ...]]:
+def _scan_codes_in_file(table: Table) -> tuple[IntArray, tuple[str, ...]]:
     """Assign scan numbers: every change of name begins a new scan, even if the name occurred before."""
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)
@@ -247,7 +249,7 @@ def _scans(table: Table) -> tuple[IntArray, tuple[str, ...]]:
     return scan, tuple(cells[k] for k in (0, *(np.flatnonzero(changes) + 1)))
 
 
-def _patterns(table: Table, description: Description) -> IntArray:
+def _pattern_codes_in_file(table: Table, description: Description) -> IntArray:
     names = list(description.patterns)
     known = ", ".join(repr(name) for name in names)
     json_name = table.path.with_suffix(".json").name
@@ -270,7 +272,7 @@ def _patterns(table: Table, description: Description) -> IntArray:
     return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
 
 
-def _covariates(table: Table, notes: list[str]) -> dict[str, FloatArray]:
+def _covariate_columns(table: Table, notes: list[str]) -> dict[str, FloatArray]:
     """Return every other numeric column; a column is numeric if most of its cells hold numbers."""
     out: dict[str, FloatArray] = {}
     for name in table.columns:

@@ -35,10 +35,10 @@ def read_image(path: Path) -> FloatArray:
     """
     content = read_bytes(path, _ALLOWED)
     if path.suffix.lower() == ".npy":
-        return _from_npy(path, content)
+        return _albedo_from_npy(path, content)
     if not content.startswith(_SIGNATURE):
         raise FileError(path, "the file does not begin as a PNG does", _ALLOWED)
-    return _from_png(path, content)
+    return _albedo_from_png(path, content)
 
 
 def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
@@ -65,7 +65,7 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
     return out.getvalue()
 
 
-def _from_npy(path: Path, content: bytes) -> FloatArray:
+def _albedo_from_npy(path: Path, content: bytes) -> FloatArray:
     allowed = f"a two-dimensional array of numbers, at most {_LARGEST_PIXELS}"
     file = io.BytesIO(content)
     try:
@@ -88,8 +88,8 @@ def _from_npy(path: Path, content: bytes) -> FloatArray:
     return albedo / 255.0
 
 
-def _from_png(path: Path, content: bytes) -> FloatArray:
-    chunks = _chunks(path, content)
+def _albedo_from_png(path: Path, content: bytes) -> FloatArray:
+    chunks = _png_chunks(path, content)
     width, height, depth, colour, _, _, interlace = struct.unpack(">IIBBBBB", chunks[b"IHDR"])
     if depth != 8 or colour not in _CHANNELS or interlace or not 0 < width * height <= _LARGEST_PIXELS:
         found = f"{width} x {height} pixels, {depth} bits, colour type {colour}, interlace {interlace}"
@@ -107,10 +107,10 @@ def _from_png(path: Path, content: bytes) -> FloatArray:
     if filters.max() > 4:
         k = int(np.argmax(filters > 4))
         raise FileError(path, f"line {k} has filter {filters[k]}", "filters 0 to 4")
-    return _albedo(path, _decoded(chunks[b"IDAT"], width, height, n_channels), colour, chunks)
+    return _albedo_of_pixels(path, _decoded_pixels(chunks[b"IDAT"], width, height, n_channels), colour, chunks)
 
 
-def _decoded(packed: bytes, width: int, height: int, n_channels: int) -> Bytes8:
+def _decoded_pixels(packed: bytes, width: int, height: int, n_channels: int) -> Bytes8:
     """Decompress the pixels and undo the line filters, (height, width, n_channels)."""
     from PIL import Image as Pillow  # imported here: most recordings have no image
 
@@ -119,7 +119,8 @@ def _decoded(packed: bytes, width: int, height: int, n_channels: int) -> Bytes8:
     return np.asarray(decoded).reshape(height, width, n_channels)
 
 
-def _chunks(path: Path, content: bytes) -> dict[bytes, bytes]:
+def _png_chunks(path: Path, content: bytes) -> dict[bytes, bytes]:
+    """Return the data of a PNG's chunks by type, with chunks of one type joined; their checksums are checked."""
     parts: dict[bytes, list[bytes]] = {}
     at = len(_SIGNATURE)
     while at < len(content):
@@ -136,7 +137,8 @@ def _chunks(path: Path, content: bytes) -> dict[bytes, bytes]:
     return chunks
 
 
-def _albedo(path: Path, pixels: Bytes8, colour: int, chunks: dict[bytes, bytes]) -> FloatArray:
+def _albedo_of_pixels(path: Path, pixels: Bytes8, colour: int, chunks: dict[bytes, bytes]) -> FloatArray:
+    """Return albedo, (height, width): the mean over the colours, times opacity."""
     if colour == 3:
         table = np.frombuffer(chunks.get(b"PLTE", b""), dtype=np.uint8)
         if table.size == 0 or table.size % 3 or int(pixels.max()) >= table.size // 3:

@@ -41,7 +41,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
     deadline_s = time.monotonic() + patience_s
     while (handle := _locked_file(lock, path)) is None:
         if time.monotonic() >= deadline_s:
-            raise FileError(path, f"{_holder(lock)} is writing to it", "one process at a time")
+            raise FileError(path, f"{_holder_in_words(lock)} is writing to it", "one process at a time")
         time.sleep(_RETRY_S)
     try:
         with contextlib.suppress(OSError):  # the process id is only used in messages
@@ -126,7 +126,7 @@ else:
         os.close(handle)
 
 
-def _holder(lock: Path) -> str:
+def _holder_in_words(lock: Path) -> str:
     try:
         return f"process {int(lock.read_text(encoding='ascii'))}"
     except (OSError, ValueError):

@@ -18,7 +18,7 @@ from probewise._kinds import require_finite_number, require_pair
 from probewise.errors import ParameterError
 
 
-class _Checked:
+class _CheckedPattern:
     """Base of the patterns: converts numbers to floats and pairs to tuples, and refuses everything else."""
 
     def __post_init__(self) -> None:
@@ -36,14 +36,14 @@ class _Checked:
 
 
 @dataclass(frozen=True)
-class Uniform(_Checked):
+class Uniform(_CheckedPattern):
     """Uniform albedo."""
 
     albedo: float
 
 
 @dataclass(frozen=True)
-class HalfPlane(_Checked):
+class HalfPlane(_CheckedPattern):
     """The half-plane x cos(normal) + y sin(normal) > offset."""
 
     normal_rad: float
@@ -53,7 +53,7 @@ class HalfPlane(_Checked):
 
 
 @dataclass(frozen=True)
-class Quadrant(_Checked):
+class Quadrant(_CheckedPattern):
     """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0; direction is (dx, dy), each +1 or -1."""
 
     corner_mm: tuple[float, float]
@@ -71,7 +71,7 @@ class Quadrant(_Checked):
 
 
 @dataclass(frozen=True)
-class Disc(_Checked):
+class Disc(_CheckedPattern):
     """The inside of a circle."""
 
     center_mm: tuple[float, float]
@@ -85,7 +85,7 @@ class Disc(_Checked):
 
 
 @dataclass(frozen=True)
-class Polygon(_Checked):
+class Polygon(_CheckedPattern):
     """The inside of a polygon by the even-odd rule."""
 
     vertices_mm: tuple[tuple[float, float], ...]
@@ -103,7 +103,7 @@ class Polygon(_Checked):
 
 
 @dataclass(frozen=True)
-class Stripes(_Checked):
+class Stripes(_CheckedPattern):
     """Stripes where frac((x . n - phase) / period) < duty."""
 
     normal_rad: float
@@ -121,7 +121,7 @@ class Stripes(_Checked):
 
 
 @dataclass(frozen=True)
-class Ramp(_Checked):
+class Ramp(_CheckedPattern):
     """A linear gradient without bounds: albedo per_mm (x . n). It also describes an encoder, which reads its place."""
 
     normal_rad: float
@@ -129,7 +129,7 @@ class Ramp(_Checked):
 
 
 @dataclass(frozen=True, eq=False)
-class Image(_Checked):
+class Image(_CheckedPattern):
     """An image: one albedo (0 to 1) per pixel, first row on top, 0 outside; `origin_mm` is its lower left corner."""
 
     albedo: FloatArray

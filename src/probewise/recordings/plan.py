@@ -67,7 +67,7 @@ class Instrumentation:
 
     @property
     def ends(self) -> tuple[float, ...]:
-        """The declared ends of the range."""
+        """The ends of the range that are declared: two, one or none."""
         return tuple(end for end in (self.min, self.max) if end is not None)
 
 

@@ -62,10 +62,10 @@ def paper_plan(*, reading_s: float = 1.2, break_s: float = 30.0) -> Plan:
     break_s
         Seconds to turn the sensor between scans, or to change the pattern.
     """
-    line = _line(-50, 50, 1)
+    line = _line_places(-50, 50, 1)
     scans = [_Scan(f"edge_{deg}", line, ("boundary",), deg, reading_s, break_s) for deg in ORIENTATIONS_DEG]
     scans.append(_Scan("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s, break_s))
-    return _plan(scans)
+    return _plan_of_scans(scans)
 
 
 def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
@@ -82,7 +82,7 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
     break_s
         Seconds to turn the sensor between scans, or to change the pattern.
     """
-    out, flat = _line(-50, 50, 1), _line(-40, 40, 8)
+    out, flat = _line_places(-50, 50, 1), _line_places(-40, 40, 8)
     scans: list[_Scan] = []
     for deg in ORIENTATIONS_DEG:
         back_s = reading_s / 2 if deg >= 180 else reading_s
@@ -92,10 +92,10 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
             _Scan(f"white_{deg}", flat, ("white",), deg, reading_s, break_s),
             _Scan(f"black_{deg}", flat, ("black",), deg, reading_s, break_s),
         ]
-    along_y = _line(60, -60, -2)[:, ::-1] + [-5.0, 0.0]
+    along_y = _line_places(60, -60, -2)[:, ::-1] + [-5.0, 0.0]
     scans.append(_Scan("quadrants", np.zeros((4, 2)), QUADRANTS, 0, break_s, break_s))
     scans.append(_Scan("disc_y", along_y, ("disc",), 0, reading_s, break_s))
-    return _plan(scans)
+    return _plan_of_scans(scans)
 
 
 def jittered(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
@@ -125,7 +125,7 @@ def jittered(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Pla
     return replace(plan, time_s=time_s, covariates=covariates)
 
 
-def _line(first: int, last: int, step: int) -> FloatArray:
+def _line_places(first: int, last: int, step: int) -> FloatArray:
     x_mm = np.arange(first, last + np.sign(step), step, dtype=np.float64)
     return np.stack([x_mm, np.zeros_like(x_mm)], axis=-1)
 
@@ -134,7 +134,8 @@ def _battery_mv(time_s: FloatArray) -> FloatArray:
     return _FULL_BATTERY_MV - _DRAIN_MV_PER_S * time_s
 
 
-def _plan(scans: Sequence[_Scan]) -> Plan:
+def _plan_of_scans(scans: Sequence[_Scan]) -> Plan:
+    """Join scans to a plan, with the time of each reading and the battery's voltage."""
     intervals = [np.full(len(s.places_mm), s.reading_s) for s in scans]
     for scan, interval in zip(scans[1:], intervals[1:], strict=True):
         interval[0] = scan.before_s

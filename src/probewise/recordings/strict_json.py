@@ -53,10 +53,10 @@ def strict_json(text: str | bytes) -> Any:
     try:
         value = json.loads(
             text,
-            object_pairs_hook=_unique_names,
+            object_pairs_hook=_dict_of_unique_names,
             parse_constant=_refuse_constant,
-            parse_int=_whole_number,
-            parse_float=_number,
+            parse_int=_parse_whole_number,
+            parse_float=_parse_finite_number,
         )
         if "\\u" in text:  # an escaped lone surrogate could not be written to a file
             json.dumps(value, ensure_ascii=False).encode()
@@ -67,7 +67,7 @@ def strict_json(text: str | bytes) -> Any:
     return value
 
 
-def _unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def _dict_of_unique_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     out = dict(pairs)
     if len(out) < len(pairs):
         names = [name for name, _ in pairs]
@@ -79,15 +79,15 @@ def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no JSON number")
 
 
-def _whole_number(digits: str) -> int:
+def _parse_whole_number(digits: str) -> int:
     # Python refuses to convert texts of thousands of digits.
     if len(digits) > _MOST_DIGITS:
         raise ValueError(f"a number of {len(digits)} digits, beyond every float")
-    _number(digits)
+    _parse_finite_number(digits)
     return int(digits)
 
 
-def _number(digits: str) -> float:
+def _parse_finite_number(digits: str) -> float:
     value = float(digits)
     if not math.isfinite(value):
         raise ValueError(f"the number {shown(digits)} is beyond every float")

@@ -26,29 +26,29 @@ def where_white(pattern: Pattern) -> str:
     """
     match pattern:
         case Uniform(albedo):
-            return f"all {_shade(albedo)}"
+            return f"all {_shade_in_words(albedo)}"
         case HalfPlane(normal, offset, inside, outside):
-            return _inside_and_outside(_half_plane(normal, offset), inside, outside)
+            return _shades_in_words(_half_plane_in_words(normal, offset), inside, outside)
         case Quadrant((x, y), (dx, dy), inside, outside):
             sides = f"{'above' if dy > 0 else 'below'} y = {y:g} mm and {'right' if dx > 0 else 'left'} of x = {x:g} mm"
-            return _inside_and_outside(sides, inside, outside)
+            return _shades_in_words(sides, inside, outside)
         case Disc((x, y), radius, inside, outside):
-            return _inside_and_outside(
+            return _shades_in_words(
                 f"inside the circle of radius {radius:g} mm about ({x:g}, {y:g}) mm", inside, outside
             )
         case Polygon(_, inside, outside):
-            return _inside_and_outside("inside the polygon", inside, outside)
+            return _shades_in_words("inside the polygon", inside, outside)
         case Stripes(normal, period, duty, _, inside, outside):
             way = math.degrees(normal)
             stripes = f"in stripes of {duty * period:g} mm, one every {period:g} mm, across {way:g} degrees"
-            return _inside_and_outside(stripes, inside, outside)
+            return _shades_in_words(stripes, inside, outside)
         case Ramp(normal, per_mm):
             return f"a ramp that brightens by {per_mm:g} of white per mm towards {math.degrees(normal):g} degrees"
         case Image(_, _, _, file):
             return f"the picture {file}, black around it"
 
 
-def _half_plane(normal_rad: float, offset_mm: float) -> str:
+def _half_plane_in_words(normal_rad: float, offset_mm: float) -> str:
     quarter = normal_rad / (math.pi / 2)
     if abs(quarter - round(quarter)) > _EVEN:
         towards = f"towards {math.degrees(normal_rad):g} degrees"
@@ -57,11 +57,11 @@ def _half_plane(normal_rad: float, offset_mm: float) -> str:
     return _SIDES[side].format((offset_mm if side < 2 else -offset_mm) + 0.0)
 
 
-def _inside_and_outside(where: str, inside: float, outside: float) -> str:
-    return f"{_shade(inside)} {where}, {_shade(outside)} elsewhere"
+def _shades_in_words(where: str, inside: float, outside: float) -> str:
+    return f"{_shade_in_words(inside)} {where}, {_shade_in_words(outside)} elsewhere"
 
 
-def _shade(albedo: float) -> str:
+def _shade_in_words(albedo: float) -> str:
     if albedo >= 1:
         return "white"
     return "black" if albedo <= 0 else f"grey (albedo {albedo:g})"

@@ -93,7 +93,7 @@ class AlbedoPatch(PatchEffect[SceneView]):
 
 @dataclass(frozen=True, eq=False)
 class GradedRegion:
-    """A region times 1 + per_mm . (X, Y); `per_mm` has shape (n_samples, 2)."""
+    """A region whose albedo is multiplied by 1 + per_mm . (X, Y); `per_mm` has shape (n_samples, 2)."""
 
     region: Region
     per_mm: FloatArray

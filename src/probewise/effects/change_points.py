@@ -68,7 +68,7 @@ class ChangePointEffect(NamedEffect[V]):
         return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
 
     def coarse(self) -> Self:
-        """Keep at most about 48 intervals."""
+        """Return the effect with neighbouring intervals joined, so that about 48 remain."""
         stride = -(-(len(self.times_s) - 1) // _FEW)
         return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
 
@@ -80,7 +80,10 @@ class ChangePointEffect(NamedEffect[V]):
         return Gates(always, np.array([plan.time_s > at for at in middles]))
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the time of change over all intervals by their weight, theta (n_samples, n_params)."""
+        """Redraw the time of change: for each sample an interval by its weight, then a time uniform within it.
+
+        `theta` is (n_samples, n_params), in and out; `weights` is (n_intervals,).
+        """
         times = np.array(self.times_s)
         chosen = rng.choice(len(weights), len(theta), p=weights)
         at_s = times[chosen] + np.diff(times)[chosen] * rng.random(len(theta))

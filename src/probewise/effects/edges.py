@@ -147,7 +147,7 @@ class EdgeShadow(NamedEffect[View]):
 
         Raised edges may belong to all kinds of pattern, to one kind, or to all kinds but one.
         """
-        kinds = _by_kind(extent.plan)
+        kinds = _edged_patterns_by_kind(extent.plan)
         but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
         choices = tuple(dict.fromkeys([(), *kinds, *but_one])) if len(kinds) > 1 else ((),)
         return cls(narrowest_mm=0.01 * extent.length_mm, widest_mm=extent.length_mm / 3, choices=choices)
@@ -188,7 +188,7 @@ class EdgeShadow(NamedEffect[View]):
         )
 
 
-def _by_kind(plan: Plan) -> tuple[tuple[str, ...], ...]:
+def _edged_patterns_by_kind(plan: Plan) -> tuple[tuple[str, ...], ...]:
     """Group by kind the names of the plan's patterns that have edges."""
     kinds: dict[type, list[str]] = {}
     for name, _ in plan.rows_by_pattern():

@@ -40,7 +40,7 @@ class HeavyTailedPrior:
 
     @cached_property
     def _sds(self) -> FloatArray:
-        return self.typical * _scales(self.smallest, self.largest)
+        return self.typical * _relative_sds(self.smallest, self.largest)
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape."""
@@ -64,7 +64,7 @@ class HeavyTailedPrior:
         else:
             tail, sign = np.minimum(u, 1.0 - u), np.where(u < 0.5, -1.0, 1.0)
         goal = -np.log(2 * np.clip(tail, 1e-15, 0.5))
-        return np.asarray(sign * self.typical * _quantiles(self.smallest, self.largest).at(goal))
+        return np.asarray(sign * self.typical * _tabulate_quantiles(self.smallest, self.largest).at(goal))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, any shape."""
@@ -80,7 +80,7 @@ class HeavyTailedPrior:
 
 
 @dataclass(frozen=True, eq=False)
-class _Quantiles:
+class _QuantileTable:
     """Quantiles of the mixture of typical size one: a table of -log(2 x upper tail), and the size it belongs to."""
 
     sds: FloatArray
@@ -88,7 +88,7 @@ class _Quantiles:
     size: FloatArray
 
     def at(self, goal: FloatArray) -> FloatArray:
-        """Return the sizes at which the tail has this depth, any shape."""
+        """Return the sizes at which -log(2 x upper tail) equals `goal`, any shape."""
         x = np.interp(goal, self.depth, self.size)
         for _ in range(3):
             scaled = x[..., None] / (self.sds * math.sqrt(2))
@@ -98,19 +98,19 @@ class _Quantiles:
         return np.asarray(x)
 
 
-def _scales(smallest: float, largest: float) -> FloatArray:
+def _relative_sds(smallest: float, largest: float) -> FloatArray:
     """Return the sds of the mixture, in typical sizes."""
     decades = math.log(largest / SMALLEST_AND_LARGEST[1]) / math.log(SMALLEST_AND_LARGEST[1] / SMALLEST_AND_LARGEST[0])
     return np.asarray(np.geomspace(smallest, largest, _N_SCALES + max(math.ceil((_N_SCALES - 1) * decades), 0)))
 
 
 @lru_cache(maxsize=16)
-def _quantiles(smallest: float, largest: float) -> _Quantiles:
-    """Tabulate the quantiles once for every typical size: smooth, monotone, from 0."""
-    sds = _scales(smallest, largest)
+def _tabulate_quantiles(smallest: float, largest: float) -> _QuantileTable:
+    """Tabulate the quantiles of the mixture of typical size one, from size 0 upwards."""
+    sds = _relative_sds(smallest, largest)
     size = np.concatenate([[0.0], np.geomspace(1e-5, 12.0 * largest, 600)])
     upper = 0.5 * erfc(size[:, None] / (sds * math.sqrt(2))).mean(axis=-1)
-    return _Quantiles(sds, -np.log(2 * upper), size)
+    return _QuantileTable(sds, -np.log(2 * upper), size)
 
 
 @dataclass(frozen=True)
@@ -121,22 +121,22 @@ class LogHeavyTailedPrior:
     smallest: float = SMALLEST_AND_LARGEST[0]
 
     @cached_property
-    def _log(self) -> HeavyTailedPrior:
+    def _prior_of_log(self) -> HeavyTailedPrior:
         return HeavyTailedPrior(self.typical_log, smallest=self.smallest)
 
     def from_unit(self, u: FloatArray) -> FloatArray:
         """Evaluate the quantile function, any shape."""
-        return np.exp(self._log.from_unit(u))
+        return np.exp(self._prior_of_log.from_unit(u))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, any shape."""
-        return self._log.to_unit(np.log(value))
+        return self._prior_of_log.to_unit(np.log(value))
 
     def log_prob(self, value: FloatArray) -> FloatArray:
         """Return the natural log of the density, any shape; -inf at and below zero."""
         value = np.asarray(value, dtype=np.float64)
         safe = np.where(value > 0, value, 1.0)
-        return np.where(value > 0, self._log.log_prob(np.log(safe)) - np.log(safe), -np.inf)
+        return np.where(value > 0, self._prior_of_log.log_prob(np.log(safe)) - np.log(safe), -np.inf)
 
     def __str__(self) -> str:
-        return f"logarithm {self._log}"
+        return f"logarithm {self._prior_of_log}"

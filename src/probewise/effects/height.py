@@ -36,10 +36,10 @@ class HeightGradient(LinearEffect[Footprint]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical slope to 1 % of the height over the longest scan."""
-        return cls(typical=0.01 * _height_mm(extent.plan) / extent.length_mm)
+        return cls(typical=0.01 * _nominal_height_mm(extent.plan) / extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return raised(value, 1 + theta[:, :1] * plan.x_mm / _height_mm(plan))
+        return raised(value, 1 + theta[:, :1] * plan.x_mm / _nominal_height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "grows" if mean[0] > 0 else "shrinks"
@@ -66,10 +66,10 @@ class HeightOffset(OneScanEffect[Footprint]):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical offset to 1 % of the height; None for a single scan."""
         choices = mountings(extent.plan)
-        return cls(choices=choices, typical_mm=0.01 * _height_mm(extent.plan)) if choices else None
+        return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return raised(value, 1 + theta * in_scans(plan, self.scans) / _height_mm(plan))
+        return raised(value, 1 + theta * in_scans(plan, self.scans) / _nominal_height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "higher" if mean[0] > 0 else "lower"
@@ -77,5 +77,5 @@ class HeightOffset(OneScanEffect[Footprint]):
         return f"in {scans_in_words(self.scans)} the sensor hangs {much} mm {way} than in the others"
 
 
-def _height_mm(plan: Plan) -> float:
+def _nominal_height_mm(plan: Plan) -> float:
     return plan.instrumentation.height_mm or _USUAL_MM

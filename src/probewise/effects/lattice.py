@@ -74,7 +74,7 @@ def lattice_step(readings: FloatArray) -> float:
         return 0.0
     least = 1e-6 * float(values[-1] - values[0])
     exact = _common_step(values, least)
-    return _lattice_through(values, exact or 10 * least) or exact
+    return _step_of_rounded_lattice(values, exact or 10 * least) or exact
 
 
 def lattice_step_sd(readings: FloatArray, step: float) -> float:
@@ -88,7 +88,7 @@ def lattice_step_sd(readings: FloatArray, step: float) -> float:
     return max(next(digits, 0.0) / math.sqrt(12) / reach, _DIGITS * step)
 
 
-def _lattice_through(values: FloatArray, rounding: float) -> float:
+def _step_of_rounded_lattice(values: FloatArray, rounding: float) -> float:
     """Find the step of a lattice of rounded values, from the two closest outwards; 0 where there is none.
 
     `rounding` is the full width of the rounding error of each value.

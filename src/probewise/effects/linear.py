@@ -26,7 +26,7 @@ class LinearEffect(NamedEffect[V]):
     """Whether the parameters are never negative."""
 
     @cached_property
-    def _typical(self) -> float:
+    def _typical_size(self) -> float:
         (name,) = (each.name for each in fields(self) if each.name.startswith("typical"))  # type: ignore[arg-type]
         return float(getattr(self, name))
 
@@ -38,12 +38,12 @@ class LinearEffect(NamedEffect[V]):
     @cached_property
     def prior(self) -> Product:
         """The same heavy-tailed prior for each parameter."""
-        size = HeavyTailedPrior(self._typical, positive=self.positive)
+        size = HeavyTailedPrior(self._typical_size, positive=self.positive)
         return Product(dict.fromkeys(self.parameters, size))
 
     def bank(self) -> FloatArray:
         """Return one entry with a column for each parameter, (1, n_params, n_params)."""
-        return self._typical * np.eye(len(self.parameters))[None, :, :]
+        return self._typical_size * np.eye(len(self.parameters))[None, :, :]
 
 
 @dataclass(frozen=True)

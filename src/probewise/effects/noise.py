@@ -191,7 +191,10 @@ class NoisePerRun(NoiseEffect):
         return np.ones((1, 1, len(self.runs)))
 
     def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
-        """Return for each between-run sd the most probable values and the log of their Laplace weight."""
+        """Return the runs' most probable values, (n_nodes, n_runs), and log Laplace weights, (n_nodes,).
+
+        Each node is one sd of the logs of the values between runs.
+        """
         n_runs = len(self.runs)
         counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)
         squares: FloatArray = np.bincount(rows.run, residuals**2, minlength=n_runs).astype(np.float64)
@@ -199,7 +202,7 @@ class NoisePerRun(NoiseEffect):
             return np.zeros((0, n_runs)), np.zeros(0)
         values, log_weights = [], []
         for spread in _SPREADS:
-            logs = _most_likely_logs(counts, squares, spread)
+            logs = _most_likely_log_sds(counts, squares, spread)
             curvature = 2 * counts + spread**-2
             # The overall sd is integrated elsewhere, at fixed values: `beside` corrects for its coupling to them.
             beside = float(np.sum(2 * counts * spread**-2 / curvature)) / float(2 * counts.sum())
@@ -229,8 +232,12 @@ class NoisePerRun(NoiseEffect):
         )
 
 
-def _most_likely_logs(counts: FloatArray, squares: FloatArray, spread: float) -> FloatArray:
-    """Maximise over the logs of the runs' sds, the overall sd profiled out; counts, squared residuals: (n_runs,)."""
+def _most_likely_log_sds(counts: FloatArray, squares: FloatArray, spread: float) -> FloatArray:
+    """Return the most probable logs of the runs' noise sds over the overall sd, which is profiled out, (n_runs,).
+
+    `counts` and `squares` are the number of readings and the sum of squared residuals of each run, (n_runs,); `spread`
+    is the prior sd of the logs.
+    """
     logs = np.zeros(len(counts))
     for _ in range(_NEWTON_STEPS):
         weighed = squares * np.exp(-2 * logs)

@@ -34,34 +34,34 @@ def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) 
     predicted
         Noise-free readings, (n_samples, n_points).
     """
-    level = _with_walk(level)
-    of_kept = _log_rounded(readings, predicted, level.sd, level.step)
+    level = _with_walk_variance(level)
+    of_kept = _log_density_rounded(readings, predicted, level.sd, level.step)
     with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
         if np.any(level.wide_share):
-            wide = _log_rounded(readings, predicted, level.sd * level.wide_times, level.step)
+            wide = _log_density_rounded(readings, predicted, level.sd * level.wide_times, level.step)
             of_kept = np.logaddexp(np.log1p(-level.wide_share) + of_kept, np.log(level.wide_share) + wide)
         if np.any(level.lost_share):
-            lost = _log_rounded(readings, level.lost_value, level.sd * _NARROW, level.step)
+            lost = _log_density_rounded(readings, level.lost_value, level.sd * _NARROW, level.step)
             of_kept = np.logaddexp(np.log1p(-level.lost_share) + of_kept, np.log(level.lost_share) + lost)
     return of_kept
 
 
 def variance(level: NoiseLevel) -> FloatArray:
     """Return the variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
-    level = _with_walk(level)
+    level = _with_walk_variance(level)
     wide = 1 + level.wide_share * (level.wide_times**2 - 1)
     return np.asarray(level.sd**2 * wide + level.step**2 / 12)
 
 
-def _with_walk(level: NoiseLevel) -> NoiseLevel:
+def _with_walk_variance(level: NoiseLevel) -> NoiseLevel:
     """Add the random walk's marginal variance at each row to the noise sd."""
     if not np.any(level.walk):
         return level
     return replace(level, sd=level.sd * np.sqrt(1 + level.walk**2 * level.walked), walk=np.zeros((1, 1)))
 
 
-def _log_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: FloatArray) -> FloatArray:
-    """Return the normal log density; where there is a rounding step, the log of its mean over the reading's cell."""
+def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: FloatArray) -> FloatArray:
+    """Return the log of the normal density or, where readings are rounded, of its mean over the rounding cell."""
     if not np.any(step):
         return log_gaussian_density(readings, mean, sd)
     width = np.where(step > 0, step, 1.0)

@@ -101,7 +101,7 @@ class PatchPrior:
         return LogUniform(_RADII[0] / 2 * self.line.length_mm, _RADII[-1] * 2 * self.line.length_mm)
 
     @cached_property
-    def _by_line(self) -> Product:
+    def _prior_seen_by_scan(self) -> Product:
         """Prior over what the scan shows: height on the line, place along it, distance in radii, radius."""
         line, length = self.line, self.line.length_mm
         return Product(
@@ -115,21 +115,22 @@ class PatchPrior:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map unit-cube coordinates to height, x, y, r; both (n_samples, 4)."""
-        on_line, along, beside, r = self._by_line.from_unit_cube(u).T
+        on_line, along, beside, r = self._prior_seen_by_scan.from_unit_cube(u).T
         x, y = self.line.place(along, beside * r)
         return np.stack([on_line * np.exp(0.5 * beside**2), x, y, r], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Invert `from_unit_cube`."""
-        return self._by_line.to_unit_cube(self._seen_by_scan(theta))
+        """Map height, x, y, r to unit-cube coordinates; both (n_samples, 4)."""
+        return self._prior_seen_by_scan.to_unit_cube(self._parameters_seen_by_scan(theta))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the natural log of the density, (n_samples, 4) -> (n_samples,)."""
-        shown = self._seen_by_scan(theta)
+        shown = self._parameters_seen_by_scan(theta)
         # d(on_line, beside) / d(height, y) = exp(-beside^2 / 2) / r
-        return self._by_line.log_prob(shown) - 0.5 * shown[:, 2] ** 2 - np.log(shown[:, 3])
+        return self._prior_seen_by_scan.log_prob(shown) - 0.5 * shown[:, 2] ** 2 - np.log(shown[:, 3])
 
-    def _seen_by_scan(self, theta: FloatArray) -> FloatArray:
+    def _parameters_seen_by_scan(self, theta: FloatArray) -> FloatArray:
+        """Convert height, x, y, r to height on the line, place along it, distance in radii, radius: (n_samples, 4)."""
         height, x, y, r = theta.T
         along, beside_mm = self.line.coordinates(x, y)
         beside = beside_mm / r

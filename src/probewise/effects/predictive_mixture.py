@@ -54,7 +54,7 @@ class PredictiveMixture:
         if between is not None:
             level = replace(level, sd=np.hypot(np.broadcast_to(level.sd, mean.shape), between))
         if self._log_sum.size:
-            log_p = log_density(_of_rows(level, self.scored), self.readings[self.scored], mean[:, self.scored])
+            log_p = log_density(_noise_of_rows(level, self.scored), self.readings[self.scored], mean[:, self.scored])
             self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
 
     def finished(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -71,7 +71,7 @@ class PredictiveMixture:
         return base + shift, np.sqrt(spread + self._of_noise / n), scores
 
 
-def _of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
+def _noise_of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
     """Select the noise of some rows."""
     if level.sd.shape[-1] == 1:
         return level

@@ -50,12 +50,12 @@ class Reflection(NamedEffect[Footprint]):
         u_mm = value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy
         v_mm = value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy
         return Footprint(
-            weight=_joined(value.weight * (1 - share), value.weight * share),
-            u_mm=_joined(value.u_mm, u_mm),
-            v_mm=_joined(value.v_mm, v_mm),
-            var_u=_joined(value.var_u, value.var_u),
-            var_v=_joined(value.var_v, value.var_v),
-            cov_uv=_joined(value.cov_uv, value.cov_uv),
+            weight=_joined_gaussians(value.weight * (1 - share), value.weight * share),
+            u_mm=_joined_gaussians(value.u_mm, u_mm),
+            v_mm=_joined_gaussians(value.v_mm, v_mm),
+            var_u=_joined_gaussians(value.var_u, value.var_u),
+            var_v=_joined_gaussians(value.var_v, value.var_v),
+            cov_uv=_joined_gaussians(value.cov_uv, value.cov_uv),
             brightness=value.brightness,
         )
 
@@ -72,6 +72,6 @@ class Reflection(NamedEffect[Footprint]):
         )
 
 
-def _joined(first: FloatArray, second: FloatArray) -> FloatArray:
+def _joined_gaussians(first: FloatArray, second: FloatArray) -> FloatArray:
     shape = np.broadcast_shapes(first.shape, second.shape)
     return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)

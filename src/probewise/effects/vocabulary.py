@@ -124,7 +124,7 @@ class NamedEffect(Effect[V], Protocol[V]):
         return (self,)
 
     def gates(self, plan: Plan) -> Gates | None:
-        """Return masks where the variants differ only in the readings they act on; None otherwise."""
+        """Return the masks of variants that differ only in the readings they act on; None for other variants."""
         return None
 
     def coarse(self) -> Self:
@@ -132,9 +132,9 @@ class NamedEffect(Effect[V], Protocol[V]):
         return self
 
     def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the parameter that the variant determines, over all variants by weight, theta (n_samples, n_params).
+        """Redraw the parameter that the variant determines: for each sample a variant by its weight, then the value.
 
-        By default theta is returned as it is.
+        `theta` is (n_samples, n_params), in and out; `weights` is (n_variants,). By default theta does not change.
         """
         return theta
 
@@ -171,7 +171,7 @@ _OWN = ("name", "stage", "units", "covariates", "prior", "apply", "bank", "sente
 
 
 class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
-    """An effect on the noise: the mean of the readings does not change."""
+    """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True."""
 
     n_nodes: ClassVar[int] = 10
     """Number of nodes of its prior, for an effect of one parameter."""
@@ -185,7 +185,7 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
         return None
 
     def change(self, predicted: FloatArray) -> FloatArray:
-        """Return the change of readings predicted without it, any shape: none unless it `changes_the_mean`."""
+        """Return its change of readings predicted without it, same shape; zeros unless it `changes_the_mean`."""
         return np.zeros_like(predicted)
 
     def bank(self) -> FloatArray:

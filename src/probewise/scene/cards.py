@@ -85,8 +85,8 @@ class CardedRegion:
 def seen_with_cards(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
     """Return the white fraction seen with cards: `seen` is that without, `covered` the share of the view on each card.
 
-    Exact for a view that contains edges of cards only, or none of a card; with both, the albedo under the card is taken
-    to be the mean albedo of the view.
+    Exact unless a view contains both an edge of a card and an edge of what lies below the cards. There, the albedo
+    under the card is taken to be the mean albedo of the view.
     """
     for card, share in zip(cards, covered, strict=True):
         seen = np.asarray(seen * (1.0 - share) + card.albedo * share)

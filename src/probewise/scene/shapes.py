@@ -77,6 +77,7 @@ class PlacedPrior:
         return np.where(inside & np.isfinite(own), own - np.log(room), -np.inf)
 
     def _bounds_of_centre(self, own: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the least and greatest x and y of the centre, each (n_samples, 2), for the shapes' own parameters."""
         size = np.array([self.field.width_mm, self.field.height_mm])
         margin = np.zeros((len(own), 2)) if self.extent is None else self.extent(own)
         return margin, size - margin
@@ -96,7 +97,8 @@ def _require_fit(shape: str, name: str, bounds: Bounds, field: Field, *, reach: 
         )
 
 
-def _round_extent(own: FloatArray) -> FloatArray:
+def _circle_extent(own: FloatArray) -> FloatArray:
+    """Return half width and half height of circles, (n_samples, 2), from their radii, (n_samples, 1)."""
     return np.repeat(own[:, :1], 2, axis=1)
 
 
@@ -119,7 +121,7 @@ class Circle:
     def prior(self) -> PlacedPrior:
         """Uniform over centre and radius."""
         return PlacedPrior(
-            self.field, Product({"radius_mm": Uniform(*self.radius_mm)}), _round_extent if self.inside else None
+            self.field, Product({"radius_mm": Uniform(*self.radius_mm)}), _circle_extent if self.inside else None
         )
 
     def region(self, theta: FloatArray) -> EllipseRegion:
@@ -240,7 +242,7 @@ class RegularPolygon:
         """Uniform over centre, radius, and angle within the polygon's symmetry."""
         own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
         # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
-        return PlacedPrior(self.field, own, _round_extent if self.inside else None)
+        return PlacedPrior(self.field, own, _circle_extent if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a polygon for each hypothesis, theta (n_samples, 4)."""

@@ -65,7 +65,7 @@ class EmulatedArm:
     joints
         Base, shoulder, elbow.
     lowest
-        Lowest pose of the sensor so far; below a height of 0 it would have gone through the table.
+        Lowest pose of the sensor so far; a height below 0 means that it went through the table.
     """
 
     def __init__(self, geometry: Geometry) -> None:

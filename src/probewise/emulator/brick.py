@@ -102,17 +102,17 @@ class Brick:
             0x0C: lambda: b"",
             0x0D: self._keep_alive,
             0x88: lambda: _VERSIONS,
-            0x90: self._no_module,
-            0x91: self._no_module,
+            0x90: self._refuse_module,
+            0x91: self._refuse_module,
             0x92: lambda handle: b"\0",
-            0x94: self._read_map,
-            0x95: self._write_map,
-            0x97: self._usb_only,
-            0x98: self._rename,
+            0x94: self._refuse_reading_map,
+            0x95: self._refuse_writing_map,
+            0x97: self._refuse_usb_only,
+            0x98: self._rename_brick,
             0x9B: self._device_info,
             0xA1: lambda buffer: bytes((buffer, 0)),
-            0xA2: self._poll,
-            0xA4: self._usb_only,
+            0xA2: self._poll_buffer,
+            0xA4: self._refuse_usb_only,
         }
 
     @property
@@ -141,10 +141,10 @@ class Brick:
         request = None if self.is_off else parse(telegram)
         if request is None:
             return None
-        status, payload = self._carried_out(request)
+        status, payload = self._execute_request(request)
         return reply(request.opcode, status, payload) if request.wants_reply else None
 
-    def _carried_out(self, request: Request) -> tuple[Status, bytes]:
+    def _execute_request(self, request: Request) -> tuple[Status, bytes]:
         if request.command is None:
             return Status.UNKNOWN_COMMAND, b""
         try:
@@ -166,26 +166,26 @@ class Brick:
         self._awake_s = self._clock()
         return struct.pack("<I", int(1000 * self._sleep_s))
 
-    def _rename(self, name: bytes) -> bytes:
+    def _rename_brick(self, name: bytes) -> bytes:
         self._name = name.split(b"\0")[0][:15]
         return b""
 
     def _device_info(self) -> bytes:
         return struct.pack("<15s7s4xI", self._name, ADDRESS, self._files.free)
 
-    def _no_module(self, wanted: bytes | int) -> bytes:
+    def _refuse_module(self, wanted: bytes | int) -> bytes:
         raise Refused(Status.MODULE_NOT_FOUND)
 
-    def _read_map(self, module: int, offset: int, wanted: int) -> bytes:
+    def _refuse_reading_map(self, module: int, offset: int, wanted: int) -> bytes:
         raise Refused(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0) + bytes(min(wanted, 119)))
 
-    def _write_map(self, module: int, offset: int, wanted: int, data: bytes) -> bytes:
+    def _refuse_writing_map(self, module: int, offset: int, wanted: int, data: bytes) -> bytes:
         raise Refused(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0))
 
-    def _poll(self, buffer: int, wanted: int) -> bytes:
+    def _poll_buffer(self, buffer: int, wanted: int) -> bytes:
         if wanted > _LONGEST_POLL:
             raise Refused(Status.UNDEFINED_ERROR, bytes((buffer, 0)))
         return bytes((buffer, 0)) + bytes(wanted)
 
-    def _usb_only(self, *fields: bytes) -> bytes:
+    def _refuse_usb_only(self, *fields: bytes) -> bytes:
         raise Refused(Status.UNDEFINED_ERROR)

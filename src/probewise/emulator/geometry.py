@@ -65,13 +65,13 @@ def read_geometry(path: Path) -> Geometry:
         raise FileError(path, f"not TOML: {error}", "an arm's file of format arm/1") from error
 
     def number(*keys: str) -> float:
-        value = _value(path, table, keys)
+        value = _value_in_file(path, table, keys)
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
             raise FileError(path, f"{'.'.join(keys)} is {shown(value)}", f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
     def joint(name: str) -> JointNumbers:
-        port = _value(path, table, ("joints", name, "port"))
+        port = _value_in_file(path, table, ("joints", name, "port"))
         if port not in ("A", "B", "C"):
             raise FileError(path, f"joints.{name}.port is {shown(port)}", "A, B or C")
         ratio = number("joints", name, "gear_ratio")
@@ -82,7 +82,7 @@ def read_geometry(path: Path) -> Geometry:
             raise FileError(path, f"joints.{name}.home_deg is {home:g}", f"within its limits, {low:g} to {high:g}")
         return JointNumbers(port, ratio, home, low, high, play)
 
-    elbow = _value(path, table, ("links", "elbow"))
+    elbow = _value_in_file(path, table, ("links", "elbow"))
     if elbow not in ("absolute", "relative"):
         raise FileError(path, f"links.elbow is {shown(elbow)}", '"absolute" or "relative"')
     joints = (joint("base"), joint("shoulder"), joint("elbow"))
@@ -104,7 +104,7 @@ def read_geometry(path: Path) -> Geometry:
     )
 
 
-def _value(path: Path, table: Mapping[str, Any], keys: tuple[str, ...]) -> object:
+def _value_in_file(path: Path, table: Mapping[str, Any], keys: tuple[str, ...]) -> object:
     found: Any = table
     for key in keys:
         if not isinstance(found, Mapping) or key not in found:

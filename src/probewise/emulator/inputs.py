@@ -21,7 +21,9 @@ _I2C_BIT_S = 1 / 9600
 
 
 @dataclass
-class _Port:
+class _InputPort:
+    """An input port: its sensor, type and mode, and its last values."""
+
     sensor: Sensor
     kind: int = _NONE
     mode: int = _RAW
@@ -35,7 +37,7 @@ class _Port:
 
 @dataclass
 class Inputs:
-    """Ports 1 to 4.
+    """The input ports 1 to 4 with their sensors, and the commands that set and read them.
 
     Parameters
     ----------
@@ -48,10 +50,10 @@ class Inputs:
     sensors: Sequence[Sensor]
     clock: Clock
     commands: Mapping[int, Callable[..., bytes]] = field(init=False)
-    _ports: tuple[_Port, ...] = field(init=False)
+    _ports: tuple[_InputPort, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._ports = tuple(_Port(sensor) for sensor in self.sensors)
+        self._ports = tuple(_InputPort(sensor) for sensor in self.sensors)
         self.commands = {
             0x05: self._set_mode,
             0x07: self._get_values,
@@ -64,15 +66,15 @@ class Inputs:
     def reset_ports(self) -> None:
         """Set every port to no sensor, as the firmware does when a program starts or ends."""
         for port in self._ports:
-            self._configure(port, _NONE, _RAW)
+            self._configure_port(port, _NONE, _RAW)
 
     def _set_mode(self, number: int, kind: int, mode: int) -> bytes:
-        self._configure(self._port(number), kind, mode)
+        self._configure_port(self._port_numbered(number), kind, mode)
         return b""
 
-    def _configure(self, port: _Port, kind: int, mode: int) -> None:
+    def _configure_port(self, port: _InputPort, kind: int, mode: int) -> None:
         """Set type and mode; readings are invalid for a while, and the old values stay."""
-        self._convert(port)
+        self._convert_reading(port)
         now_s = self.clock()
         if kind != port.kind:
             port.valid_s = now_s + (0.301 if kind in _SOUND else 0.401 if kind in _COLOUR else 0.021)
@@ -81,38 +83,38 @@ class Inputs:
         port.kind, port.mode = kind, mode
 
     def _get_values(self, number: int) -> bytes:
-        port = self._port(number)
-        valid = self._convert(port)
+        port = self._port_numbered(number)
+        valid = self._convert_reading(port)
         raw, normalized, scaled = port.shown
         return struct.pack(
             "<BBBBBHHhh", number, valid, False, port.kind, port.mode, raw, normalized, scaled, normalized
         )
 
     def _reset_scaled(self, number: int) -> bytes:
-        port = self._port(number)
+        port = self._port_numbered(number)
         port.shown = (*port.shown[:2], 0)  # until the next conversion
         return b""
 
-    def _convert(self, port: _Port) -> bool:
+    def _convert_reading(self, port: _InputPort) -> bool:
         """Update the port's values; return whether they are valid."""
         if self.clock() < port.valid_s:
             return False
         if port.kind not in (_NONE, *_DIGITAL):
             sensor = EmptyPort() if isinstance(port.sensor, Digital) else port.sensor
             raw = sensor.counts(lit=port.kind == _LIGHT_ON)
-            normalized = _normalized(raw, port.kind)
-            port.boolean = _switched(normalized, port.boolean)
-            port.shown = (raw, normalized, _scaled(normalized, port.mode, port.boolean))
+            normalized = _normalized_value(raw, port.kind)
+            port.boolean = _boolean_value(normalized, port.boolean)
+            port.shown = (raw, normalized, _scaled_value(normalized, port.mode, port.boolean))
         return True
 
     def _bus_status(self, number: int) -> bytes:
-        port = self._port(number)
-        status, ready = self._bus(port)
-        return _checked_status(status, bytes((len(ready),)))
+        port = self._port_numbered(number)
+        status, ready = self._bus_state(port)
+        return _payload_if_ok(status, bytes((len(ready),)))
 
     def _bus_write(self, number: int, n_written: int, n_wanted: int, written: bytes) -> bytes:
-        port = self._port(number)
-        status, _ = self._bus(port)
+        port = self._port_numbered(number)
+        status, _ = self._bus_state(port)
         if status in (Status.CHANNEL_NOT_READY, Status.BUS_PENDING):
             raise Refused(Status.CHANNEL_NOT_READY)
         if n_written > 16 or n_wanted > 16 or len(written) < n_written:
@@ -124,13 +126,13 @@ class Inputs:
         return b""
 
     def _bus_read(self, number: int) -> bytes:
-        port = self._port(number)
-        status, ready = self._bus(port)
+        port = self._port_numbered(number)
+        status, ready = self._bus_state(port)
         if status == Status.OK:
             port.answer = b""
-        return _checked_status(status, bytes((len(ready),)) + ready.ljust(16, b"\0"))
+        return _payload_if_ok(status, bytes((len(ready),)) + ready.ljust(16, b"\0"))
 
-    def _bus(self, port: _Port) -> tuple[Status, bytes]:
+    def _bus_state(self, port: _InputPort) -> tuple[Status, bytes]:
         """Return the status of the bus and the bytes to read."""
         if port.kind not in _DIGITAL or self.clock() < port.valid_s:
             return Status.CHANNEL_NOT_READY, b""
@@ -138,19 +140,19 @@ class Inputs:
             return Status.BUS_PENDING, b""
         return (Status.BUS_ERROR, b"") if port.failed else (Status.OK, port.answer)
 
-    def _port(self, number: int) -> _Port:
+    def _port_numbered(self, number: int) -> _InputPort:
         if number >= len(self._ports):
             raise Refused(Status.OUT_OF_RANGE)
         return self._ports[number]
 
 
-def _checked_status(status: Status, payload: bytes) -> bytes:
+def _payload_if_ok(status: Status, payload: bytes) -> bytes:
     if status != Status.OK:
         raise Refused(status, payload)
     return payload
 
 
-def _normalized(raw: int, kind: int) -> int:
+def _normalized_value(raw: int, kind: int) -> int:
     """Scale to 0..1023 in integers as the firmware does; more light or sound gives a larger value."""
     if kind in (_LIGHT_ON, _LIGHT_OFF):
         zero, percent = _LIGHT_SCALE
@@ -161,14 +163,14 @@ def _normalized(raw: int, kind: int) -> int:
     return AD_MAX - min(max(raw - zero, 0) * 100 // percent, AD_MAX)
 
 
-def _switched(normalized: int, before: int) -> int:
+def _boolean_value(normalized: int, before: int) -> int:
     """Return the boolean value with hysteresis at 45 % and 55 %; low is on, as for a pressed touch sensor."""
     if normalized < AD_MAX * 45 // 100:
         return 1
     return 0 if normalized > AD_MAX * 55 // 100 else before
 
 
-def _scaled(normalized: int, mode: int, boolean: int) -> int:
+def _scaled_value(normalized: int, mode: int, boolean: int) -> int:
     """Convert by mode; the counting modes stay at 0, since no emulated sensor makes edges."""
     match mode & 0xE0:
         case 0x00:

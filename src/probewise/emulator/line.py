@@ -39,7 +39,7 @@ class VirtualLine:
             self._received += self._radio.receive()
             if len(self._received) >= size or self._clock() >= deadline_s:
                 break
-            self._check()
+            self._require_open()
             next_s = self._radio.next_s
             until_s = deadline_s if next_s is None else min(next_s, deadline_s)
             self._clock.sleep(max(until_s - self._clock(), 0.0))
@@ -55,13 +55,13 @@ class VirtualLine:
         LinkError
             If the line is cut.
         """
-        self._check()
+        self._require_open()
         self._radio.send(data)
 
     def close(self) -> None:
         """Close the line; the state of the brick does not change."""
         self._closed = True
 
-    def _check(self) -> None:
+    def _require_open(self) -> None:
         if self._closed or not self._radio.is_open:
             raise LinkError("the line to the emulated brick is cut; open a new one")

@@ -122,7 +122,7 @@ class Output:
         if self.run_state == RunState.RUNNING:
             self._run_until_limit()
         if self.run_state == RunState.IDLE:
-            self._fade()
+            self._fade_power()
 
     def regulate(self) -> bool:
         """Regulate the speed if it is due; return whether it was."""
@@ -130,7 +130,7 @@ class Output:
             return False
         if self._regulation & _SPEED:
             before = (self.power, self._error, self._error_sum)
-            self.power = self._regulated(self._error - self._moved + self.target_power)
+            self.power = self._regulated_power(self._error - self._moved + self.target_power)
             # A remaining error too small to overcome friction: the motor stays.
             self._settled = not self._moved and before == (self.power, self._error, self._error_sum)
         self._clock_ms = self._moved = 0
@@ -163,6 +163,7 @@ class Output:
         return math.floor(self.motor.angle_deg + 0.5)
 
     def _change_run_state(self, run_state: int, power: int) -> None:
+        """Enter a run state with a power; a run that already has both goes on unchanged."""
         if run_state == self.run_state != RunState.IDLE and power == self.set_power:
             return
         if not self.target_power:
@@ -173,13 +174,13 @@ class Output:
             self.set_power = self.target_power = power
             if not power:  # hold the present position
                 self.power = self._clock_ms = self._moved = 0
-        elif self._is_past(run_state, power):
+        elif self._is_ramp_complete(run_state, power):
             run_state = RunState.RUNNING
         else:
             self.set_power, self._ramp_counts, self._ramp_from = power, 0, self.tacho_count
         self.run_state = run_state
 
-    def _is_past(self, ramp: int, power: int) -> bool:
+    def _is_ramp_complete(self, ramp: int, power: int) -> bool:
         """Return whether a ramp to this power, up or down, has already reached it."""
         if ramp == RunState.RAMP_UP:
             return self.set_power != 0 and (self.set_power >= power if power > 0 else self.set_power <= power)
@@ -232,14 +233,14 @@ class Output:
         if not self._regulation:
             self.power = bounded(self.target_power, 100)
 
-    def _fade(self) -> None:
+    def _fade_power(self) -> None:
         """Reduce the power by 1 per millisecond after a limit: a host sees IDLE well before the motor rests."""
         self._brake = False
         self.power -= _sign(self.power)
         self.target_power -= _sign(self.target_power)
         self.set_power -= _sign(self.set_power)
 
-    def _regulated(self, error: int) -> int:
+    def _regulated_power(self, error: int) -> int:
         """Return the power of the firmware's PID regulator for a position error in counts."""
         steepness, self._error = error - self._error, error
         self._error_sum = bounded(quotient(3 * self._error_sum + error, 4), 800)

@@ -36,7 +36,7 @@ class _Synchronisation:
 
 
 class Outputs:
-    """Ports A, B and C.
+    """The output ports A, B and C with their motors, and the commands that drive them.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ class Outputs:
         self.commands: Mapping[int, Callable[..., bytes]] = {
             0x04: self._set_state,
             0x06: self._get_state,
-            0x0A: self._reset,
+            0x0A: self._reset_counter,
         }
 
     def advance(self, now_s: float, battery_mv: float) -> None:
@@ -67,7 +67,7 @@ class Outputs:
         for number in range(n_ticks):
             if not moving:
                 return
-            self._tick(moving, battery_mv)
+            self._simulate_millisecond(moving, battery_mv)
             if number % _WATCHED_TICKS == 0:
                 self._watch()
             moving = [port for port in moving if not port.is_at_rest]  # one at rest stays there without a command
@@ -77,7 +77,8 @@ class Outputs:
         for port in self.ports:
             port.apply(OutputSetting())
 
-    def _tick(self, moving: Sequence[Output], battery_mv: float) -> None:
+    def _simulate_millisecond(self, moving: Sequence[Output], battery_mv: float) -> None:
+        """Simulate a millisecond of the moving ports; a synchronised pair stops when one of them reaches its limit."""
         for port in moving:
             port.tick(battery_mv)
         pair = [port for port in moving if port.is_synchronised][:2]
@@ -92,20 +93,20 @@ class Outputs:
         self, port: int, power: int, mode: int, regulation: int, turn_ratio: int, run_state: int, tacho_limit: int
     ) -> bytes:
         setting = OutputSetting(power, mode, regulation, turn_ratio, run_state, tacho_limit)
-        for output in self.ports if port == _ALL else (self._port(port),):
+        for output in self.ports if port == _ALL else (self._port_numbered(port),):
             output.apply(setting)
             if output.is_synchronised:
                 self._synchronisation = _Synchronisation()
         return b""
 
     def _get_state(self, port: int) -> bytes:
-        return struct.pack("<BbBBbBIiii", port, *self._port(port).report())
+        return struct.pack("<BbBBbBIiii", port, *self._port_numbered(port).report())
 
-    def _reset(self, port: int, relative: int) -> bytes:
-        self._port(port).reset(block=bool(relative))
+    def _reset_counter(self, port: int, relative: int) -> bytes:
+        self._port_numbered(port).reset(block=bool(relative))
         return b""
 
-    def _port(self, port: int) -> Output:
+    def _port_numbered(self, port: int) -> Output:
         if port >= len(self.ports):
             raise Refused(Status.OUT_OF_RANGE)
         return self.ports[port]

@@ -29,30 +29,30 @@ class Programs:
         self.running: bytes | None = None
         self._boxes: tuple[deque[bytes], ...] = ()
         self.commands: Mapping[int, Callable[..., bytes]] = {
-            0x00: self._start,
-            0x01: self._stop,
-            0x09: self._write,
-            0x11: self._name,
-            0x13: self._read,
+            0x00: self._start_program,
+            0x01: self._stop_program,
+            0x09: self._write_message,
+            0x11: self._running_name,
+            0x13: self._read_message,
         }
 
-    def _start(self, name: bytes) -> bytes:
+    def _start_program(self, name: bytes) -> bytes:
         if not self._exists(name.split(b"\0")[0].decode("latin-1")):
             raise Refused(Status.OUT_OF_RANGE)
-        self._switch(name)
+        self._switch_program(name)
         return b""
 
-    def _stop(self) -> bytes:
+    def _stop_program(self) -> bytes:
         self._running_name()
-        self._switch(None)
+        self._switch_program(None)
         return b""
 
-    def _switch(self, name: bytes | None) -> None:
+    def _switch_program(self, name: bytes | None) -> None:
         self.running = name
         self._boxes = tuple(deque(maxlen=_DEPTH) for _ in range(_N_BOXES))
         self._on_change()
 
-    def _write(self, box: int, size: int, rest: bytes) -> bytes:
+    def _write_message(self, box: int, size: int, rest: bytes) -> bytes:
         message = rest[:size]
         if not 1 <= size <= _SIZE or len(message) < size or message[-1]:
             raise Refused(Status.OUT_OF_RANGE)
@@ -62,7 +62,7 @@ class Programs:
         self._boxes[box + _ANSWERS if box < _ANSWERS else box].append(message)
         return b""
 
-    def _read(self, box: int, local_box: int, remove: int) -> bytes:
+    def _read_message(self, box: int, local_box: int, remove: int) -> bytes:
         def padded(message: bytes) -> bytes:
             return bytes((local_box, len(message))) + message.ljust(_SIZE, b"\0")
 
@@ -74,10 +74,8 @@ class Programs:
             raise Refused(Status.MAILBOX_EMPTY, padded(b""))
         return padded(self._boxes[box].popleft() if remove else self._boxes[box][0])
 
-    def _name(self) -> bytes:
-        return self._running_name()
-
     def _running_name(self) -> bytes:
+        """Return the running program's name; refuse if none runs."""
         if self.running is None:
             raise Refused(Status.NO_PROGRAM)
         return self.running

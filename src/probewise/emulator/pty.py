@@ -35,13 +35,13 @@ class Terminal:
         if link is not None and link.exists() and not link.is_symlink():
             raise FileError(link, "the path exists already", "a new name, or a symbolic link to replace")
         self._link = link
-        self._open()
+        self._open_terminal()
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._close()
+        self._close_terminal()
         if self._link is not None:
             self._link.unlink(missing_ok=True)
 
@@ -52,8 +52,8 @@ class Terminal:
 
     def hang_up(self) -> None:
         """End the connection, so that clients lose the device, and open a new one."""
-        self._close()
-        self._open()
+        self._close_terminal()
+        self._open_terminal()
 
     def read(self, wait_s: float) -> bytes:
         """Return what a client has written, waiting at most `wait_s`."""
@@ -65,7 +65,7 @@ class Terminal:
         with contextlib.suppress(BlockingIOError):
             os.write(self._master, data)
 
-    def _open(self) -> None:
+    def _open_terminal(self) -> None:
         # The slave stays open here too: otherwise the master fails when the last client leaves.
         self._master, self._slave = os.openpty()
         tty.setraw(self._slave)
@@ -76,7 +76,7 @@ class Terminal:
             fresh.symlink_to(self._slave_path)
             fresh.replace(self._link)
 
-    def _close(self) -> None:
+    def _close_terminal(self) -> None:
         os.close(self._slave)
         os.close(self._master)
 

@@ -99,7 +99,7 @@ class Radio:
             data = data[: int(self._rng.integers(1, len(data)))]
         for telegram in self._frames.feed(data, self._clock()):
             if self.is_open:
-                self._handle(telegram)
+                self._handle_request(telegram)
 
     def receive(self) -> bytes:
         """Return the bytes that have reached the host by now."""
@@ -108,8 +108,8 @@ class Radio:
             received += self._coming.popleft()[1]
         return bytes(received)
 
-    def _handle(self, telegram: bytes) -> None:
-        self._note(">", telegram)
+    def _handle_request(self, telegram: bytes) -> None:
+        self._trace_telegram(">", telegram)
         if self._occurs("deaf", self.faults.deaf):
             return
         answer = self._refusal(telegram) if self._occurs("error", self.faults.error) else self.brick.answer(telegram)
@@ -118,10 +118,10 @@ class Radio:
             return
         if answer is None or self._occurs("silence", self.faults.silence):
             return
-        self._note("<", answer)
+        self._trace_telegram("<", answer)
         at_s = self._clock() + self._turnaround_s
         if self._occurs("unasked", self.faults.unasked):
-            self._deliver(at_s, framed(_UNASKED))
+            self._schedule_delivery(at_s, framed(_UNASKED))
         if self._occurs("late", self.faults.late):
             at_s += self.faults.late_s
         frame = self._with_faults(framed(answer))
@@ -129,11 +129,11 @@ class Radio:
             self._held += frame
             return
         frame, self._held = self._held + frame, b""
-        for piece in self._pieces(frame):
-            self._deliver(at_s, piece)
+        for piece in self._cut_into_pieces(frame):
+            self._schedule_delivery(at_s, piece)
             at_s += self._rng.uniform(0.0, _PIECE_S)
         if self._occurs("double", self.faults.double):
-            self._deliver(at_s + self._rng.uniform(0.0, _DOUBLED_S), frame)
+            self._schedule_delivery(at_s + self._rng.uniform(0.0, _DOUBLED_S), frame)
 
     def _refusal(self, telegram: bytes) -> bytes | None:
         """Return an error reply to a request, without passing it to the brick."""
@@ -152,14 +152,14 @@ class Radio:
             frame = frame[: int(self._rng.integers(1, len(frame)))]
         return bytes(byte for byte in frame if not self._occurs("drop", self.faults.drop))
 
-    def _pieces(self, frame: bytes) -> list[bytes]:
+    def _cut_into_pieces(self, frame: bytes) -> list[bytes]:
         if len(frame) < 2 or not self._occurs("fragment", self.faults.fragment):
             return [frame]
         n_cuts = int(self._rng.integers(1, min(len(frame), 4)))
         cuts = [0, *sorted(self._rng.choice(np.arange(1, len(frame)), n_cuts, replace=False).tolist()), len(frame)]
         return [frame[begin:end] for begin, end in pairwise(cuts)]
 
-    def _deliver(self, at_s: float, data: bytes) -> None:
+    def _schedule_delivery(self, at_s: float, data: bytes) -> None:
         """Schedule bytes in order: a late reply delays those after it."""
         self._last_s = max(at_s, self._last_s)
         self._coming.append((self._last_s, data))
@@ -171,7 +171,7 @@ class Radio:
             self._trace(self._clock(), "!", name)
         return happens
 
-    def _note(self, event: Event, telegram: bytes) -> None:
+    def _trace_telegram(self, event: Event, telegram: bytes) -> None:
         command = COMMANDS.get(telegram[1]) if len(telegram) > 1 else None
         name = "unknown" if command is None else command.name
         self._trace(self._clock(), event, f"{telegram.hex(' ')}  {name}")

@@ -30,7 +30,7 @@ def parse_scene(text: str) -> Surface:
     """
     name, _, listed = text.rpartition(":")
     try:
-        return _MAKERS[name or "circle"](*(_finite(cell) for cell in listed.split(",")))
+        return _MAKERS[name or "circle"](*(_parse_finite(cell) for cell in listed.split(",")))
     except (KeyError, TypeError, ValueError) as error:
         raise ParameterError("--scene", text, f"{'; '.join(FORMS)}; in mm and degrees") from error
 
@@ -55,7 +55,7 @@ def scene_text(surface: Surface) -> str:
     raise ParameterError("scene", type(surface).__name__, "; ".join(FORMS))
 
 
-def _finite(text: str) -> float:
+def _parse_finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
         raise ValueError(text)
@@ -63,11 +63,11 @@ def _finite(text: str) -> float:
 
 
 def _circle(x_mm: float, y_mm: float, radius_mm: float) -> Disc:
-    return Disc((x_mm, y_mm), _positive(radius_mm))
+    return Disc((x_mm, y_mm), _checked_positive(radius_mm))
 
 
 def _ellipse(x_mm: float, y_mm: float, a_mm: float, b_mm: float, angle_deg: float) -> Oval:
-    return Oval((x_mm, y_mm), (_positive(a_mm), _positive(b_mm)), math.radians(angle_deg))
+    return Oval((x_mm, y_mm), (_checked_positive(a_mm), _checked_positive(b_mm)), math.radians(angle_deg))
 
 
 def _polygon(*numbers: float) -> Polygon:
@@ -92,7 +92,7 @@ def _uniform(albedo: float) -> Uniform:
     return Uniform(albedo)
 
 
-def _positive(value: float) -> float:
+def _checked_positive(value: float) -> float:
     if value <= 0:
         raise ValueError(value)
     return value

@@ -65,7 +65,10 @@ class Digital:
     registers: dict[int, bytes]
 
     def transfer(self, written: bytes, wanted: int) -> bytes | None:
-        """Answer a write of address, register and data; None without an acknowledgement."""
+        """Write any data to a register and return `wanted` bytes from it; None if the address is not this sensor's.
+
+        `written` holds the address, the register and the data.
+        """
         if len(written) < 2 or written[0] & 0xFE != self.address:
             return None
         begin = written[1]

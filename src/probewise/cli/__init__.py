@@ -87,26 +87,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     verb = next(v for v in VERBS if v.name == arguments.verb)
     os.environ["MPLBACKEND"] = "Agg"  # figures go to files: no window and no display
     with warnings.catch_warnings():
-        warnings.showwarning = _one_line_warning
+        warnings.showwarning = _write_warning
         try:
             with stoppable():
                 return verb.run(arguments)
         except Stopped as stop:
-            _complain(verb, f"stopped; {str(stop) or 'nothing was written'}")
+            _write_complaint(verb, f"stopped; {str(stop) or 'nothing was written'}")
             _discard_unwritable_output()
             return stop.status
         except (NotConvergedError, LinkError) as error:
-            _complain(verb, str(error))
+            _write_complaint(verb, str(error))
             return 1
         except BrokenPipeError:  # the reader of a pipe has closed it; written files are complete
             _discard_unwritable_output()
             return 1
         except (ProbewiseError, OSError) as error:
-            _complain(verb, _one_line(error))
+            _write_complaint(verb, _error_in_one_line(error))
             return 2
 
 
-def _complain(verb: Verb, text: str) -> None:
+def _write_complaint(verb: Verb, text: str) -> None:
     with contextlib.suppress(OSError):  # the terminal was closed
         sys.stderr.write(f"probewise {verb.name}: {text}\n")
 
@@ -119,13 +119,13 @@ def _discard_unwritable_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _one_line(error: Exception) -> str:
+def _error_in_one_line(error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return " ".join(str(error).split())
 
 
-def _one_line_warning(
+def _write_warning(
     message: Warning | str,
     category: type[Warning],
     filename: str,

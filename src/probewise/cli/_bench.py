@@ -73,7 +73,7 @@ class Bench:
         return arm
 
     def answer_at_mark(self, question: MarkQuestion) -> str:
-        """Answer like a person who watches the emulated arm's sensor over a mark.
+        """Answer like a person who watches the emulated arm's sensor over a mark: "ok", or moves such as "x 5 down 2".
 
         Raises
         ------

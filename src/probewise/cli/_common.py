@@ -46,13 +46,13 @@ class OneLineParser(argparse.ArgumentParser):
         words = sys.argv[1:] if args is None else list(args)
         if self._subparsers is None:  # otherwise words may be options of a verb
             for word in itertools.takewhile(lambda word: word != "--", words):
-                self._require_known(word.partition("=")[0])
+                self._require_known_option(word.partition("=")[0])
         parsed, surplus = super().parse_known_args(words, namespace)
         if surplus and self._subparsers is None:
             self.error(f"unrecognized arguments: {' '.join(surplus)}")
         return parsed, surplus
 
-    def _require_known(self, name: str) -> None:
+    def _require_known_option(self, name: str) -> None:
         options = self._option_string_actions
         if name.startswith("--") and not any(option.startswith(name) for option in options):
             self.error(f"no option {name}{did_you_mean(name, options)}")
@@ -108,7 +108,7 @@ def parse_path(text: str) -> Path:
     return Path(text)
 
 
-def _whole_number(text: str, *, least: int, allowed: str) -> int:
+def _parse_whole_number(text: str, *, least: int, allowed: str) -> int:
     try:
         value = int(text)
     except ValueError:
@@ -120,12 +120,12 @@ def _whole_number(text: str, *, least: int, allowed: str) -> int:
 
 def positive_int(text: str) -> int:
     """Parse an integer above zero, for argparse."""
-    return _whole_number(text, least=1, allowed="greater than 0")
+    return _parse_whole_number(text, least=1, allowed="greater than 0")
 
 
 def seed_number(text: str) -> int:
     """Parse an integer of 0 or more, for argparse."""
-    return _whole_number(text, least=0, allowed="of 0 or more")
+    return _parse_whole_number(text, least=0, allowed="of 0 or more")
 
 
 def positive_number(unit: str) -> Callable[[str], float]:

@@ -61,18 +61,18 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     if chosen.kind == "file" and arguments.geometry is not None:
         raise ParameterError("--geometry", str(arguments.geometry), "none with FILE.py, which defines its own reach")
     geometry = geometry_of(arguments) if chosen.is_lego or arguments.geometry is not None else None
-    field = _field(arguments.field, geometry)
+    field = _field_of_run(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
     streams = posing.Streams.of(np.random.default_rng(arguments.seed))
     shape = posing.shape_named(arguments.shape, field)
-    orientations_rad, heights_mm, repeats = _choices(arguments, geometry)
+    orientations_rad, heights_mm, repeats = _choices_of_settings(arguments, geometry)
     cards = parse_cards(arguments.reference, field)
     if cards and (arguments.both_models or arguments.model == "naive" or arguments.method == "paper"):
         allowed = "none with --both-models, --model naive or --method paper"
         raise ParameterError("--reference", arguments.reference[0], allowed)
-    levels = _levels(arguments, chosen, sensor, rng=streams.levels)
+    levels = _naive_levels(arguments, chosen, sensor, rng=streams.levels)
     pose = partial(
         posing.pose_experiment,
         sensor,
@@ -116,7 +116,7 @@ def _other_model(model: Model) -> Model:
     return "naive" if model == "ssf" else "ssf"
 
 
-def _choices(
+def _choices_of_settings(
     arguments: argparse.Namespace, geometry: Geometry | None
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[int, ...]]:
     """Return the orientations (radians), heights and repeats to choose from, if the arm supports them."""
@@ -136,7 +136,7 @@ def _choices(
     return tuple(math.radians(turn) for turn in turns or (0.0,)), heights_mm or (), arguments.repeats or (1,)
 
 
-def _field(text: str | None, geometry: Geometry | None) -> Field:
+def _field_of_run(text: str | None, geometry: Geometry | None) -> Field:
     """Return the given field, which must agree with the geometry if there is one."""
     if geometry is None:
         return parse_field("1048,520" if text is None else text)
@@ -146,7 +146,7 @@ def _field(text: str | None, geometry: Geometry | None) -> Field:
     return own
 
 
-def _levels(
+def _naive_levels(
     arguments: argparse.Namespace, chosen: ArmName, sensor: FittedSensor, *, rng: np.random.Generator
 ) -> Naive | None:
     """Return the paper's naive levels from the given recording, or from readings of the simulated sensor."""

@@ -42,7 +42,7 @@ class Pictures:
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)
-        self.frames.append(self._frame(step, shadow))
+        self.frames.append(self._draw_frame(step, shadow))
         raise_if_stopped()  # a signal may have damaged the picture
         if step.number == 1 and not step.replayed:
             _remove_pictures(self.out)
@@ -56,7 +56,7 @@ class Pictures:
             if len(self.frames) == 1:
                 webbrowser.open((self.out / "live.html").absolute().as_uri())
 
-    def _frame(self, step: Step, shadow: Step | None) -> bytes:
+    def _draw_frame(self, step: Step, shadow: Step | None) -> bytes:
         inputs = self.inputs
         poses = [(each.reading.pose, each.reading.value) for each in self.steps]
         readings = [(pose.x_mm, pose.y_mm, value) for pose, value in poses]

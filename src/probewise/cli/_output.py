@@ -140,12 +140,13 @@ class _Commit:
 
 
 def _prepare_commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[str]) -> _Commit:
+    """List the changes that move the files of `folder` into `out`, spare the inputs and remove outdated files."""
     names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     for name in names:
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
     own = {path.resolve() for path in inputs}
-    aside = _names_kept(out, [name for name in names if (out / name).resolve() in own])
+    aside = _kept_names(out, [name for name in names if (out / name).resolve() in own])
     old = itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated)
     gone = [path.relative_to(out).as_posix() for path in old if path.resolve() not in own]
     return _Commit(names, aside, [name for name in gone if name not in names])
@@ -173,6 +174,7 @@ def _finish_interrupted_commit(out: Path) -> None:
 
 
 def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
+    """Make the changes of a commit; those already made are skipped."""
     for name in commit.names:
         new, target = folder / name, out / name
         if not new.exists():
@@ -185,16 +187,16 @@ def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _names_kept(out: Path, names: Sequence[str]) -> dict[str, str]:
+def _kept_names(out: Path, names: Sequence[str]) -> dict[str, str]:
     """Return for each file its first free name NAME_kept, NAME_kept_2, ...; files of one stem get the same ending."""
     aside: dict[str, str] = {}
     for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):
         group = [Path(name) for name in names if Path(name).with_suffix("") == stem]
         endings = itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2)))
-        ending = next(e for e in endings if not any((out / _renamed(path, e)).exists() for path in group))
-        aside |= {path.as_posix(): _renamed(path, ending).as_posix() for path in group}
+        ending = next(e for e in endings if not any((out / _with_ending(path, e)).exists() for path in group))
+        aside |= {path.as_posix(): _with_ending(path, ending).as_posix() for path in group}
     return aside
 
 
-def _renamed(path: Path, ending: str) -> Path:
+def _with_ending(path: Path, ending: str) -> Path:
     return path.with_name(f"{path.stem}{ending}{path.suffix}")

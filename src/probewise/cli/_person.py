@@ -65,7 +65,7 @@ class PersonAtBench:
         self._answer(f"{text}, then press Enter: ")
         if request.pattern is None or not self._check_sheets:
             return
-        while (wrong := self._contradiction(request.pattern)) is not None:
+        while (wrong := self._contradiction_of_sheet(request.pattern)) is not None:
             if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
                 caution(f"{wrong}; is the right sheet there, the right way round?")
                 break
@@ -87,7 +87,8 @@ class PersonAtBench:
             return " (the emulator's terminal knows no such pattern; --arm emulator lays it by itself)"
         return f" (in the emulator's terminal: {scene})"
 
-    def _contradiction(self, name: str) -> str | None:
+    def _contradiction_of_sheet(self, name: str) -> str | None:
+        """Read the sheet's white and black; return a complaint if they contradict its pattern, else None."""
         bounds, origin = bounds_of(self._arm), np.array(self._origin)
         values = {}
         for is_white, place in self._sheet_check.places_to_check(

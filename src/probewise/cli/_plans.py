@@ -29,9 +29,9 @@ def for_own_instrument(
     if unit is not None:  # the declared values have another unit
         said |= {"min": None, "max": None, "step": None, "sensor": ""}
     if range_ is not None:
-        said |= dict(zip(("min", "max"), _numbers("--range", range_, 2), strict=True))
+        said |= dict(zip(("min", "max"), _parse_numbers("--range", range_, 2), strict=True))
     if step is not None:
-        (said["step"],) = _numbers("--step", step, 1)
+        (said["step"],) = _parse_numbers("--step", step, 1)
     return keep_commanded(dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, **said)))  # type: ignore[arg-type]
 
 
@@ -55,7 +55,7 @@ def keep_commanded(plan: Plan) -> Plan:
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
 
 
-def _numbers(option: str, text: str, n: int) -> list[float]:
+def _parse_numbers(option: str, text: str, n: int) -> list[float]:
     try:
         numbers = [float(cell) for cell in text.split(",")]
     except ValueError:

@@ -61,7 +61,7 @@ class SheetCheck:
         if math.isnan(shade) or math.isnan(value):
             return None
         name, is_white = self._plan.pattern_names[int(self._plan.pattern[row])], bool(shade)
-        wrong = self._against_earlier(is_white, value)
+        wrong = self._contradiction_of_earlier(is_white, value)
         if wrong is None:
             self._read[is_white].append(value)
             return None
@@ -82,7 +82,7 @@ class SheetCheck:
             if self._bright and contrast < self._least_difference(*values.values()):
                 wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
         for is_white, value in values.items():
-            told = self._against_earlier(is_white, value)
+            told = self._contradiction_of_earlier(is_white, value)
             wrong = wrong or (None if told is None else f"where it should be {_colour(is_white)} {told}")
         if wrong is not None:
             return f"sheet {name!r} contradicts its pattern: {wrong}"
@@ -117,7 +117,8 @@ class SheetCheck:
                 out[is_white] = (x, y)
         return out
 
-    def _against_earlier(self, is_white: bool, value: float) -> str | None:
+    def _contradiction_of_earlier(self, is_white: bool, value: float) -> str | None:
+        """Return a complaint if a reading over white or black contradicts earlier readings of the sheets, else None."""
         own, other = self._read[is_white], self._read[not is_white]
         if own and other:
             level, opposite = float(np.median(own)), float(np.median(other))

@@ -32,14 +32,14 @@ class Stopped(KeyboardInterrupt):
         return 128 + self.number
 
 
-class _Request:
+class _StopRequest:
     """The last request to stop: its signal number, None if there is none, and its time."""
 
     number: int | None = None
     at_s: float = 0.0
 
 
-_request = _Request()
+_request = _StopRequest()
 
 
 @contextlib.contextmanager
@@ -89,11 +89,11 @@ def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) ->
         yield
     except BaseException as error:
         if (asked := _stop_request_in(error)) is not None:
-            raise Stopped(asked.number, _message_of(kept)) from error
+            raise Stopped(asked.number, _text_of_what_is_kept(kept)) from error
         if isinstance(error, LinkError):
-            raise LinkError(f"{error}; {_message_of(kept)}") from error
+            raise LinkError(f"{error}; {_text_of_what_is_kept(kept)}") from error
         if results and isinstance(error, FileError):
-            raise FileError(error.path, error.found, f"{error.allowed}; {_message_of(kept)}") from error
+            raise FileError(error.path, error.found, f"{error.allowed}; {_text_of_what_is_kept(kept)}") from error
         raise
 
 
@@ -115,7 +115,7 @@ def _stop_request_in(error: BaseException) -> Stopped | None:
     return Stopped() if isinstance(error, KeyboardInterrupt) else None
 
 
-def _message_of(kept: Callable[[], str]) -> str:
+def _text_of_what_is_kept(kept: Callable[[], str]) -> str:
     try:
         return kept()
     except FileError as error:

@@ -20,7 +20,7 @@ def workers(n: int) -> Iterator[ProcessPoolExecutor]:
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"), initializer=_quiet_worker)
+    pool = ProcessPoolExecutor(n, mp_context=multiprocessing.get_context("spawn"), initializer=_initialise_worker)
     try:
         yield pool
     except BaseException:
@@ -31,7 +31,7 @@ def workers(n: int) -> Iterator[ProcessPoolExecutor]:
     pool.shutdown()
 
 
-def _quiet_worker() -> None:
+def _initialise_worker() -> None:
     import warnings
 
     from probewise.errors import DoubtfulResultWarning

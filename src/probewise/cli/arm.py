@@ -181,6 +181,7 @@ def _task(
     moves: bool = False,
     arms: str | None = None,
 ) -> OneLineParser:
+    """Add the parser of a task; with `moves` it has --arm, whose help is `arms`, and --dry-run."""
     parser = tasks.add_parser(name, help=summary, description=summary)
     if moves:
         _add_arm(parser, arms)
@@ -204,7 +205,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
     from probewise.arm.geometry import JOINTS
@@ -214,7 +215,7 @@ def _check(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
     out = None if arguments.out is None else check_out_file(arguments.out)
     drawing = None if arguments.drawing is None else check_out_file(arguments.drawing)
-    port = None if arguments.arm is None else _port(arguments.arm)
+    port = None if arguments.arm is None else _nxt_port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
     held = geometry.holds(places)
@@ -266,7 +267,7 @@ def _check_brick(port: str, geometry: Geometry) -> None:
             raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
 
 
-def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _jog_joints(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm.geometry import JOINTS
 
     match arguments.where:
@@ -276,7 +277,7 @@ def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 raise ParameterError("--steps", True, "with --down: the sensor is lowered in steps")
             if arguments.down and not arguments.dry_run and not arguments.steps:
                 warn_of_clearance(geometry)
-            with _arm(arguments, geometry) as arm:
+            with _open_lego_arm(arguments, geometry) as arm:
                 if arguments.steps and not arguments.dry_run:
                     confirm_lowering(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
@@ -288,17 +289,17 @@ def _jog(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 by_rad = math.radians(float(text))
             except ValueError as error:
                 raise ParameterError("WHERE", text, "a number of degrees") from error
-            with _arm(arguments, geometry) as arm:
+            with _open_lego_arm(arguments, geometry) as arm:
                 arm.turn(JOINTS.index(joint), by_rad)
                 _say_position(arm, quiet=arguments.quiet)
         case _:
             raise ParameterError("WHERE", " ".join(arguments.where), f"X,Y in mm; or {', '.join(JOINTS)}, and degrees")
 
 
-def _home(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _bring_home(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm.geometry import JOINTS
 
-    with _arm(arguments, geometry) as arm:
+    with _open_lego_arm(arguments, geometry) as arm:
         if arguments.here:
             angles = [f"{name} {math.degrees(j.home_rad):g}" for name, j in zip(JOINTS, geometry.joints, strict=True)]
             arm.release()
@@ -355,7 +356,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
     done = {mark.place_mm[:2] for mark in taken}
     marks = [(x, y) for x, y in marks_of(geometry).tolist()]
     arguments.scene = arguments.sensor = arguments.seed = None
-    instrument, bench = _instrument(arguments, geometry)
+    instrument, bench = _open_instrument(arguments, geometry)
     assert isinstance(instrument, LegoArm)
 
     def kept_so_far() -> str:
@@ -380,7 +381,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
                 say(f"mark {number} kept: {kept}", quiet=arguments.quiet)
 
 
-def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
     """Measure by the light how high the sensor hangs at each place, relative to the first."""
     import numpy as np
 
@@ -399,7 +400,7 @@ def _heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
         raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
     require_reach(geometry, np.array(places), "place")
     arguments.sensor = arguments.seed = arguments.scene = None
-    instrument, bench = _instrument(arguments, geometry, scene=WHITE)
+    instrument, bench = _open_instrument(arguments, geometry, scene=WHITE)
     assert isinstance(instrument, LegoArm)
     _warn_and_confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
@@ -446,14 +447,14 @@ def _height_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: float)
     return f"({x_mm:g}, {y_mm:g}) mm: it hangs {abs(off_mm):.1f} ± {sd_mm:.1f} mm {side} than its counters say"
 
 
-def _read(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    with _arm(arguments, geometry) as arm:
+def _read_sensor(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    with _open_lego_arm(arguments, geometry) as arm:
         value, battery_mv = arm.read_here(), arm.battery_mv()
         if not arguments.dry_run:
             say(f"{value:g} {UNITS}, battery {battery_mv:.0f} mV")
 
 
-def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
     from probewise.arm import LegoArm, Pose, require_reach
@@ -466,7 +467,7 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before connecting to the brick
         require_reach(geometry, places, "reading of the scan")
     names: list[str] = ["battery_mv"]
-    instrument, _ = _instrument(arguments, geometry)
+    instrument, _ = _open_instrument(arguments, geometry)
     _warn_and_confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
         require_reach(bounds_of(arm), places, "reading of the scan")
@@ -482,7 +483,7 @@ def _scan(arguments: argparse.Namespace, geometry: Geometry) -> None:
             say(f"{x_mm:.3f},{y_mm:.3f},{turned:.3f},{reading.time_s:.3f},{reading.value:.9g}{''.join(more)}")
 
 
-def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise._progress import progress_shown
     from probewise.arm import carry_out, recording_of
     from probewise.arm.carry_out import BY_HAND_S, duration_s
@@ -492,7 +493,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
     named = arguments.plan == PAPER
     out = check_out_file(arguments.out, *([] if named else [Path(arguments.plan)]))
-    own = _is_own(arguments)
+    own = _is_own_instrument(arguments)
     asked = paper_plan() if named else read_plan(arguments.plan)
     if own:
         plan = for_own_instrument(asked, unit=arguments.unit, range_=arguments.range, step=arguments.step)
@@ -511,7 +512,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
             return "nothing was read"
         return kept_message(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
 
-    instrument, bench = _instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
+    instrument, bench = _open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
     _warn_and_confirm_lowering(arguments, instrument, geometry)
     with reporting_what_is_kept(kept), instrument as arm:
         check = SheetCheck(plan, white_is_bright=not own)
@@ -521,7 +522,7 @@ def _record(arguments: argparse.Namespace, geometry: Geometry) -> None:
         )
         if by_person:
             ask = PersonAtBench(
-                arm, plan, origin, check, check_sheets=not own, emulated=not own and is_pty(_port(arguments.arm))
+                arm, plan, origin, check, check_sheets=not own, emulated=not own and is_pty(_nxt_port(arguments.arm))
             )
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
             say(
@@ -576,7 +577,8 @@ def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list
     return readings_of(before)
 
 
-def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+def _open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+    """Open the arm of --arm, or for --dry-run one that only prints its moves."""
     from probewise.arm import LegoArm, Rehearsal
 
     if arguments.dry_run:
@@ -585,10 +587,10 @@ def _arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 
         raise CommandError(
             "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
         )
-    return open_nxt(_port(arguments.arm), geometry, start_s=start_s)
+    return open_nxt(_nxt_port(arguments.arm), geometry, start_s=start_s)
 
 
-def _instrument(
+def _open_instrument(
     arguments: argparse.Namespace,
     geometry: Geometry,
     *,
@@ -600,7 +602,7 @@ def _instrument(
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
     if chosen is None or chosen.kind == "nxt":
         _refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
-        return _arm(arguments, geometry, start_s=start_s), None
+        return _open_lego_arm(arguments, geometry, start_s=start_s), None
     if arguments.dry_run:
         raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
     if chosen.kind == "file":
@@ -650,12 +652,13 @@ def _refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> No
             raise ParameterError(f"--{name}", str(value), f"none with {what}")
 
 
-def _is_own(arguments: argparse.Namespace) -> bool:
+def _is_own_instrument(arguments: argparse.Namespace) -> bool:
     """Return whether the arm is a user's own instrument."""
     return arguments.arm is not None and parse_arm(arguments.arm).kind == "file"
 
 
-def _port(name: str) -> str:
+def _nxt_port(name: str) -> str:
+    """Return the port of "nxt:PORT"; raise ParameterError for any other arm."""
     chosen = parse_arm(name)
     if chosen.kind != "nxt":
         own = "; FILE.py is for `arm scan`, `arm record` and `explore`" if chosen.kind == "file" else ""
@@ -665,6 +668,7 @@ def _port(name: str) -> str:
 
 
 def _prompter(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
+    """Return a function that prompts the person; in a dry run, it only prints the request."""
     return (lambda text: say(f"ask: {text}")) if arguments.dry_run else prompter(arm)
 
 
@@ -678,14 +682,14 @@ def _say_position(arm: LegoArm, *, quiet: bool) -> None:
 
 
 TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
-    "check": _check,
-    "jog": _jog,
+    "check": _check_arm,
+    "jog": _jog_joints,
     "fit-geometry": _fit_geometry,
-    "home": _home,
-    "heights": _heights,
-    "read": _read,
-    "scan": _scan,
-    "record": _record,
+    "home": _bring_home,
+    "heights": _measure_heights,
+    "read": _read_sensor,
+    "scan": _scan_line,
+    "record": _record_plan,
 }
 
 VERB = Verb("arm", "Check, move and read the LEGO arm; record a plan with it or another arm.", add_arguments, run)

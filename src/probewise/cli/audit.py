@@ -41,13 +41,13 @@ def run(arguments: argparse.Namespace) -> int:
     out = None if arguments.out is None else check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:
-            audit = _of_simulator(arguments, progress)
+            audit = _audit_simulator(arguments, progress)
         else:
             plan = read_plan(arguments.plan, progress=progress)
             sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
             audit = audit_plan(plan, sensor=sensor, progress=progress)
         progress("drawing the figures")
-        notes = [] if out is None else _write(audit, out, arguments.plan)
+        notes = [] if out is None else _write_results(audit, out, arguments.plan)
     say(audit.summary(), quiet=arguments.quiet)
     for note in notes:
         say(f"note: {note}", quiet=arguments.quiet)
@@ -56,7 +56,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _of_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanAudit:
+def _audit_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanAudit:
     from probewise.diagnosis import audit_system
     from probewise.systems import read_run_table, read_simulator
 
@@ -67,7 +67,7 @@ def _of_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanAudi
     return audit_system(simulator, table)
 
 
-def _write(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
+def _write_results(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
     import json
 
     from probewise.diagnosis import CURE_PLAN, audit_json

@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     with progress_shown(quiet=arguments.quiet) as progress:
         recording = read_recording(arguments.recording, progress=progress)
         orders = tuple(sorted(set(arguments.orders)))
-        n_live = _enough_live(arguments.live, orders)
+        n_live = _checked_n_live(arguments.live, orders)
         rng = np.random.default_rng(arguments.seed)
         result = verbs.calibrate(
             recording,
@@ -103,8 +103,8 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _enough_live(n_live: int, orders: Sequence[int]) -> int:
-    """Raise, before any work, if the live points are too few for the number of parameters."""
+def _checked_n_live(n_live: int, orders: Sequence[int]) -> int:
+    """Return the number of live points; raise ParameterError if it is too small for the largest order, or too large."""
     from probewise.nested import LIVE_PER_PARAM, least_live
 
     if n_live > MOST_LIVE:

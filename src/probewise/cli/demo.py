@@ -70,8 +70,8 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     truth = hidden_circle(seed)
     with workers(2) as pool:
         progress("calibrating and diagnosing", 0, 8)
-        diagnosing = pool.submit(_diagnose, seed)
-        calibration = _calibrate(seed, arguments.full, pool)
+        diagnosing = pool.submit(_diagnose_concealed, seed)
+        calibration = _calibrate_shipped(seed, arguments.full, pool)
         sensor = calibration.sensor
         doubting = [pool.submit(search_with_a_fault, sensor, trust, truth, seed) for trust in TRUSTS.values()]
         starting = [pool.submit(search_from_circle, sensor, model, truth, seed) for model in MODELS]
@@ -168,7 +168,7 @@ def hidden_circle(seed: int) -> tuple[float, ...]:
     return tuple(float(v) for v in drawn)
 
 
-def _calibrate(seed: int, full: bool, pool: Executor) -> Calibration:
+def _calibrate_shipped(seed: int, full: bool, pool: Executor) -> Calibration:
     import numpy as np
 
     from probewise.calibration import calibrate
@@ -234,13 +234,13 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
     experiment = experiment_for(
         sensor, circle_on_field(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy()
     )
-    first, surface = place_on_circle(truth, seed), surface_of("circle", np.array(truth), field)
+    first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
 
 
-def place_on_circle(truth: tuple[float, ...], seed: int) -> Pose:
-    """Draw a place within the circle, uniformly: the common first reading of robots to be compared."""
+def place_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
+    """Draw the pose of the first reading, uniformly within the circle; it is the same for all robots compared."""
     import numpy as np
 
     from probewise.arm import Pose
@@ -266,12 +266,12 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
     field = Field()
     experiment = experiment_for(sensor, circle_on_field(), field, n_live=N_LIVE_ROBOT, trust=trust)
     world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
-    first, surface = place_on_circle(truth, seed), surface_of("circle", np.array(truth), field)
+    first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world, surface, field, seed=seed) as arm:
         return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT)
 
 
-def _diagnose(seed: int) -> Diagnosis:
+def _diagnose_concealed(seed: int) -> Diagnosis:
     """Diagnose the second recording, with the same result as `probewise diagnose`."""
     from probewise.cli.diagnose import generators
     from probewise.diagnosis import diagnose

@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     surface = parse_scene(arguments.scene)
     faults = Faults.parse(arguments.fault)
     world, _ = world_of(arguments.sensor)
-    with _trace(arguments.log) as trace, Terminal(arguments.link) as terminal:
+    with _telegram_log(arguments.log) as trace, Terminal(arguments.link) as terminal:
         bench = set_up(
             geometry,
             world,
@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Listener:
-    """Commands typed at the emulator: another scene, `turn DEGREES`, `where`; also reports a sensor in the table."""
+    """Executes commands typed at the emulator: a scene, `turn DEGREES`, `where`; reports a sensor in the table."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
@@ -119,9 +119,9 @@ class _Listener:
             self._is_heard = bool(typed)
             *lines, self._typed = (self._typed + typed).split(b"\n")
             for line in lines:
-                self._execute(line.decode(errors="replace"))
+                self._execute_line(line.decode(errors="replace"))
 
-    def _execute(self, line: str) -> None:
+    def _execute_line(self, line: str) -> None:
         if line.strip() == "where":
             say(_place(self._bench.arm.sensor_pose()))
             return
@@ -145,8 +145,8 @@ def _is_foreground() -> bool:
 
 
 @contextlib.contextmanager
-def _trace(path: Path | None) -> Iterator[Trace]:
-    """Yield a function that writes one line per telegram, with the seconds since the start."""
+def _telegram_log(path: Path | None) -> Iterator[Trace]:
+    """Yield a function that writes a line per telegram or fault to the file; without a file it writes nothing."""
     from probewise.emulator.radio import no_trace
 
     if path is None:

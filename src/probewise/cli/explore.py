@@ -139,10 +139,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--batch", type=positive_int, default=1, metavar="N", help="choose N readings at a time")
     more = parser.add_argument_group("more than a place", "further choices, for an arm that supports them")
     more.add_argument(
-        "--orientations", type=_numbers, metavar="DEG,...", help="orientations to choose from, such as 0,45,90"
+        "--orientations", type=_parse_numbers, metavar="DEG,...", help="orientations to choose from, such as 0,45,90"
     )
     more.add_argument(
-        "--heights", type=_numbers, metavar="MM,...", help="reading heights to choose from, such as 10,14"
+        "--heights", type=_parse_numbers, metavar="MM,...", help="reading heights to choose from, such as 10,14"
     )
     more.add_argument(
         "--repeats",
@@ -254,7 +254,7 @@ def _relative_path(folder: Path, path: Path) -> str:
         return str(path.absolute())
 
 
-def _numbers(text: str) -> tuple[float, ...]:
+def _parse_numbers(text: str) -> tuple[float, ...]:
     """Parse "A,B,...", each number once, for argparse."""
     try:
         values = tuple(float(cell) for cell in text.split(","))

@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
         if getattr(arguments, name) is not None:
             allowed = f"none with {arguments.arm}, which has no use for it"
             raise ParameterError(f"--{name.replace('_', '-')}", str(getattr(arguments, name)), allowed)
-    plan = _plan(arguments, chosen)
+    plan = _first_plan(arguments, chosen)
     sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
     truth_seed, noise_seed, rounds_seed, files_seed = np.random.SeedSequence(arguments.seed).spawn(4)
     noise = int(noise_seed.generate_state(1)[0])
@@ -171,7 +171,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
+def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
     """Read the first plan, adapted to the chosen arm."""
     plan = plan_of(arguments.plan)
     if chosen.kind == "simulated":

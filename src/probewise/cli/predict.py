@@ -29,7 +29,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Predict every row, and score the predictions where there are readings."""
     refuse_journal(arguments.plan)
     if arguments.simulator is not None:
-        return _by_simulator(arguments)
+        return _predict_by_simulator(arguments)
     from probewise._progress import progress_shown
     from probewise.calibration import predict, read_sensor
     from probewise.recordings import read_plan_and_readings, write_prediction
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _by_simulator(arguments: argparse.Namespace) -> int:
+def _predict_by_simulator(arguments: argparse.Namespace) -> int:
     """Predict every row of a table with a simulator, as fitted or repaired."""
     import numpy as np
 

@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--paper", arguments.paper, " or ".join(PAPERS_MM))
     named = Path(arguments.what)
     out = check_out_file(arguments.out, *([named] if named.is_file() else []))
-    sheets = _sheets(arguments)
+    sheets = _sheets_to_draw(arguments)
     drawn = sheets_pdf(sheets, paper=arguments.paper, title=f"probewise sheets: {named.name}")
     write_bytes_atomically(out, drawn)
     for sheet in sheets:
@@ -59,7 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
+def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     from probewise.cli._plans import plan_of
     from probewise.recordings.description import read_description
     from probewise.report.sheets import field_sheet, jig_sheets, marks_sheet, plan_sheets, target_sheet
@@ -75,7 +75,7 @@ def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
         field_mm = geometry_of(arguments).field_mm
         if arguments.target is None and what == TARGET:
             raise CommandError("--target is missing: give a shape, such as --target circle:524,260,80")
-        outline = None if arguments.target is None else _outline(arguments.target, field_mm)
+        outline = None if arguments.target is None else _target_outline_mm(arguments.target, field_mm)
         if what == FIELD:
             return (field_sheet(field_mm, outline),)
         assert outline is not None
@@ -94,7 +94,7 @@ def _sheets(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
     return plan_sheets(plan.patterns, plan)
 
 
-def _outline(text: str, field_mm: tuple[float, float]):  # type: ignore[no-untyped-def]
+def _target_outline_mm(text: str, field_mm: tuple[float, float]):  # type: ignore[no-untyped-def]
     import numpy as np
 
     from probewise.cli._geometry import parse_truth

@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     for name in ("seed", "size", "clean"):
         if getattr(arguments, name) is not None:
             raise ParameterError(f"--{name}", getattr(arguments, name), "only with --concealed")
-    rows = _rows(arguments)
+    rows = _study_rows(arguments)
     numbers = dict.fromkeys(rows, arguments.circles)
     numbers[rows[0]] = arguments.quoted or arguments.circles
     if max(numbers.values()) < 2:
@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(study))
-        page = report.write_page(study, command=_command(arguments))
+        page = report.write_page(study, command=_command_line(arguments))
         write_text_atomically(stage / "report.html", page)
     say(report.answer(study), quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
@@ -137,7 +137,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     return 0
 
 
-def _rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
+def _study_rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
     from probewise.study import Row, paper_rows, standard_rows
 
     given = {name: getattr(arguments, name) for name in _FACTORS if getattr(arguments, name) is not None}
@@ -155,7 +155,7 @@ def _rows(arguments: argparse.Namespace) -> tuple[Row, ...]:
     return (Row(**given),)
 
 
-def _command(arguments: argparse.Namespace) -> str:
+def _command_line(arguments: argparse.Namespace) -> str:
     words = ["probewise", "study", "--circles", str(arguments.circles)]
     words += [] if arguments.quoted is None else ["--quoted", str(arguments.quoted)]
     words += ["--beside-paper"] if arguments.beside_paper else []

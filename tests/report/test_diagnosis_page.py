@@ -218,7 +218,7 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     monkeypatch.setattr(
         covariate_view, "covariate_values", lambda d: {place.witness: np.arange(3.0) for place in d.where}
     )
-    monkeypatch.setattr(covariate_view, "_views", lambda d, place, at: [place])
+    monkeypatch.setattr(covariate_view, "_views_of_place", lambda d, place, at: [place])
     chance = SimpleNamespace(means=lambda d, view, after: SimpleNamespace(largest_in_sds=sizes[view.covariate]))
     ordered = covariate_view.places_in_order(found, chance)
     assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
@@ -232,6 +232,6 @@ def test_a_plan_that_tells_next_to_nothing_is_not_asked_for():
     plan = SimpleNamespace(plan=range(8), minutes=1.2, description="scan again", expected_log_bayes_factor=0.04)
     words = SimpleNamespace(next_plan="next_plan.csv")
     found = SimpleNamespace(next_measurement=plan, apparatus=SimpleNamespace(words=words))
-    said = page._next_in_words(found)
+    said = page._next_readings_in_words(found)
     assert said.startswith("Nothing that is worth the time: the best plan of up to")
     assert "factor of 0.0 nats. It is in next_plan.csv: scan again (8 readings, about 1 minute)." in said

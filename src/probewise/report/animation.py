@@ -30,7 +30,7 @@ def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -
         sheet = Image.new("RGB", size, "white")
         sheet.paste(picture, (0, 0))
         sheets.append(sheet)
-    palette = _palette(sheets)
+    palette = _common_palette(sheets)
     sheets = [sheet.quantize(palette=palette, dither=Image.Dither.NONE) for sheet in sheets]
     durations = [round(1000 * frame_s)] * (len(sheets) - 1) + [round(1000 * last_s)]
     out = io.BytesIO()
@@ -38,7 +38,7 @@ def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -
     return out.getvalue()
 
 
-def _palette(sheets: Sequence[Image.Image]) -> Image.Image:
+def _common_palette(sheets: Sequence[Image.Image]) -> Image.Image:
     """Choose 256 colours for all frames together: with a palette for each, a colour would change between frames.
 
     They cover all colours, not the most frequent, so that the small square at the next place keeps its colour.

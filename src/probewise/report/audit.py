@@ -122,5 +122,5 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
     )
 
 
-def _names(effects: Sequence[str]) -> str:
+def _names_in_words(effects: Sequence[str]) -> str:
     return ", ".join(map(spoken_name, effects)) or "–"

@@ -47,7 +47,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
                 effect.detectability,
                 number(effect.share, 2),
                 effect.reason or ", ".join(f"{spoken_name(n)} {c:.3f}" for n, c in effect.alike[:4]) or "–",
-                "; ".join(_smallest(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
+                "; ".join(_detectable_size_in_words(s.parameter, s.unit, s.amount) for s in effect.smallest) or "–",
                 *["–" if effect.rows is None else str(effect.rows)] * counted,
             )
             for effect in sorted(effects, key=lambda e: rank.index(e.detectability))
@@ -65,14 +65,14 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
     )
 
 
-def _smallest(parameter: str, unit: str, amount: float | None) -> str:
+def _detectable_size_in_words(parameter: str, unit: str, amount: float | None) -> str:
     """Write an effect's size, with its parameter's name where the unit alone is not clear."""
     name = _SIZES.get(parameter, "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " "))
-    value = "at no size" if amount is None else f"{amount:.2g} {_unit(unit)}"
+    value = "at no size" if amount is None else f"{amount:.2g} {_unit_in_words(unit)}"
     return f"{name} {value}".strip()
 
 
-def _unit(unit: str) -> str:
+def _unit_in_words(unit: str) -> str:
     """Write "1/V" as "per V" and "LEGO/h" as "LEGO units per h"; a user's own unit is kept."""
     upper, _, lower = unit.partition("/")
     if upper not in ("1", "LEGO", "mm"):

@@ -96,7 +96,7 @@ def sections(
             "Readings",
             (
                 figure(drawn["readings.png"], "Readings as recorded, along the scans; single readings are below."),
-                *_notes(recording.notes),
+                *_note_paragraphs(recording.notes),
             ),
         ),
         Section(
@@ -117,7 +117,7 @@ def sections(
                 ),
             ),
         ),
-        Section("Parameters", (ssf_table(sensor), parameter_table(sensor), *_notes(sensor.notes))),
+        Section("Parameters", (ssf_table(sensor), parameter_table(sensor), *_note_paragraphs(sensor.notes))),
         Section(
             "Prior",
             (
@@ -202,5 +202,5 @@ def write_page(
     )
 
 
-def _notes(notes: tuple[str, ...]) -> tuple[Markup, ...]:
+def _note_paragraphs(notes: tuple[str, ...]) -> tuple[Markup, ...]:
     return tuple(paragraph(f"Note: {note}.") for note in notes)

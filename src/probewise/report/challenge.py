@@ -39,10 +39,10 @@ def table_of_rows(rows: Sequence[Row]) -> Markup:
         (
             (
                 _keep_indentation(row.name),
-                _value(row.found) if row.found.n else "–",
-                typeset(_interval(row.found)),
+                _value_text(row.found) if row.found.n else "–",
+                typeset(_interval_text(row.found)),
                 str(row.found.n),
-                _target(row),
+                _target_text(row),
                 "undecided" if row.decision == "open" else _DECISIONS[row.decision],
             )
             for row in rows
@@ -65,7 +65,7 @@ def table_csv(rows: Sequence[Row]) -> str:
         numbers = (row.found.value, row.found.low, row.found.high)
         bounds = (row.least, row.most)
         writer.writerow(
-            [row.name.strip(), *map(_number, numbers), row.found.n, *map(_number, bounds), _DECISIONS[row.decision]]
+            [row.name.strip(), *map(_to_csv, numbers), row.found.n, *map(_to_csv, bounds), _DECISIONS[row.decision]]
         )
     return text.getvalue()
 
@@ -82,9 +82,9 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
         )
         sections.append(Section("Confusion matrix", (drawn,)))
         sections.append(
-            Section("Case by case", (_cases(results),))
+            Section("Case by case", (_case_table(results),))
             if systems
-            else Section("Each effect at lambda 8", (_effects(done),))
+            else Section("Each effect at lambda 8", (_effect_table(done),))
         )
     failures = [(f"{r['kind']}, {r['at']}", r["failed"]) for r in results if "failed" in r]
     if failures:
@@ -103,17 +103,17 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
     )
 
 
-def _effects(done: Results) -> Markup:
+def _effect_table(done: Results) -> Markup:
     return table(
         ("effect", "cases", "detected at alpha .01", "named first"),
         (
-            (name, str(detected.n), *(f"{_value(e)} ({_interval(e)})" for e in (detected, named)))
+            (name, str(detected.n), *(f"{_value_text(e)} ({_interval_text(e)})" for e in (detected, named)))
             for name, (detected, named) in by_effect(done).items()
         ),
     )
 
 
-def _cases(results: Results) -> Markup:
+def _case_table(results: Results) -> Markup:
     return table(
         (
             "case",
@@ -125,11 +125,11 @@ def _cases(results: Results) -> Markup:
             "right",
             "held-out gain, and that of the right model (nats)",
         ),
-        (_case(number, result) for number, result in enumerate(results)),
+        (_case_cells(number, result) for number, result in enumerate(results)),
     )
 
 
-def _case(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
+def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
     concealed = " and ".join(h["name"] for h in result.get("hidden", ())) or result.get("noise_model", "")
     begun = (str(number), result.get("system", ""), concealed, f"{result['size']:g}" if result["size"] else "")
     if "failed" in result:
@@ -157,15 +157,15 @@ def _legend() -> Markup:
     )
 
 
-def _value(found: Estimate) -> str:
+def _value_text(found: Estimate) -> str:
     return "no case" if not found.n else f"{found.value:.3g}"
 
 
-def _interval(found: Estimate) -> str:
+def _interval_text(found: Estimate) -> str:
     return f"{found.low:.3g} to {found.high:.3g}" if math.isfinite(found.high - found.low) else ""
 
 
-def _target(row: Row) -> str:
+def _target_text(row: Row) -> str:
     if row.decision is None:
         return ""
     if math.isinf(row.least):
@@ -173,5 +173,6 @@ def _target(row: Row) -> str:
     return f"at least {row.least:g}" if math.isinf(row.most) else f"{row.least:g} to {row.most:g}"
 
 
-def _number(value: float) -> str:
+def _to_csv(value: float) -> str:
+    """Write a number as a cell of a CSV file; one that is not finite is empty."""
     return f"{value:.6g}" if math.isfinite(value) else ""

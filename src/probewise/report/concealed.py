@@ -28,18 +28,19 @@ def write_page(rows: Sequence[ConcealedRow], *, command: str) -> str:
         "the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals promise.",
     )
     sections = [
-        Section("The table", (_table(rows), _legend())),
+        Section("The table", (_comparison_table(rows), _legend())),
         Section("How it was made", (definition_list([("command", command)]),)),
     ]
     return page("A robot with a concealed fault", answer=answer(rows), key_figure=drawn, sections=sections)
 
 
 def _wrong_count(rows: Sequence[ConcealedRow]) -> str:
+    """Write how many of all runs ended sure and wrong, as in "3 of 40 runs"."""
     n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in rows)
     return f"{n_wrong} of {count(sum(row.runs for row in rows), 'run')}"
 
 
-def _table(rows: Sequence[ConcealedRow]) -> Markup:
+def _comparison_table(rows: Sequence[ConcealedRow]) -> Markup:
     header = (
         "concealed",
         "runs",

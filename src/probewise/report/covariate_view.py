@@ -41,7 +41,7 @@ class CovariateView:
     @property
     def shown_names(self) -> list[str] | None:
         """Names in the order in which they are drawn."""
-        return None if self.names is None else [self.names[v] for v in _values(self.at)]
+        return None if self.names is None else [self.names[v] for v in _distinct_values(self.at)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,9 +85,9 @@ class ResidualNoise:
 
 
 def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateView:
-    """Choose the first figure's covariate: the first whose means clearly leave the band of chance, else the largest.
+    """Choose the covariate of the first figure: the first candidate with a mean clearly outside the band of chance.
 
-    The largest is the one with the largest mean in sds.
+    If there is none, the candidate with the largest mean in sds; without candidates, the predicted reading.
 
     Candidates in order: a named wave, folded at its period; the places; for an unknown effect, its most likely
     covariate; last, the change that the repair makes.
@@ -97,7 +97,7 @@ def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateV
     places = sorted(alarming, key=lambda place: -_probability_of_dependence(diagnosis, place))
     found = _views_at_period(diagnosis)
     for place in places:
-        found += _views(diagnosis, place, values[place.witness])
+        found += _views_of_place(diagnosis, place, values[place.witness])
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_view_by_change(diagnosis))
     if not found:
@@ -113,25 +113,25 @@ def places_in_order(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[P
     """
     values, seen = covariate_values(diagnosis), {}
     for place in diagnosis.where:
-        views = _views(diagnosis, place, values[place.witness])
+        views = _views_of_place(diagnosis, place, values[place.witness])
         seen[place.witness] = any(chance.means(diagnosis, w, after=False).largest_in_sds >= _SEEN for w in views)
     ordered = sorted(diagnosis.where, key=lambda p: (-_probability_of_dependence(diagnosis, p), not seen[p.witness]))
     shown: list[Place] = []
     for place in ordered:  # with one scan, a place in all scans and one in that scan are the same
-        if not any(_is_same(values, place, other) for other in shown):
+        if not any(_is_same_interval(values, place, other) for other in shown):
             shown.append(place)
     return [(place, seen[place.witness]) for place in shown]
 
 
-def _is_same(values: Mapping[str, FloatArray], place: Place, other: Place) -> bool:
+def _is_same_interval(values: Mapping[str, FloatArray], place: Place, other: Place) -> bool:
     """Return whether two places are the same interval of the same covariate."""
     ends = (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
     own, others = values[place.witness], values[other.witness]
     return ends and place.start is not None and np.array_equal(own, others, equal_nan=True)
 
 
-def _views(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
-    """List the views of a place: for a scan first along its path; then along the place's covariate, (n_points,)."""
+def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
+    """List the views of a place: along its scan's path, if it has one; then along its covariate `at`, (n_points,)."""
     by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
@@ -145,7 +145,7 @@ def view_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> Covaria
     if place.without_effect:
         label = f"reading to be expected without it ({unit_name(unit)})"
     names = category_names(diagnosis, place)
-    return CovariateView(at, label, names, _window(place, at, names), place)
+    return CovariateView(at, label, names, _shaded_interval(place, at, names), place)
 
 
 def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
@@ -232,16 +232,16 @@ def _view_by_change(diagnosis: Diagnosis) -> CovariateView:
     )
 
 
-def _window(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
+def _shaded_interval(place: Place, at: FloatArray, names: Mapping[float, str] | None) -> tuple[float, float] | None:
     """Return the interval to shade: from a place's start to its end, or around its category; None if it has neither."""
     ends = None if place.start is None or place.end is None else (place.start, place.end)
     if not names:
         return ends
-    shown = _values(at)
+    shown = _distinct_values(at)
     members = [k for k, v in enumerate(shown) if (ends[0] <= v <= ends[1] if ends else names[v] == place.scan)]
     return (members[0] - 0.5, members[-1] + 0.5) if members else None
 
 
-def _values(at: FloatArray) -> list[float]:
+def _distinct_values(at: FloatArray) -> list[float]:
     values: list[float] = np.unique(at[np.isfinite(at)]).tolist()
     return values

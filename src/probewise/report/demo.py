@@ -161,12 +161,12 @@ def figures(
     """
     drawn = calibration_report.figures(calibration, recording, prediction)
     hidden = started_alike[0].truth_mm
-    drawn["arm.png"] = png(arm_and_sensor(geometry, _at_the_edge(hidden), outline_mm=hidden))
+    drawn["arm.png"] = png(arm_and_sensor(geometry, _edge_point(hidden), outline_mm=hidden))
     drawn["orientations.png"] = png(sensor_orientations(recording))
     drawn["quadrants.png"] = png(quadrant_patterns(recording))
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
-    drawn["first_three.png"] = png(_views(started_alike, n_first))
-    drawn["equal_readings.png"] = png(_views(started_alike, [len(started_alike[-1].run.steps)]))
+    drawn["first_three.png"] = png(_draw_views(started_alike, n_first))
+    drawn["equal_readings.png"] = png(_draw_views(started_alike, [len(started_alike[-1].run.steps)]))
     names = [f"{s.model} model" for s in searches]
     axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
     posterior_widths(
@@ -199,13 +199,13 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     return drawn
 
 
-def _at_the_edge(outline_mm: FloatArray) -> tuple[float, float]:
+def _edge_point(outline_mm: FloatArray) -> tuple[float, float]:
     """Choose a point of an outline at which to draw the arm."""
     x_mm, y_mm = outline_mm[0]
     return float(x_mm), float(y_mm)
 
 
-def _views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
+def _draw_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
     """Draw the paper's view after each of these numbers of readings, one column per search."""
     window = window_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
@@ -432,14 +432,14 @@ def comparison_lines(searches: Sequence[RobotSearch]) -> list[str]:
     costs, errors = [row[:-2] for row in rows], [(row[0], *row[-2:]) for row in rows]
     return [
         "A whole search, from an empty field (bits: information gained; the paper's count: 25 bits over the readings)",
-        *_in_columns(costs),
+        *_aligned_lines(costs),
         "",
         "Errors of the circle that was found: estimate minus truth, ± posterior sd",
-        *_in_columns(errors),
+        *_aligned_lines(errors),
         "",
     ]
 
 
-def _in_columns(rows: Sequence[Sequence[str]]) -> list[str]:
+def _aligned_lines(rows: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in rows]

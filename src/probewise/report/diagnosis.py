@@ -65,15 +65,15 @@ def answer(diagnosis: Diagnosis) -> str:
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
     """Build the sections below the first screen."""
     return [
-        Section("What it could be", _explanations(diagnosis)),
-        Section("Where it shows", _places(diagnosis, drawn)),
+        Section("What it could be", _explanation_elements(diagnosis)),
+        Section("Where it shows", _place_figures(diagnosis, drawn)),
         Section(
             "Before and after the repair" if diagnosis.repair.changes_predictions else "The model",
-            _before_and_after(diagnosis, drawn),
+            _before_and_after_figures(diagnosis, drawn),
         ),
-        Section("Does the repaired model predict held-out readings?", _gain_of_repair(diagnosis, drawn)),
-        Section("Aliased effects, and what would separate them", _aliases(diagnosis)),
-        Section("Noise", _noise(diagnosis, drawn)),
+        Section("Does the repaired model predict held-out readings?", _gain_elements(diagnosis, drawn)),
+        Section("Aliased effects, and what would separate them", _alias_elements(diagnosis)),
+        Section("Noise", _noise_elements(diagnosis, drawn)),
     ]
 
 
@@ -89,13 +89,13 @@ def write_page(
                     ("recordings", source),
                     ("readings", f"{int(diagnosis.recording.usable.sum())} used of {len(diagnosis.recording)}"),
                     ("seed", str(seed)),
-                    *_simulator(diagnosis),
+                    *_simulator_facts(diagnosis),
                 )
             ),
             *(paragraph(f"Note: {note}.") for note in (*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
         ),
     )
-    design = () if audit is None else (Section("What these readings could have shown", _design(audit)),)
+    design = () if audit is None else (Section("What these readings could have shown", _design_elements(audit)),)
     known: set[str] = set()
     first = fragment(figure(drawn["first.svg"], _first_caption(diagnosis)), definition_list(_facts(diagnosis)))
     return page(
@@ -124,13 +124,13 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Answer in plain words: what to do next, what was found, whether it is real, whether the repair helps."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     facts = [
-        ("What to measure next", _next_in_words(diagnosis)),
-        ("What was found", _sentence(_reason_in_words(diagnosis))),
+        ("What to measure next", _next_readings_in_words(diagnosis)),
+        ("What was found", _as_sentence(_reason_in_words(diagnosis))),
     ]
     if diagnosis.report.formula is not None:
-        facts.append(("As a formula", _formula(diagnosis.report.formula)))
+        facts.append(("As a formula", _formula_in_words(diagnosis.report.formula)))
     if diagnosis.report.remainder is not None:
-        facts.append(("Beside that", _sentence(diagnosis.report.remainder.sentence)))
+        facts.append(("Beside that", _as_sentence(diagnosis.report.remainder.sentence)))
     if not diagnosis.judged.too_little:
         facts.append(("Could it be chance?", _chance_in_words(diagnosis)))
     if gain.heldout_by_scan and diagnosis.repair.changes_predictions:
@@ -149,7 +149,7 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return facts
 
 
-def _simulator(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+def _simulator_facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Name the user's simulator, if there is one, and how often it was called."""
     if not isinstance(diagnosis.apparatus, SimulatorApparatus):
         return []
@@ -161,7 +161,7 @@ def _simulator(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     return [*own, ("calls of simulate", f"{system.caller.n_calls:,}, {how}")]
 
 
-def _formula(formula: Formula) -> str:
+def _formula_in_words(formula: Formula) -> str:
     """Write a formula with its estimated parameters."""
     numbers = ", ".join(f"{p.name} = {give_or_take(p.mean, p.sd)}" for p in formula.parameters)
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
@@ -215,7 +215,7 @@ def _chance_in_words(diagnosis: Diagnosis) -> str:
     return typeset(said)
 
 
-def _next_in_words(diagnosis: Diagnosis) -> str:
+def _next_readings_in_words(diagnosis: Diagnosis) -> str:
     plan = diagnosis.next_measurement
     if plan is None and diagnosis.judged.too_little:
         cure = diagnosis.apparatus.words.find_signal
@@ -231,24 +231,24 @@ def _next_in_words(diagnosis: Diagnosis) -> str:
             f"Bayes factor of {number(told, 1)} nats. It is in {file}: {description} ({asked})."
         )
     said = f"{description}: {asked}, {file}."
-    *others, last = map(_in_words, plan.between)
+    *others, last = map(_label_in_words, plan.between)
     rivals = f"{others[0]} from {last}" if len(others) == 1 else f"{', '.join(others)} and {last}"
     return f"{said[:1].upper()}{said[1:]} Expected to separate {rivals} by {number(told, 1)} nats."
 
 
-def _in_words(label: str) -> str:
-    """Write the label of a hypothesis that a plan separates in words; one without effect names is in words already."""
+def _label_in_words(label: str) -> str:
+    """Write in words the label of a hypothesis that a plan separates; a label without effect names stays as it is."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
     said = join_names(map(effect_in_words, names)) if all(is_in_words(name) for name in names) else named
     return f"{said}, too weak to be detected so far" if weak else said
 
 
-def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     credible = [hypothesis_in_words(_effects_of(label)) for label in diagnosis.judged.credible]
     return (
         *(
-            paragraph(_sentence(f"{effect_in_words(e.name)} ({probability(e.probability)}): {e.sentence}"))
+            paragraph(_as_sentence(f"{effect_in_words(e.name)} ({probability(e.probability)}): {e.sentence}"))
             for e in diagnosis.effects
             if e.probability > _LIKELY
         ),
@@ -260,11 +260,11 @@ def _explanations(diagnosis: Diagnosis) -> tuple[Markup, ...]:
                 if h.probability > 1e-3
             ),
         ),
-        *_credible(credible),
-        *_candidates(diagnosis),
+        *_credible_set(credible),
+        *_candidates_paragraph(diagnosis),
         *_unlisted_corrections(diagnosis),
-        *_weighings(diagnosis),
-        *_effects(diagnosis),
+        *_evidence_comparison(diagnosis),
+        *_effect_elements(diagnosis),
     )
 
 
@@ -273,35 +273,35 @@ def _effects_of(label: str) -> tuple[str, ...]:
     return () if label == "clean" else tuple(label.split("+"))
 
 
-def _credible(names: Sequence[str]) -> tuple[Markup, ...]:
+def _credible_set(names: Sequence[str]) -> tuple[Markup, ...]:
     if len(names) <= _MOST_CREDIBLE:
         return (paragraph(f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(names)}."),)
     summary = element("summary", f"95 % credible set: {len(names)} explanations")
     return (element("details", summary, paragraph(f"{'; '.join(names)}.")),)
 
 
-def _candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _candidates_paragraph(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """List the candidates for an unknown effect, if one is likely."""
     likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
-    said = ", ".join(f"{_candidate(name)} ({probability(p)})" for name, p in likely)
+    said = ", ".join(f"{_candidate_in_words(name)} ({probability(p)})" for name, p in likely)
     return (paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {said}."),)
 
 
-def _candidate(name: str) -> str:
+def _candidate_in_words(name: str) -> str:
     return effect_in_words(name) if is_in_words(name) else family_words(name)
 
 
 def _unlisted_corrections(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """List corrections that samples of the repaired model contain, but none of the explanations above."""
     return tuple(
-        paragraph(_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
+        paragraph(_as_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.carried
     )
 
 
-def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _evidence_comparison(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """Tabulate the explanations whose evidence was computed twice: by Laplace and by nested sampling."""
     if not diagnosis.report.weighings:
         return ()
@@ -323,7 +323,7 @@ def _weighings(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     )
 
 
-def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _place_figures(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     """Show where the residuals are significant; all but the first few figures are folded away."""
     if not diagnosis.where:
         return (paragraph("No residual is larger than noise explains."),)
@@ -341,7 +341,7 @@ def _places(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, .
     return (opening, *first, *more)
 
 
-def _before_and_after(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _before_and_after_figures(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     run = diagnosis.apparatus.words.run
     which = f"The {run} that the repair changes most" if diagnosis.repair.changes_predictions else f"One {run}"
     colours = "orange as calibrated, blue repaired" if diagnosis.repair.changes_predictions else "orange"
@@ -354,7 +354,7 @@ def _before_and_after(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple
     )
 
 
-def _gain_of_repair(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     shown = (
         (
@@ -394,7 +394,7 @@ def _nothing_held_out(diagnosis: Diagnosis) -> str:
     return f"No {run} could be held out: that takes two {run}s of eight readings or more."
 
 
-def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     noise = diagnosis.report.noise
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
@@ -412,7 +412,7 @@ def _noise(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ..
     )
 
 
-def _effects(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     likely = [effect for effect in diagnosis.effects if effect.probability > _LIKELY]
     rest = [effect for effect in diagnosis.effects if effect.probability <= _LIKELY]
     shown = (_effect_table(likely),) if likely else ()
@@ -424,7 +424,7 @@ def _effects(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 def _effect_table(effects: Sequence[EffectFound]) -> Markup:
     rows = [
         (
-            _with_name(effect.name) if k == 0 else "",
+            _words_and_name(effect.name) if k == 0 else "",
             probability(effect.probability) if k == 0 else "",
             number(effect.size_lambda, 1) if k == 0 else "",
             p.name.removesuffix(f"_{p.unit}").replace("_", " "),
@@ -436,7 +436,7 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
     return table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
 
 
-def _with_name(name: str) -> str:
+def _words_and_name(name: str) -> str:
     """Name an effect in words, followed by its name in diagnosis.json."""
     said = effect_in_words(name)
     return f"{said} ({name})" if said != name else name
@@ -445,15 +445,15 @@ def _with_name(name: str) -> str:
 def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Write a parameter with its sd (and unit, if asked), and its interval."""
     low, high = found.interval95
-    own = _unit(found) if unit else ""
+    own = _unit_text(found) if unit else ""
     return typeset(f"{give_or_take(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
 
 
-def _unit(found: ParameterFound) -> str:
+def _unit_text(found: ParameterFound) -> str:
     return "" if found.unit == "1" else unit_name(found.unit)
 
 
-def _aliases(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+def _alias_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """List the aliased pairs: those among the credible explanations first, the others folded away."""
     credible = {name for label in diagnosis.judged.credible for name in label.split("+")}
     ranked = sorted(diagnosis.judged.aliases, key=lambda a: (-len(credible & set(a.effects)), -a.cosine))
@@ -474,19 +474,19 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
                 " and ".join(map(effect_in_words, a.effects)),
                 number(a.cosine, 3),
                 typeset(a.settle_by),
-                _readings(a.readings),
+                _readings_needed(a.readings),
             )
             for a in aliases
         ),
     )
 
 
-def _readings(n: int) -> str:
+def _readings_needed(n: int) -> str:
     """Write the number of readings that would separate a pair: a dash for 0, a bound above the largest plan."""
     return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
 
 
-def _design(audit: PlanAudit) -> tuple[Markup, ...]:
+def _design_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     def names(found: Sequence[str]) -> str:
         return ", ".join(found).replace("_", " ") or "none"
 
@@ -508,7 +508,7 @@ def _design(audit: PlanAudit) -> tuple[Markup, ...]:
     )
 
 
-def _sentence(text: str) -> str:
+def _as_sentence(text: str) -> str:
     return typeset(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
 
 

@@ -49,9 +49,9 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     chance, values = ResidualNoise.of(diagnosis), covariate_values(diagnosis)
     drawn = {
         "first.svg": _draw_evidence(diagnosis, chance),
-        "before_after.svg": _before_and_after(diagnosis),
-        "residuals.svg": _residuals(diagnosis),
-        "noise.svg": _noise(diagnosis, chance),
+        "before_after.svg": _draw_before_and_after(diagnosis),
+        "residuals.svg": _draw_residuals(diagnosis),
+        "noise.svg": _draw_noise(diagnosis, chance),
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
@@ -125,7 +125,7 @@ def _draw_means_along(
     diagnosis: Diagnosis, chance: ResidualNoise, view: CovariateView, *, after: bool, each: bool, ax: Axes
 ) -> Axes:
     names = view.shown_names
-    at = view.at if names is None else _side_by_side(view.at)
+    at = view.at if names is None else _spread_categories(view.at)
     return mean_residuals_along(
         chance.means(diagnosis, view, after=after),
         label=view.label,
@@ -137,7 +137,7 @@ def _draw_means_along(
     )
 
 
-def _side_by_side(at: FloatArray) -> FloatArray:
+def _spread_categories(at: FloatArray) -> FloatArray:
     """Spread the rows of each categorical value evenly about its position, in order of time, (n_points,)."""
     out = np.full(at.shape, np.nan)
     for k, value in enumerate(np.unique(at[np.isfinite(at)])):
@@ -146,7 +146,7 @@ def _side_by_side(at: FloatArray) -> FloatArray:
     return out
 
 
-def _before_and_after(diagnosis: Diagnosis) -> bytes:
+def _draw_before_and_after(diagnosis: Diagnosis) -> bytes:
     """Draw the line scan that the repair changes most (or the longest): readings, both models, residuals of each."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
     rows = scan_changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
@@ -169,7 +169,7 @@ def scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
     return max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
 
 
-def _residuals(diagnosis: Diagnosis) -> bytes:
+def _draw_residuals(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading, before and after the repair."""
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
@@ -183,7 +183,7 @@ def _residuals(diagnosis: Diagnosis) -> bytes:
     )
 
 
-def _noise(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+def _draw_noise(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     """Draw the tests of the noise model: autocorrelation, spread by level, tails."""
     axes = stack_of_axes([2.2, 2.4, 2.2])
     for ax, name in zip(axes, ("correlated_noise", "signal_dependent_noise", "outliers"), strict=True):

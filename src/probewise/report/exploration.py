@@ -147,7 +147,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     """Write each estimate minus its truth, with the posterior sd."""
     step = run.last
     return ", ".join(
-        f"{without_unit(_own_name(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
+        f"{without_unit(_without_shape(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
         for name, mean, sd in zip(step.names, step.mean, run.sd, strict=True)
         if name in truth and np.isfinite(mean)
     )
@@ -247,7 +247,7 @@ def write_page(
         ("information", gained),
         ("the paper's count", f"{number(run.paper_bits_per_reading, 2)} bits per reading (25 bits over the readings)"),
         (f"probability that a length is off by over {OFF_MM:g} mm", off),
-        ("fit of the best hypothesis", _fit(run.last.p_value)),
+        ("fit of the best hypothesis", _fit_in_words(run.last.p_value)),
         ("seed", str(seed)),
     ]
     if truth:
@@ -308,12 +308,12 @@ def write_page(
     return page("The robot's search", answer=answer(run), key_figure=figure(frames[-1], caption), sections=sections)
 
 
-def _fit(p_value: float) -> str:
+def _fit_in_words(p_value: float) -> str:
     """Write the p-value of the fit with its meaning."""
     return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
 
 
-def _own_name(step: Step, name: str) -> str:
+def _without_shape(step: Step, name: str) -> str:
     """Drop the shape's name in front of a parameter name."""
     return name.removeprefix(f"{step.likely_shape}.")
 

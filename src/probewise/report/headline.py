@@ -27,32 +27,32 @@ def _versions(diagnosis: Diagnosis) -> list[str]:
     """List versions of the verdict, the most complete first; the last is always short enough."""
     n = int(diagnosis.recording.usable.sum())
     if diagnosis.judged.too_little:
-        return [_too_little(diagnosis, n)]
+        return [_too_little_sentence(diagnosis, n)]
     match diagnosis.verdict:
         case "clean" if diagnosis.p_value < ALARM:
             return ["These readings look unusual, but nothing that was tried explains them better than the model."]
         case "clean":
             return [f"Nothing is missing: the model explains all {n} readings to within their noise."]
         case "unknown":
-            return _unknown(diagnosis)
+            return _unknown_versions(diagnosis)
         case "cannot_tell":
-            return _undecided(diagnosis)
+            return _undecided_versions(diagnosis)
         case "noise":
-            return _left_out(diagnosis, "The predicted mean is right, but the noise is not white:")
+            return _left_out_versions(diagnosis, "The predicted mean is right, but the noise is not white:")
         case "named":
             more = ["Something more is missing."] if diagnosis.improvement.p_value_after < ALARM else []
-            said = _left_out(diagnosis, "The model leaves out")
+            said = _left_out_versions(diagnosis, "The model leaves out")
             return [" ".join([one, *more]) for one in said] + said
 
 
-def _too_little(diagnosis: Diagnosis, n: int) -> str:
+def _too_little_sentence(diagnosis: Diagnosis, n: int) -> str:
     seen = diagnosis.recording.readings[diagnosis.recording.usable]
     if n > 1 and float(np.ptp(seen)) == 0.0:
         return f"All {n} readings are equal: there is no signal to diagnose."
     return f"{count(n, 'reading').capitalize()} {'is' if n == 1 else 'are'} too few for a diagnosis."
 
 
-def _left_out(diagnosis: Diagnosis, opening: str) -> list[str]:
+def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
     sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
     names = [effect_in_words(name) for name in sorted(diagnosis.combination, key=lambda k: -sizes.get(k, 0.0))]
     if len(names) == 1:
@@ -64,7 +64,7 @@ def _left_out(diagnosis: Diagnosis, opening: str) -> list[str]:
     ]
 
 
-def _unknown(diagnosis: Diagnosis) -> list[str]:
+def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
     covariate, _ = words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
@@ -80,7 +80,7 @@ def _unknown(diagnosis: Diagnosis) -> list[str]:
     return [*said, f"{plain}.", f"{short}."]
 
 
-def _undecided(diagnosis: Diagnosis) -> list[str]:
+def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
     if diagnosis.p_value >= ALARM or any(h.probability > _RIVAL and not h.effects for h in diagnosis.hypotheses):
         leading = next((h.effects for h in diagnosis.hypotheses if h.effects), ())
         plain = "These readings cannot tell whether anything is missing"

@@ -56,13 +56,13 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, caption: str 
     wide = len(header) > _MOST_COLUMNS
     head = element("tr", *(element("th", cell, scope="col") for cell in header))
     labels = header if wide else [""] * len(header)
-    body = [element("tr", *(_cell(cell, label) for cell, label in zip(row, labels, strict=True))) for row in rows]
+    body = [element("tr", *(_table_cell(cell, label) for cell, label in zip(row, labels, strict=True))) for row in rows]
     title = (element("caption", caption),) if caption else ()
     inner = element("table", *title, element("thead", head), element("tbody", *body))
     return element("div", inner, class_="scroll wide" if wide else "scroll")
 
 
-def _cell(text: str, label: str) -> Markup:
+def _table_cell(text: str, label: str) -> Markup:
     is_number = bool(text) and (text.lstrip("-−+<≈ ")[:1].isdigit())
     attributes = ({"class_": "number"} if is_number else {}) | ({"data-label": label} if label else {})
     return element("td", text, **attributes)
@@ -131,8 +131,8 @@ def page(
     body = fragment(
         element("header", element("h1", title), paragraph(answer, class_="answer")),
         key_figure,
-        *_contents(sections),
-        *(_section(s, str(k), 2) for k, s in enumerate(sections, start=1)),
+        *_table_of_contents(sections),
+        *(_section_element(s, str(k), 2) for k, s in enumerate(sections, start=1)),
     )
     again = () if reload_s is None else (Markup(f'<meta http-equiv="refresh" content="{reload_s}">'),)
     head = fragment(
@@ -146,27 +146,27 @@ def page(
     return f"<!doctype html>\n{document}\n"
 
 
-def _section(section: Section, number: str, level: int) -> Markup:
-    parts = (_section(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
+def _section_element(section: Section, number: str, level: int) -> Markup:
+    parts = (_section_element(part, f"{number}.{k}", level + 1) for k, part in enumerate(section.parts, start=1))
     heading = element(f"h{level}", section.heading)
-    return element("section", heading, *section.body, *parts, id=_address(number))
+    return element("section", heading, *section.body, *parts, id=_section_id(number))
 
 
-def _contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
+def _table_of_contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
     """Build a table of contents with links, where there are many sections."""
     if sum(1 + len(s.parts) for s in sections) < _FEWEST_LISTED:
         return ()
-    entries = (_entry(s, str(k)) for k, s in enumerate(sections, start=1))
+    entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))
     return (element("nav", element("ol", *entries), aria_label="contents"),)
 
 
-def _entry(section: Section, number: str) -> Markup:
-    parts = [_entry(part, f"{number}.{k}") for k, part in enumerate(section.parts, start=1)]
-    link = element("a", section.heading, href=f"#{_address(number)}")
+def _contents_entry(section: Section, number: str) -> Markup:
+    parts = [_contents_entry(part, f"{number}.{k}") for k, part in enumerate(section.parts, start=1)]
+    link = element("a", section.heading, href=f"#{_section_id(number)}")
     return element("li", link, element("ol", *parts)) if parts else element("li", link)
 
 
-def _address(number: str) -> str:
+def _section_id(number: str) -> str:
     return f"part-{number.replace('.', '-')}"
 
 

@@ -21,7 +21,7 @@ _LEAST_TOLD = 0.005
 
 def probabilities_png(found: Investigation) -> bytes:
     """Draw the probability of each explanation after each round, as a PNG."""
-    return png(beliefs_by_round({_title(each): _probabilities(each) for each in found.rounds}))
+    return png(beliefs_by_round({_round_title(each): _explanation_probabilities(each) for each in found.rounds}))
 
 
 def probabilities_figure(found: Investigation) -> Markup:
@@ -77,7 +77,7 @@ def write_page(
         )
     )
     known: set[str] = set()
-    story = Section("How it came to that", (), tuple(_round_words(each) for each in found.rounds))
+    story = Section("How it came to that", (), tuple(_round_section(each) for each in found.rounds))
     details = Section("The diagnosis of all readings", (), tuple(of_a_diagnosis.sections(last.diagnosis, drawn)))
     return page(
         f"Investigation: {last.diagnosis.verdict.replace('_', ' ')} after {count(len(found.rounds), 'round')}",
@@ -87,12 +87,12 @@ def write_page(
     )
 
 
-def _title(each: Round) -> str:
+def _round_title(each: Round) -> str:
     n = count(len(each.recording), "reading")
     return f"round {each.number}: {n}" if each.number == 1 else f"round {each.number}: {len(each.recording)} more"
 
 
-def _probabilities(each: Round) -> dict[str, float]:
+def _explanation_probabilities(each: Round) -> dict[str, float]:
     out: dict[str, float] = {}
     for hypothesis in each.diagnosis.hypotheses:
         name = hypothesis_in_words(hypothesis.effects)
@@ -100,11 +100,11 @@ def _probabilities(each: Round) -> dict[str, float]:
     return out
 
 
-def _round_words(each: Round) -> Section:
+def _round_section(each: Round) -> Section:
     """Describe one round: the readings and their reason, the diagnosis, the next plan."""
     diagnosis = each.diagnosis
     why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.asked}"
-    likely = [(name, p) for name, p in _probabilities(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
+    likely = [(name, p) for name, p in _explanation_probabilities(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
     asked = diagnosis.next_measurement
     between = (
         "" if asked is None or len(asked.between) < 2 else f", which tell {asked.between[0]} from {asked.between[1]}"
@@ -121,4 +121,4 @@ def _round_words(each: Round) -> Section:
         table(("explanation", "probability"), ((name, probability(p)) for name, p in likely)),
         paragraph(typeset(then)),
     )
-    return Section(_title(each)[:1].upper() + _title(each)[1:], said)
+    return Section(_round_title(each)[:1].upper() + _round_title(each)[1:], said)

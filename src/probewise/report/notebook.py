@@ -44,17 +44,17 @@ SSF_CAPTION = "Spatial sensitivity function, seen from above; white lines at a h
 MOST_PARAMETERS = 6  # of a run's picture in a notebook: compact; `corner_plot` draws all of them
 
 
-def _card(*parts: Markup) -> str:
+def _div(*parts: Markup) -> str:
     return element("div", *parts)
 
 
-def _text(text: str) -> Markup:
+def _pre(text: str) -> Markup:
     return Markup(f"<pre>{html.escape(text)}</pre>")
 
 
 @render_html.register
 def _(value: SSFField) -> str:
-    return _card(
+    return _div(
         figure(
             png(spatial_sensitivity(value), dpi=DPI),
             SSF_CAPTION,
@@ -67,18 +67,18 @@ def _(value: Recording) -> str:
     said = (
         f"{count(len(value), 'reading')}, {int(value.usable.sum())} usable, {count(len(value.plan.scan_names), 'scan')}"
     )
-    return _card(figure(png(readings_by_orientation(value), dpi=DPI), said))
+    return _div(figure(png(readings_by_orientation(value), dpi=DPI), said))
 
 
 @render_html.register
 def _(value: RunRecording) -> str:
-    return _card(paragraph(f"{value.summary()}; {count(len(value.plan.scan_names), 'run')}"))
+    return _div(paragraph(f"{value.summary()}; {count(len(value.plan.scan_names), 'run')}"))
 
 
 @render_html.register
 def _(value: FittedSensor) -> str:
     picture = figure(png(spatial_sensitivity(value.field), dpi=DPI), "Mean SSF field")
-    return _card(paragraph(calibration_report.answer(value)), picture, calibration_report.parameter_table(value))
+    return _div(paragraph(calibration_report.answer(value)), picture, calibration_report.parameter_table(value))
 
 
 @render_html.register
@@ -88,7 +88,7 @@ def _(value: Calibration) -> str:
         {o.n_gaussians: o.log_z for o in value.orders},
         {o.n_gaussians: o.log_z_error for o in value.orders},
     )
-    return _card(
+    return _div(
         paragraph(calibration_report.answer(value.sensor)),
         figure(png(drawn, dpi=DPI), "Mean SSF by number of Gaussians"),
         calibration_report.evidence_table(value.sensor),
@@ -97,13 +97,13 @@ def _(value: Calibration) -> str:
 
 @render_html.register
 def _(value: NestedResult) -> str:
-    text = _text(value.summary())
+    text = _pre(value.summary())
     if not value.names:
-        return _card(text)
+        return _div(text)
     drawn = corner_plot(value, parameters=value.names[:MOST_PARAMETERS])
     left_out = len(value.names) - MOST_PARAMETERS
     of = f" of the first {MOST_PARAMETERS} of {len(value.names)} parameters" if left_out > 0 else ""
-    return _card(figure(png(drawn, dpi=DPI), f"Posterior{of}: each by itself, and each pair"), text)
+    return _div(figure(png(drawn, dpi=DPI), f"Posterior{of}: each by itself, and each pair"), text)
 
 
 @render_html.register
@@ -112,7 +112,7 @@ def _(value: Weighted) -> str:
     believed = zip(names, value.mean(), value.sd(), strict=False)
     known = ", ".join(f"{without_unit(n)} {with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed)
     drawn = corner_plot(value, parameters=names)
-    return _card(
+    return _div(
         figure(png(drawn, dpi=DPI), "Posterior: each parameter by itself, and each pair"),
         paragraph(f"{known}; {count(len(value.theta), 'sample')}, effective sample size {value.n_eff:.0f}."),
     )
@@ -121,7 +121,7 @@ def _(value: Weighted) -> str:
 @render_html.register
 def _(value: Step) -> str:
     pose = value.reading.pose
-    return _card(paragraph(value.summary()), paragraph(f"Taken at ({pose.x_mm:g}, {pose.y_mm:g}) mm."))
+    return _div(paragraph(value.summary()), paragraph(f"Taken at ({pose.x_mm:g}, {pose.y_mm:g}) mm."))
 
 
 @render_html.register
@@ -135,7 +135,7 @@ def _(value: Exploration) -> str:
     widths = posterior_widths(
         {"run": np.array([s.widest_mm for s in value.steps])}, target_mm=value.experiment.stop_sd_mm
     )
-    return _card(
+    return _div(
         paragraph(exploration_report.answer(value)),
         figure(picture, "The robot's view at the end"),
         figure(png(widths, dpi=DPI), "Widest posterior sd after each reading"),
@@ -147,14 +147,14 @@ def _(value: Prediction) -> str:
     recording = Recording(value.plan, value.readings)
     drawn = predicted_against_recorded(recording, value.mean, value.sd)
     said = value.summary().replace("\n", "; ")
-    return _card(paragraph(said), figure(png(drawn, dpi=DPI), "Predicted readings, each with its 95 % band"))
+    return _div(paragraph(said), figure(png(drawn, dpi=DPI), "Predicted readings, each with its 95 % band"))
 
 
 @render_html.register
 def _(value: PlanAudit) -> str:
     drawn = png(audit_report.picture(value), dpi=DPI)
-    text = _text(value.summary())
-    return _card(paragraph(audit_report.answer(value)), figure(drawn, "Detectability of effects, and aliases"), text)
+    text = _pre(value.summary())
+    return _div(paragraph(audit_report.answer(value)), figure(drawn, "Detectability of effects, and aliases"), text)
 
 
 @render_html.register
@@ -166,7 +166,7 @@ def _(value: Diagnosis) -> str:
     rows = [
         (effect_in_words(e.name), f"{e.probability:.3f}", e.sentence) for e in value.effects if e.probability > 0.05
     ]
-    return _card(
+    return _div(
         paragraph(diagnosis_report.answer(value)),
         figure(png(bars, dpi=DPI), "Probability of each hypothesis"),
         *((table(("effect", "probability", "what it does"), rows),) if rows else ()),
@@ -179,24 +179,24 @@ def _(value: SystemFit) -> str:
     readings = np.where(value.recording.usable, value.recording.readings, np.nan)
     unit = unit_name(own.unit)
     drawn = predicted_and_recorded(readings, value.predicted, value.sd, label=own.reading, unit=unit)
-    return _card(
+    return _div(
         paragraph(fit_report.answer(value)),
         figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."),
-        _text(value.summary()),
+        _pre(value.summary()),
     )
 
 
 @render_html.register
 def _(value: SystemPrediction) -> str:
-    said = _text(value.summary())
+    said = _pre(value.summary())
     if not np.isfinite(value.readings).any():
-        return _card(said)
+        return _div(said)
     unit = unit_name(value.table.instrumentation.unit)
     drawn = predicted_and_recorded(value.readings, value.mean, value.sd, label="reading", unit=unit)
-    return _card(figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."), said)
+    return _div(figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."), said)
 
 
 @render_html.register
 def _(value: Investigation) -> str:
-    said = _text(value.summary())
-    return _card(paragraph(investigation_report.answer(value)), investigation_report.probabilities_figure(value), said)
+    said = _pre(value.summary())
+    return _div(paragraph(investigation_report.answer(value)), investigation_report.probabilities_figure(value), said)

@@ -31,7 +31,7 @@ def fine_map(run: Exploration, number: int) -> UtilityMap:
     """
     step, coarse = run.steps[number - 1], run.experiment.grid
     grid = Grid(coarse.width_mm, coarse.height_mm, _FINER * coarse.n_x - 1, _FINER * coarse.n_y - 1)
-    within = _nearest(coarse, grid, step.map.reachable[: coarse.n_places])
+    within = _reachable_on_fine_grid(coarse, grid, step.map.reachable[: coarse.n_places])
     model, noise_sd = run.experiment.model, run.experiment.noise_sd
     return entropy_map(model, step.samples, grid, grid.plan("field"), reachable=within, noise_sd=noise_sd)
 
@@ -109,8 +109,8 @@ def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, fl
     return max(left, 0.0), min(right, grid.width_mm), max(low, 0.0), min(high, grid.height_mm)
 
 
-def _nearest(coarse: Grid, fine: Grid, reachable: BoolArray) -> BoolArray:
-    """Interpolate reachability to the finer grid from the nearest place of the robot's grid, (n_places,)."""
+def _reachable_on_fine_grid(coarse: Grid, fine: Grid, reachable: BoolArray) -> BoolArray:
+    """Return which places of the finer grid are reachable, (n_places,), by the nearest place of the robot's grid."""
     rows = np.rint(np.linspace(0, coarse.n_y - 1, fine.n_y)).astype(np.int64)
     columns = np.rint(np.linspace(0, coarse.n_x - 1, fine.n_x)).astype(np.int64)
     return np.asarray(reachable.reshape(coarse.n_y, coarse.n_x)[np.ix_(rows, columns)].ravel())

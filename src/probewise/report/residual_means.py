@@ -70,7 +70,7 @@ def mean_residuals(
     """
     ok = np.flatnonzero(np.isfinite(covariate) & np.isfinite(before))
     values = covariate[ok]
-    groups = _by_value(values) if names else _in_steps(values, window)
+    groups = _groups_by_value(values) if names else _groups_in_steps(values, window)
     rows = [ok[group] for group in groups]
     at = np.arange(len(groups), dtype=np.float64) if names else np.array([values[g].mean() for g in groups])
     sd_of_row = np.broadcast_to(np.asarray(sd, dtype=np.float64), before.shape)
@@ -88,23 +88,24 @@ def mean_residuals(
     )
 
 
-def _by_value(values: FloatArray) -> list[IntArray]:
+def _groups_by_value(values: FloatArray) -> list[IntArray]:
     return [np.flatnonzero(values == value) for value in np.unique(values)]
 
 
-def _in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
+def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
     """Group rows in equal steps of the covariate; join small neighbouring groups, but keep the window separate."""
     if values.size == 0:
         return []
     if window is None:
-        return _equal_groups(values, np.arange(values.size), _LEAST_ROWS)
+        return _groups_of_part(values, np.arange(values.size), _LEAST_ROWS)
     inside = (values >= window[0]) & (values <= window[1])
     least = int(np.clip(inside.sum(), 1, _LEAST_ROWS))
     parts = (values < window[0], inside, values > window[1])
-    return [group for part in parts if part.any() for group in _equal_groups(values, np.flatnonzero(part), least)]
+    return [group for part in parts if part.any() for group in _groups_of_part(values, np.flatnonzero(part), least)]
 
 
-def _equal_groups(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
+def _groups_of_part(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
+    """Group rows in equal steps of the covariate; in equal numbers where most rows share a few values."""
     mine = values[rows]
     share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
     n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
@@ -121,6 +122,7 @@ def _rows_by_step(mine: FloatArray, rows: IntArray, n: int) -> list[IntArray]:
 
 
 def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
+    """Join successive groups until each has `least` rows."""
     groups: list[IntArray] = []
     waiting = np.empty(0, dtype=np.int64)
     for part in parts:

@@ -37,7 +37,7 @@ _JIG_MM, _JIG_BASE_MM = 20.0, 40.0
 
 @dataclass(frozen=True, eq=False)
 class Sheet:
-    """A rectangle of the lab frame, to be printed.
+    """A rectangle to be printed at true scale: a pattern in its own frame, or a part of the field.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
 
 def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
     """Make the sheet of the black field with a white target of the given outline, (n, 2), in place."""
-    pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_corners(outline_mm))
+    pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_corner_pairs(outline_mm))
     said = "all black" if outline_mm is None else "black, the target white at its place"
     return Sheet("field", pattern, (0.0, 0.0), field_mm, (said,), frame="the field's lower left corner")
 
@@ -221,7 +221,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
         joints.append(joints[-1] + length * np.array([math.cos(angle), math.sin(angle)]))
     face = joints[-1] + [geometry.sensor_mm[0], -geometry.sensor_mm[1]]
     crosses = np.array([*joints, face])
-    beams = [_beam(a, b) for a, b in itertools.pairwise(joints)]
+    beams = [_beam_outline(a, b) for a, b in itertools.pairwise(joints)]
     drawn = np.concatenate([crosses, *beams, [[0.0, 0.0]]])
     low, high = _sheet_around(drawn, _JIG_MM)
     if drawn[:, 1].min() >= 0:
@@ -284,7 +284,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     return side, from_above
 
 
-def _beam(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
+def _beam_outline(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
     """Return the closed outline, (n, 2), of a beam with round ends, given the centres of its outer holes."""
     turn = math.atan2(*(end_mm - start_mm)[::-1].tolist())
     half = np.linspace(math.pi / 2, 3 * math.pi / 2, 37)
@@ -331,7 +331,7 @@ def _places_to_show(pattern: Pattern) -> FloatArray:
             return np.array([[-AROUND_MM, 0.0], [AROUND_MM, 0.0]])
 
 
-def _corners(outline_mm: FloatArray) -> tuple[tuple[float, float], ...]:
+def _corner_pairs(outline_mm: FloatArray) -> tuple[tuple[float, float], ...]:
     return tuple((x, y) for x, y in outline_mm[:-1].tolist())
 
 

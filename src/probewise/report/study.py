@@ -157,13 +157,13 @@ def _readings_row(row: Row, found: Summary) -> tuple[str, ...]:
         str(found.n_runs),
         f"{number(100 * reached.value, 1)} % ({number(100 * reached.low, 1)} to {number(100 * reached.high, 1)})",
         _estimate_words(found.mean),
-        _with_interval(found.median),
+        _value_with_interval(found.median),
         _estimate_words(found.to_white),
         _estimate_words(found.after_white),
     )
 
 
-def _with_interval(estimate: Estimate) -> str:
+def _value_with_interval(estimate: Estimate) -> str:
     return f"{estimate.value:g}" + (
         f" ({estimate.low:g} to {estimate.high:g})" if math.isfinite(estimate.low) else " (too few runs)"
     )
@@ -175,7 +175,7 @@ def _information_row(row: Row, found: Summary) -> tuple[str, ...]:
         _estimate_words(found.bits_each),
         number(found.error_mm, 1),
         f"{count(found.wrong, 'run')} ({number(found.wrong_expected, 1)}, {found.wrong_limit})",
-        _percent(found.held),
+        _percent_words(found.held),
         _estimate_words(found.arm_s),
         number(found.cpu_s, 2),
     )
@@ -190,7 +190,7 @@ def _estimate_words(estimate: Estimate) -> str:
     return with_error(estimate.value, half) if half > 0 else number(estimate.value, 1)
 
 
-def _percent(estimate: Estimate) -> str:
+def _percent_words(estimate: Estimate) -> str:
     scaled = Estimate(100 * estimate.value, 100 * estimate.low, 100 * estimate.high)
     return f"{_estimate_words(scaled)} %" if math.isfinite(estimate.value) else "–"
 

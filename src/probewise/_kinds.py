@@ -134,17 +134,18 @@ def require_callable(name: str, value: object, allowed: str) -> None:
 
 def require_takes(name: str, value: object, arguments: Sequence[str], allowed: str) -> None:
     """Raise ParameterError unless `value` can be called with these arguments, by their names."""
-    _require_binds(name, value, f"{allowed} {name}({', '.join(arguments)})", (), dict.fromkeys(arguments))
+    _require_accepts_call(name, value, f"{allowed} {name}({', '.join(arguments)})", (), dict.fromkeys(arguments))
 
 
 def require_takes_places(name: str, value: object, n_arguments: int, allowed: str) -> None:
-    """Raise ParameterError unless `value` can be called with so many arguments."""
-    _require_binds(name, value, allowed, (None,) * n_arguments, {})
+    """Raise ParameterError unless `value` can be called with `n_arguments` arguments by position."""
+    _require_accepts_call(name, value, allowed, (None,) * n_arguments, {})
 
 
-def _require_binds(
+def _require_accepts_call(
     name: str, value: object, allowed: str, arguments: tuple[None, ...], named: Mapping[str, None]
 ) -> None:
+    """Raise ParameterError unless `value` can be called so; a function that hides its signature passes."""
     require_callable(name, value, allowed)
     try:
         inspect.signature(value).bind(*arguments, **named)  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ def require_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
 
 
 def require_absent(absent: Mapping[str, BoolArray], effects: tuple[str, ...], n_samples: int) -> None:
-    """Raise ParameterError unless `absent` marks samples, (n_samples,), of effects of the model alone."""
+    """Raise ParameterError unless `absent` holds truth values, (n_samples,), by names of the model's effects."""
     for name, without in absent.items():
         if name not in effects or without.shape != (n_samples,):
             raise ParameterError("absent", name, f"effects of the model, each with {n_samples} truth values")

@@ -95,7 +95,7 @@ def nested_progress(progress: Progress) -> Callable[[int | str, RoundSummary | R
     return tell
 
 
-class _Report(NamedTuple):
+class _LastReport(NamedTuple):
     """The last report; its fields are the arguments of `Progress`."""
 
     stage: str
@@ -110,31 +110,31 @@ class _Bars:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._shows_at = time.monotonic() + _PATIENCE_S
-        self._now: _Report | None = None
+        self._now: _LastReport | None = None
         self._began = 0.0
         self._bar: tqdm[Never] | None = None
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
         with self._lock:
             if self._now is None or (stage, total) != (self._now.stage, self._now.total):
-                self._end(ended=True)
+                self._close_bar(ended=True)
                 self._began = time.time()
-            self._now = _Report(stage, done, total, note)
-            self._draw()
+            self._now = _LastReport(stage, done, total, note)
+            self._update_bar()
 
     def beat(self) -> None:
         """Update the elapsed time."""
         with self._lock:
-            self._draw()
+            self._update_bar()
             if self._bar is not None:
                 self._bar.refresh()
 
     def close(self, *, ended: bool) -> None:
         """End the last bar."""
         with self._lock:
-            self._end(ended=ended)
+            self._close_bar(ended=ended)
 
-    def _draw(self) -> None:
+    def _update_bar(self) -> None:
         if self._now is None or time.monotonic() < self._shows_at:
             return
         if self._bar is None:
@@ -144,7 +144,7 @@ class _Bars:
         self._bar.set_postfix_str(self._now.note, refresh=False)
         self._bar.update(self._now.done - self._bar.n)
 
-    def _end(self, *, ended: bool) -> None:
+    def _close_bar(self, *, ended: bool) -> None:
         if self._bar is not None:
             if ended and self._bar.total:  # a stage may end before its last step
                 self._bar.n = self._bar.total
@@ -159,10 +159,10 @@ class _TextProgress:
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()
         self._said = False
-        self._now = _Report("getting ready", 0, 0, "")
+        self._now = _LastReport("getting ready", 0, 0, "")
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-        self._now = _Report(stage, done, total, note)
+        self._now = _LastReport(stage, done, total, note)
         self.beat()
 
     def beat(self) -> None:

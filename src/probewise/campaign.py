@@ -83,7 +83,7 @@ def run_campaign(
             raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
         done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
         left = {key: task for key, task in tasks.items() if key not in done}
-        with _ResultLog(path, wanted, fresh=before is None) as lines, _as_completed(work, left, executor) as ended:
+        with _ResultLog(path, wanted, fresh=before is None) as lines, _ended_tasks(work, left, executor) as ended:
             progress(noun, len(done), len(tasks))
             for key, result in ended:
                 line = json.loads(lines.add(key, result))  # as a later reader will see it
@@ -161,7 +161,7 @@ class _ResultLog:
 
 
 @contextlib.contextmanager
-def _as_completed(
+def _ended_tasks(
     work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
 ) -> Iterator[Iterator[tuple[str, Result]]]:
     """Yield (key, result) as tasks end; on leaving, cancel the tasks that have not begun."""
@@ -177,6 +177,7 @@ def _as_completed(
 
 
 def _result_of(future: Future[Result]) -> Result:
+    """Return a task's result; raise NotConvergedError if its worker died."""
     try:
         return future.result()
     except BrokenExecutor as error:

@@ -234,17 +234,17 @@ class Product:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each coordinate by its own marginal, both (n_samples, n_params)."""
-        u = _columns(u, self.names)
+        u = _checked_columns(u, self.names)
         return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each parameter by its own marginal, both (n_samples, n_params)."""
-        theta = _columns(theta, self.names)
+        theta = _checked_columns(theta, self.names)
         return np.stack([m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the sum of the marginals' log densities, (n_samples, n_params) -> (n_samples,)."""
-        theta = _columns(theta, self.names)
+        theta = _checked_columns(theta, self.names)
         total = np.zeros(len(theta))
         for i, marginal in enumerate(self.marginals.values()):
             total = total + marginal.log_prob(theta[:, i])
@@ -271,23 +271,24 @@ class Joint:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each part's coordinates by that part, both (n_samples, n_params)."""
-        u = _columns(u, self.names)
-        return np.concatenate([p.from_unit_cube(c) for p, c in self._split(u)], axis=-1)
+        u = _checked_columns(u, self.names)
+        return np.concatenate([p.from_unit_cube(c) for p, c in self._columns_of_parts(u)], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each part's parameters by that part, both (n_samples, n_params)."""
-        theta = _columns(theta, self.names)
-        return np.concatenate([p.to_unit_cube(c) for p, c in self._split(theta)], axis=-1)
+        theta = _checked_columns(theta, self.names)
+        return np.concatenate([p.to_unit_cube(c) for p, c in self._columns_of_parts(theta)], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""
-        theta = _columns(theta, self.names)
+        theta = _checked_columns(theta, self.names)
         total = np.zeros(len(theta))
-        for part, columns in self._split(theta):
+        for part, columns in self._columns_of_parts(theta):
             total = total + part.log_prob(columns)
         return total
 
-    def _split(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
+    def _columns_of_parts(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
+        """Return each part with its columns, (n_samples, n_params of the part)."""
         ends = np.cumsum([len(p.names) for p in self.parts])
         return [(p, columns[:, end - len(p.names) : end]) for p, end in zip(self.parts, ends, strict=True)]
 
@@ -323,7 +324,8 @@ def require_prior(name: str, prior: object, *more: str) -> None:
         raise ParameterError(name, prior, f"a prior with {' and '.join(missing)}; see probewise.priors.Prior")
 
 
-def _columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:
+def _checked_columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:
+    """Convert parameters to floats; raise ShapeError unless they are (n_samples, n_params)."""
     array = floats(values, "parameters")
     if array.ndim != 2 or array.shape[1] != len(names):
         raise ShapeError(f"parameters have shape {array.shape}; allowed: (n_samples, {len(names)}) for {names}")

@@ -225,7 +225,7 @@ def readings_of(recording: Recording) -> list[Reading]:
 
 
 def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
-    """Return the object that says which places an arm can reach."""
+    """Return what says which places an arm can reach: its geometry, its `Reach`, or the instrument itself."""
     match arm:
         case LegoArm():
             return arm.geometry

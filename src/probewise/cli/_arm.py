@@ -207,7 +207,7 @@ def open_brick(port: str) -> Brick:
 
 
 class ReportingInstrument:
-    """An instrument that calls `moving` before each move and `read` after each reading, since a real arm is slow."""
+    """An instrument that calls `moving` with the pose before each move, and `read` with each reading."""
 
     def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
         self._instrument, self._moving, self._read = instrument, moving, read

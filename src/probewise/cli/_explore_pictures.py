@@ -38,7 +38,7 @@ class Pictures:
     frames: list[bytes] = field(default_factory=list)
 
     def add(self, step: Step, shadow: Step | None) -> None:
-        """Draw a step, beside the other sensor model's (`shadow`) if there is one, and write the picture."""
+        """Draw a step, with the other sensor model's step (`shadow`) if there is one, and write the picture."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)

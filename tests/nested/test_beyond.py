@@ -13,7 +13,7 @@ from probewise.nested import check
 from probewise.nested.hills import Hill, evidence_not_met
 from probewise.nested.missing import Missing, look_for_missing
 from probewise.nested.moves import SliceMove
-from probewise.nested.sampler import least_live, search
+from probewise.nested.sampler import least_live, run_once
 
 
 @pytest.mark.slow
@@ -23,7 +23,7 @@ def test_a_spike_that_no_live_point_met_is_found_and_weighed() -> None:
     found = []
     for seed in range(3):
         rng = np.random.default_rng([seed, 20])
-        run = search(known, rng=rng, n_live=300)
+        run = run_once(known, rng=rng, n_live=300)
         assert run.log_z < known.log_z - 3  # not met by the run
         missing = look_for_missing(run, known, max_calls=run.n_calls, rng=rng)
         found.append(evidence_not_met((*missing.lost, *missing.above), run))
@@ -33,7 +33,7 @@ def test_a_spike_that_no_live_point_met_is_found_and_weighed() -> None:
 @pytest.mark.parametrize("name", ["Gaussian 4-D", "circle", "shells 2-D"])
 def test_where_there_is_no_higher_peak_nothing_is_found_for_a_third_of_the_cost(name: str) -> None:
     known = problems.problem(name)
-    run = search(known, rng=np.random.default_rng(1), n_live=100)
+    run = run_once(known, rng=np.random.default_rng(1), n_live=100)
     missing = look_for_missing(run, known, max_calls=10 * run.n_calls, rng=np.random.default_rng(2))
     assert not missing.above
     assert missing.n_calls <= run.n_calls / 3
@@ -41,7 +41,7 @@ def test_where_there_is_no_higher_peak_nothing_is_found_for_a_third_of_the_cost(
 
 def test_with_hardly_any_evaluations_left_no_more_are_used() -> None:
     known = problems.problem("Gaussian 4-D")
-    run = search(known, rng=np.random.default_rng(1), n_live=100)
+    run = run_once(known, rng=np.random.default_rng(1), n_live=100)
     assert look_for_missing(run, known, max_calls=10, rng=np.random.default_rng(2)).n_calls <= 10
 
 
@@ -50,15 +50,15 @@ def test_a_peak_that_holds_much_of_the_evidence_is_a_doubt(
     monkeypatch: pytest.MonkeyPatch, above_it: float, doubted: bool
 ) -> None:
     known = problems.problem("Gaussian 4-D")
-    run = search(known, rng=np.random.default_rng(1), n_live=100)
+    run = run_once(known, rng=np.random.default_rng(1), n_live=100)
     hill = SimpleNamespace(log_z=run.log_z + above_it, is_met_by=lambda _: False)
     missing = Missing((), (cast(Hill, hill),), 77)
     monkeypatch.setattr(check, "look_for_missing", lambda *_, **__: missing)
-    result = check.checked(
+    result = check.check_and_repeat(
         run,
         known,
         SliceMove(),
-        search,
+        run_once,
         max_cost=5.0,
         max_calls=None,
         least_live=least_live(4),

@@ -14,8 +14,8 @@ from scipy.special import logsumexp
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested import Check, NestedResult, SliceMove, merge, refine, run
-from probewise.nested.check import checked
-from probewise.nested.sampler import search
+from probewise.nested.check import check_and_repeat
+from probewise.nested.sampler import run_once
 
 
 def rng() -> np.random.Generator:
@@ -84,11 +84,11 @@ def misled(max_cost: float, seed: int = 5) -> tuple[NestedResult, NestedResult]:
     known = problems.problem("Gaussian 4-D")
     sound = quiet(known, max_cost=1.0)
     wrong = dataclasses.replace(sound, log_z=sound.log_z + 8 * sound.log_z_error)
-    result = checked(
+    result = check_and_repeat(
         wrong,
         known,
         SliceMove(),
-        search,
+        run_once,
         max_cost=max_cost,
         max_calls=None,
         least_live=10,
@@ -141,7 +141,7 @@ def test_about_a_curve_two_runs_that_agree_outvote_a_second_pass_below_both(
         return dataclasses.replace(sound, log_z=log_z, information=mean - log_z + clusters_by, n_calls=1000)
 
     rng = np.random.default_rng(6)
-    result = checked(sound, known, SliceMove(), answer, max_cost=5.0, max_calls=None, least_live=10, rng=rng)
+    result = check_and_repeat(sound, known, SliceMove(), answer, max_cost=5.0, max_calls=None, least_live=10, rng=rng)
     assert result.check is not None
     assert bool(result.warnings) is not cured
     # A pass that found another posterior is followed by one from a single ellipse.

@@ -35,7 +35,7 @@ from probewise.nested import (
     Tally,
     run,
 )
-from probewise.nested.checkpoint import Keeper, Live, Origin, Run, settings_of
+from probewise.nested.checkpoint import CheckpointFile, Live, Origin, Run, settings_of
 from probewise.priors import Normal, Product, Uniform
 
 SEED = 20240229
@@ -678,13 +678,13 @@ def test_a_run_is_saved_as_often_as_asked(
 ) -> None:
     """Each state of a run that is saved after every round: even where saving takes longer than a round."""
     n_saved = itertools.count()
-    true = Keeper.save
+    true = CheckpointFile.save
 
-    def save(self: Keeper, now: Run) -> None:
+    def save(self: CheckpointFile, now: Run) -> None:
         next(n_saved)
         true(self, now)
 
-    monkeypatch.setattr(Keeper, "save", save)
+    monkeypatch.setattr(CheckpointFile, "save", save)
     states: list[RoundSummary] = []
     quiet(slope(), n_live=30, checkpoint=path, checkpoint_every_s=every_s, progress=states.append)
     # The first live points, every round, and the end.
@@ -696,13 +696,13 @@ def test_saving_takes_a_tenth_of_the_time_at_most(path: Path, monkeypatch: pytes
     settings = settings_of(("p0",), 10, 5, SliceMove(), RemainingEvidence(), "{}")
     clock = itertools.count(0.0, 3.0)
     monkeypatch.setattr("probewise.nested.checkpoint.time.monotonic", lambda: next(clock))
-    keeper = Keeper(path, 1.0, settings, _last=0.0)
+    keeper = CheckpointFile(path, 1.0, settings, _last=0.0)
     live = Live(_points(10, 1), Origin.of_prior(10), 0.0)
     saved = []
     for k in range(60):
         now = Run(live, (), SliceMove(), 0.0, 0.0, (), n_calls=k)
         keeper.save_if_due(now)
-        saved.append(keeper._held is now)
+        saved.append(keeper._state_in_file is now)
     # A saving looks twice and so takes 3 s; ten times that pass at ten looks.
     assert sum(saved) == 6
 

@@ -13,9 +13,9 @@ from scipy.stats import chi2, norm
 
 from probewise._arrays import FloatArray
 from probewise.nested import NestedResult, Weighted, refine, run, update
-from probewise.nested.importance import _bridge_sampled, with_loss_in_error
-from probewise.nested.proposal import find_parts, fit_proposals, joined
-from probewise.nested.space import unbounded
+from probewise.nested.importance import _bridge_sampling_estimate, with_loss_in_error
+from probewise.nested.proposal import find_parts, fit_proposals, mixture_of_proposals
+from probewise.nested.space import unbounded_space_of
 from probewise.priors import Normal, Product
 
 FALSE_ALARM = 1e-4
@@ -33,10 +33,10 @@ def test_held_back_samples_see_the_mode_that_the_draws_are_blind_to() -> None:
         rng = np.random.default_rng(seed)
         held = rng.standard_normal(400) + 20.0 * (rng.random(400) < 0.2)
         draws = _target_over_normal(rng.standard_normal(2000))
-        log_z, error, missed, _ = _bridge_sampled(draws, 2000, _target_over_normal(held), 400.0)
+        log_z, error, missed, _ = _bridge_sampling_estimate(draws, 2000, _target_over_normal(held), 400.0)
         assert missed == pytest.approx(0.2, abs=4.5 * math.sqrt(0.16 / 400))
         z.append((log_z - math.log(5.0)) / error)
-        assert _bridge_sampled(draws, 2000, np.empty(0), 0.0)[0] == pytest.approx(math.log(4.0), abs=1e-6)
+        assert _bridge_sampling_estimate(draws, 2000, np.empty(0), 0.0)[0] == pytest.approx(math.log(4.0), abs=1e-6)
     assert abs(np.sum(z)) < norm.isf(FALSE_ALARM / 2) * np.sqrt(len(z))
     assert np.sum(np.square(z)) < chi2.isf(FALSE_ALARM, len(z))
 
@@ -45,11 +45,11 @@ def test_no_single_draw_decides_where_samples_say_what_it_stands_for() -> None:
     """A weight of 10,000 times the others' doubles plain importance sampling's answer; the bridge cuts it."""
     log_ratio = np.zeros(10_000)
     log_ratio[0] = math.log(1e4)
-    plain, plain_error, missed, _ = _bridge_sampled(log_ratio, 10_000, np.empty(0), 0.0)
+    plain, plain_error, missed, _ = _bridge_sampling_estimate(log_ratio, 10_000, np.empty(0), 0.0)
     assert plain == pytest.approx(math.log(2.0), abs=1e-3)
     assert plain_error == pytest.approx(0.5, abs=0.01)
     assert missed == 0.0
-    log_z, error, missed, log_weight = _bridge_sampled(log_ratio, 10_000, np.zeros(300), 300.0)
+    log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, 10_000, np.zeros(300), 300.0)
     assert abs(log_z) < 0.02
     assert error < 0.02
     assert missed == 0.0
@@ -67,7 +67,7 @@ def test_a_lattice_of_modes_is_parted_and_a_gaussian_is_not() -> None:
 def test_a_part_followed_by_few_lines_of_descent_may_be_lost() -> None:
     """A tenth of the posterior, and a run worth twenty samples of its parts' shares: exp(-2) of losing that tenth."""
     rng = np.random.default_rng(2)
-    space = unbounded(Product({"x": Normal(0, 1), "y": Normal(0, 1)}))
+    space = unbounded_space_of(Product({"x": Normal(0, 1), "y": Normal(0, 1)}))
     theta = 0.1 * rng.standard_normal((1000, 2)) + np.where(np.arange(1000) < 100, 3.0, -1.0)[:, None]
     even = np.full(1000, -math.log(1000))
     found = Weighted(("x", "y"), theta, np.zeros(1000), even, 0.0, 0.01, 1000.0, 1000, 0.1)
@@ -84,7 +84,7 @@ def test_joined_proposals_get_their_shares_of_the_draws_and_of_the_density() -> 
     rng = np.random.default_rng(3)
     left = fit_proposals(rng.standard_normal((30, 1)) - 10.0, rng=rng)
     right = fit_proposals(rng.standard_normal((30, 1)) + 10.0, rng=rng)
-    both = joined([*left, *right], [0.7, 0.3])
+    both = mixture_of_proposals([*left, *right], [0.7, 0.3])
     drawn = both.draw(4000, rng=rng)
     assert (drawn < 0).mean() == pytest.approx(0.7, abs=4 * math.sqrt(0.21 / 4000))
     grid = np.linspace(-40, 40, 20_001)[:, None]
@@ -226,6 +226,6 @@ def test_a_mixture_of_what_was_fitted_is_whole_however_many_forms_there_are() ->
     """Few samples allow one form only; its share is then all there is."""
     rng = np.random.default_rng(5)
     (only,) = fit_proposals(rng.standard_normal((30, 2)), rng=rng)
-    mixed = joined((only,), [0.75])
+    mixed = mixture_of_proposals((only,), [0.75])
     assert mixed.share.sum() == pytest.approx(1.0)
     assert mixed.draw(100, rng=rng).shape == (100, 2)

@@ -11,13 +11,13 @@ from nested_sampling import problems
 from scipy.special import logsumexp
 
 from probewise.nested import NestedResult, SliceMove, refine
-from probewise.nested.check import checked
+from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Samplable
 from probewise.nested.hills import evidence_not_met
 from probewise.nested.hops import HoppingMove
 from probewise.nested.missing import Missing, look_for_missing
-from probewise.nested.sampler import search
+from probewise.nested.sampler import run_once
 
 SHARE = 0.6
 
@@ -45,7 +45,7 @@ class Two:
 @pytest.fixture(scope="module")
 def robbed() -> NestedResult:
     """A run that saw the second mode up to 60 nats below its top, from where on there were no live points in it."""
-    return search(Two(veil=-50.0), rng=np.random.default_rng(1), n_live=100)
+    return run_once(Two(veil=-50.0), rng=np.random.default_rng(1), n_live=100)
 
 
 def missing_from(run: NestedResult, problem: Samplable, max_calls: float) -> Missing:
@@ -78,11 +78,11 @@ def test_a_refinement_of_a_run_that_was_not_checked_looks_for_lost_modes_itself(
 
 
 def check(robbed: NestedResult, max_cost: float) -> NestedResult:
-    return checked(
+    return check_and_repeat(
         robbed,
         Two(),
         SliceMove(),
-        search,
+        run_once,
         max_cost=max_cost,
         max_calls=None,
         least_live=10,
@@ -112,7 +112,7 @@ def test_a_lost_mode_that_cannot_be_won_back_within_the_limit_is_a_doubt(robbed:
 @pytest.mark.parametrize("name", ["Gaussian 4-D", "circle", "shells 2-D", "eggbox"])
 def test_where_no_mode_was_lost_none_is_doubted_for_a_third_of_the_cost(name: str) -> None:
     known = problems.problem(name)
-    run = search(known, rng=np.random.default_rng(4), n_live=100)
+    run = run_once(known, rng=np.random.default_rng(4), n_live=100)
     missing = missing_from(run, known, 10 * run.n_calls)
     assert not missing.doubts(run)  # of the eggbox's eighteen peaks a small one may have lost half of its points
     assert missing.n_calls < run.n_calls / 3
@@ -159,7 +159,7 @@ def test_first_live_points_forget_the_few_possible_draws_at_which_they_began() -
     known = problems.Known(problems.box(7, 0, 1), function, 0.0)
     middle = []
     for seed in range(20):
-        run = search(known, rng=np.random.default_rng([7, seed]), n_live=50, stop=lambda _: "at once")
+        run = run_once(known, rng=np.random.default_rng([7, seed]), n_live=50, stop=lambda _: "at once")
         first = run.theta[run.log_birth == -np.inf]
         middle.append(first[:, 3].mean())
     # The fourth of seven ordered uniforms is Beta(4, 4), of variance 1/36.

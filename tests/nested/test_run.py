@@ -161,7 +161,7 @@ def test_slice_chains_leave_the_uniform_distribution_alone(
 
 def test_a_cluster_is_measured_without_the_start_of_the_chain_that_uses_it(rng: np.random.Generator) -> None:
     points = rng.standard_normal((60, 4)) @ rng.standard_normal((4, 4))
-    without = Clusters.of([points]).without(points[:3], np.zeros(3, dtype=int))
+    without = Clusters.of([points]).without_point_itself(points[:3], np.zeros(3, dtype=int))
     for i in range(3):
         rest = np.delete(points, i, axis=0)
         assert without.mean[i] == pytest.approx(rest.mean(axis=0))

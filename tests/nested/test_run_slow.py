@@ -11,7 +11,7 @@ from nested_sampling.sampler import Counted
 
 from probewise.errors import ParameterError
 from probewise.nested import run_slow
-from probewise.nested.mixture import fit_mixture, single
+from probewise.nested.mixture import fit_mixture, single_student_t
 
 N_ERRORS = 3.9
 
@@ -106,7 +106,7 @@ def test_a_mixture_is_a_density_and_finds_the_parts() -> None:
 
 def test_a_single_component_has_the_moments_given() -> None:
     covariance = np.array([[2.0, 0.5], [0.5, 1.0]])
-    drawn = single(np.array([3.0, -1.0]), covariance).draw(40_000, rng=rng(7))
+    drawn = single_student_t(np.array([3.0, -1.0]), covariance).draw(40_000, rng=rng(7))
     assert np.abs(drawn.mean(axis=0) - (3, -1)).max() < 0.05
     # Of a Student t with 8 degrees of freedom the covariance is 8 / 6 of its kernel's.
     assert np.cov(drawn, rowvar=False) == pytest.approx(covariance * 8 / 6, abs=0.12)

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_t
 
 from probewise.calibration import SSFPrior, default_prior
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior, LogHeavyTailedPrior
-from probewise.nested.space import space_of, unbounded
+from probewise.nested.space import space_of, unbounded_space_of
 from probewise.priors import Empty, Joint, LogUniform, Normal, Prior, Product, Uniform
 from probewise.recordings import Recording, paper_plan
 from probewise.scene import AnyOf, Circle, Ellipse, Rectangle, RegularPolygon
@@ -69,7 +69,7 @@ def test_what_lies_outside_a_prior_goes_to_the_wall_of_its_cube_and_never_beyond
 
 @pytest.mark.parametrize("prior", PRIORS.values(), ids=PRIORS)
 def test_parameters_are_found_again_from_coordinates_without_walls(prior):
-    space = unbounded(prior)
+    space = unbounded_space_of(prior)
     theta = prior.from_unit_cube(cube(prior))
     x = space.enter(theta)
     back, log_density = space.leave(x)
@@ -126,7 +126,7 @@ def test_the_density_over_moments_has_the_jacobian_of_finite_differences(prior):
 def test_the_folded_density_over_moments_integrates_to_one(prior):
     """Importance sampling from a Student-t about the prior's own draws; within five standard errors."""
     rng = np.random.default_rng(6)
-    drawn = unbounded(prior).draw(20_000, rng=rng)
+    drawn = unbounded_space_of(prior).draw(20_000, rng=rng)
     around = multivariate_t(drawn.mean(axis=0), np.cov(drawn, rowvar=False), df=6, seed=rng)
     x = around.rvs(150_000)
     ratio = np.exp(prior.coordinates.leave(x)[1] - around.logpdf(x))
@@ -161,7 +161,7 @@ def test_coordinates_that_lead_nowhere_have_no_density_and_raise_nothing():
 
 
 def test_normal_scores_have_the_density_of_a_standard_normal_prior():
-    space = unbounded(Circle().prior)
+    space = unbounded_space_of(Circle().prior)
     x = space.draw(1000, rng=np.random.default_rng(3))
     _, log_density = space.leave(x)
     np.testing.assert_allclose(log_density, (-0.5 * x**2 - 0.5 * math.log(2 * math.pi)).sum(axis=1))

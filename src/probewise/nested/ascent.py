@@ -48,13 +48,13 @@ class Top:
         return float(self.highest.log_likelihood[0])
 
 
-def climb(
+def climb_to_top(
     start: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator, known: float = -math.inf
 ) -> Top:
     """Climb from a normal distribution to the top of a peak.
 
-    At most `max_calls` evaluations are used, which `evaluate` counts. Only draws above the log likelihood `known` are
-    followed: those below it may belong to another peak.
+    It ends where the best draws are level, or before it would exceed `max_calls` evaluations, which `evaluate` counts.
+    Only draws above the log likelihood `known` are followed: those below it may belong to another peak.
     """
     highest, centre, covariance = start.highest, start.centre, start.root @ start.root.T
     met = highest
@@ -82,7 +82,7 @@ def climb(
     return Top(highest, centre, root_of_covariance(wider * covariance), met)
 
 
-def end_of(run: NestedResult, evaluate: Evaluator) -> Top:
+def top_from_live_points(run: NestedResult, evaluate: Evaluator) -> Top:
     """Describe the last live points of a run: the highest one, their mean and a root of their covariance."""
     last = slice(-run.n_live, None)
     live = evaluate.known(run.theta[last], run.log_likelihood[last], run.label[last])

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from probewise.nested.ascent import Top, climb
+from probewise.nested.ascent import Top, climb_to_top
 from probewise.nested.evaluate import Evaluator, Points
 from probewise.nested.result import NestedResult
 from probewise.nested.space import is_within
@@ -22,7 +22,7 @@ _MOST_SHARE = 1 / 8  # of the run's evaluations, for these draws
 _MOST_PEAKS = 5
 
 
-def peaks_above(
+def higher_peaks(
     run: NestedResult, top: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> list[Top]:
     """Return the tops of higher peaks than the one on which a run ended.
@@ -57,7 +57,7 @@ def peaks_above(
         best = drawn.take(drawn.order()[-1:])
         if not len(best) or not best.log_likelihood[0] > known + _HIGHER:
             break
-        peak = climb(
+        peak = climb_to_top(
             Top(best, best.u[0], top.root), evaluate, max_calls=most - evaluate.n_calls, rng=rng, known=known + _HIGHER
         )
         peaks.append(peak)

@@ -1,7 +1,7 @@
 """Check a run's evidence by a second, independent estimate, and repeat the run where the two disagree.
 
-A run can be biased without any sign of it: chains that are too short bias every shell a little and always in the same
-direction, so that log Z drifts with every nat while the insertion ranks and the scatter between seeds look right.
+A run can be biased without any sign of it: chains that are too short bias every shell a little, always in the same
+direction. Then log Z drifts with every nat, while the insertion ranks and the scatter between seeds look right.
 The second estimate uses chains twice as long and has few nats of compression: it is a run from a prior near the
 posterior that the first run found (`repartition`). Where the posterior fills so much of the prior that this saves
 nothing, a small run of the same problem is used. The jump distance of the chains, in units of the live points' spread,
@@ -59,7 +59,7 @@ class SingleRun(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class _Route:
+class _EvidenceRoute:
     """A way to estimate the evidence again: a problem of the same evidence, the number of live points and the chains.
 
     Before each chain there are hops between `modes`, where they are given.
@@ -80,7 +80,7 @@ class _Route:
         """The chains, after hops where there are `modes`."""
         return self.chain if self.modes is None else HoppingMove(self.chain, self.modes)
 
-    def confirmed(self, found: NestedResult) -> bool:
+    def found_expected_posterior(self, found: NestedResult) -> bool:
         """Return whether a run of this route found the expected posterior: its information plus log Z is the mean."""
         return self.expected is None or abs(found.information + found.log_z - self.expected) < _SAME_MEAN
 
@@ -102,10 +102,11 @@ class _Budget:
 
     @property
     def left(self) -> int:
+        """Number of evaluations that may still be used."""
         return int(self.limit - self.spent)
 
-    def run_by(self, route: _Route) -> NestedResult | None:
-        """Run nested sampling by a route; None where it exceeds the budget."""
+    def run_route(self, route: _EvidenceRoute) -> NestedResult | None:
+        """Run nested sampling by a route; None if the budget or the route's limit does not suffice."""
         left = int(min(self.limit - self.spent, route.most_calls))
         if left < route.least_calls:
             return None
@@ -121,7 +122,7 @@ class _SecondEstimate:
     `curved`: whether the clusters of the posterior failed to describe it, as about a curve.
     """
 
-    route: _Route
+    route: _EvidenceRoute
     runs: tuple[NestedResult, ...]
     curved: bool
 
@@ -135,16 +136,16 @@ class _SecondEstimate:
         return sum(each.n_calls for each in self.runs)
 
     def distance(self, run: NestedResult) -> float:
-        """How far a run's log Z lies above this one, in combined standard errors."""
+        """Return a run's log Z minus this one, in combined standard errors; negative if it is below."""
         log_z, error = self.log_z
         return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
-    def contradicts(self, run: NestedResult, most: float) -> bool:
+    def is_doubtful_beside(self, run: NestedResult, most: float) -> bool:
         """Return whether a run is more than `most` errors away, or this estimate is itself doubtful."""
         return abs(self.distance(run)) > most or bool(self.runs[-1].warnings)
 
-    def overlooks(self, first: NestedResult, longer: NestedResult) -> bool:
-        """Return whether this estimate is too low about a curved posterior, below two runs that agree.
+    def is_too_low_on_curve(self, first: NestedResult, longer: NestedResult) -> bool:
+        """Return whether this estimate is too low: the posterior is curved, and two runs that agree lie above it.
 
         Along a curve the prior of a second pass is thin where the posterior is not, so it can miss a part. Chains of
         `longer` are twice as long: if those of `first` were too short, the two would differ.
@@ -154,7 +155,7 @@ class _SecondEstimate:
         return self.curved and below > _APART and alike and not first.warnings
 
 
-def checked(
+def check_and_repeat(
     first: NestedResult,
     problem: Samplable,
     move: Move,
@@ -200,7 +201,7 @@ def checked(
         if raised_by(first, evidence_not_met(missing.lost, first)) > _MATTERS:
             modes = _modes_with_lost(first, missing.lost, problem, rng)
             chain = move if isinstance(move, SliceMove) else SliceMove()
-            again = budget.run_by(_Route(problem, first.n_live, chain, "the run with hops", modes=modes))
+            again = budget.run_route(_EvidenceRoute(problem, first.n_live, chain, "the run with hops", modes=modes))
             if again is not None:
                 now = again
                 more = look_for_missing(now, problem, max_calls=budget.left, rng=rng, lost=missing.lost)
@@ -214,15 +215,15 @@ def checked(
                 f"({int(budget.limit)} evaluations in all); use a greater limit, or max_cost=1 for no check",
             )
         else:
-            if second.contradicts(now, _APART):
+            if second.is_doubtful_beside(now, _APART):
                 second = _with_sharper_estimate(second, now, first, budget)
             n_check = second.n_calls + missing.n_calls
-            if second.contradicts(now, DISAGREE):
-                again = budget.run_by(
-                    _Route(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes)
+            if second.is_doubtful_beside(now, DISAGREE):
+                again = budget.run_route(
+                    _EvidenceRoute(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes)
                 )
-                now, second = _after_repetition(second, now, again)
-            now = _with_check(now, second, n_check)
+                now, second = _agreeing_run_and_estimate(second, now, again)
+            now = _with_check_stored(now, second, n_check)
     except NotConvergedError as error:
         # A second estimate may evaluate hypotheses that the first run never met.
         notes = (f"the second pass, which checks the evidence, failed: {error}",)
@@ -240,13 +241,13 @@ def _modes_with_lost(
 
 def _second_estimate(
     now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _Budget
-) -> tuple[_Route, _SecondEstimate | None]:
+) -> tuple[_EvidenceRoute, _SecondEstimate | None]:
     """Estimate the evidence by the first route that is confirmed, else by the last; None if that did not end."""
     curved, second = False, None
     for route in _second_routes(now, problem, move, least_live, budget.rng):
-        found = budget.run_by(route)
+        found = budget.run_route(route)
         second = None if found is None else _SecondEstimate(route, (found,), curved)
-        if found is not None and route.confirmed(found):
+        if found is not None and route.found_expected_posterior(found):
             break
         curved = route.expected is not None
     return route, second
@@ -261,13 +262,13 @@ def _with_sharper_estimate(
     n_live = int(min(max(route.n_live, now.n_live), room / second.runs[0].n_calls * route.n_live))
     if n_live <= route.n_live:
         return second
-    found = budget.run_by(replace(route, n_live=n_live, most_calls=math.inf))
+    found = budget.run_route(replace(route, n_live=n_live, most_calls=math.inf))
     if found is None:
         return second
     return replace(second, runs=(found,) if second.runs[0].warnings else (*second.runs, found))
 
 
-def _after_repetition(
+def _agreeing_run_and_estimate(
     second: _SecondEstimate, now: NestedResult, again: NestedResult | None
 ) -> tuple[NestedResult, _SecondEstimate]:
     """Return the run and the second estimate that agree, given a repetition of the run with longer chains.
@@ -276,9 +277,9 @@ def _after_repetition(
     """
     if again is None or again.warnings:
         return now, second
-    if not second.contradicts(again, DISAGREE):
+    if not second.is_doubtful_beside(again, DISAGREE):
         return again, second
-    if second.overlooks(now, again):
+    if second.is_too_low_on_curve(now, again):
         shorter = replace(second.route, name="the same run with shorter chains")
         return again, _SecondEstimate(shorter, (now,), second.curved)
     return now, second
@@ -286,14 +287,14 @@ def _after_repetition(
 
 def _second_routes(
     first: NestedResult, problem: Samplable, move: Move, least_live: int, rng: np.random.Generator
-) -> Iterator[_Route]:
+) -> Iterator[_EvidenceRoute]:
     """Yield the routes to a second estimate, the cheapest first; the last one is an estimate whatever it finds."""
 
-    def from_near(near: Repartitioned, nats: float) -> _Route:
+    def route_near_posterior(near: Repartitioned, nats: float) -> _EvidenceRoute:
         wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
         enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
         n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
-        return _Route(near, n_live, _with_longer_chains(move), "a second pass from near the posterior")
+        return _EvidenceRoute(near, n_live, _with_longer_chains(move), "a second pass from near the posterior")
 
     if first.information > 0:
         theta = first.samples(_N_SAMPLES, rng=rng)
@@ -306,14 +307,14 @@ def _second_routes(
             and (nats := _information_near(first, clustered)) < _FEW_NATS < _GAIN * first.information
         ):
             most, expected = _MOST_COST * first.n_calls, nats + first.log_z
-            yield replace(from_near(clustered, nats), most_calls=most, expected=expected)
+            yield replace(route_near_posterior(clustered, nats), most_calls=most, expected=expected)
         single = _repartitioned_near(problem, theta, clustered=False)
         # With a log Z that is far too large the nats come out too few, or negative.
         if single is not None and (nats := _information_near(first, single)) < _GAIN * first.information:
-            yield from_near(single, nats)
+            yield route_near_posterior(single, nats)
             return
     n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
-    yield _Route(problem, n_live, _with_longer_chains(move), "a second run with longer chains")
+    yield _EvidenceRoute(problem, n_live, _with_longer_chains(move), "a second run with longer chains")
 
 
 def _repartitioned_near(problem: Samplable, theta: FloatArray, *, clustered: bool) -> Repartitioned | None:
@@ -353,7 +354,7 @@ def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def _with_check(now: NestedResult, second: _SecondEstimate, n_check: int) -> NestedResult:
+def _with_check_stored(now: NestedResult, second: _SecondEstimate, n_check: int) -> NestedResult:
     """Store the check in the result, with a warning where the estimates disagree."""
     (log_z, error), distance, name = second.log_z, second.distance(now), second.route.name
     warnings = now.warnings

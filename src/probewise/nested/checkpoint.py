@@ -114,18 +114,18 @@ def settings_of(
     ParameterError
         If the move is not a dataclass, which a checkpoint requires.
     """
-    _numbers(move)
+    _numeric_fields(move)
     return {
         "names": list(names),
         "n_live": n_live,
         "n_replaced": n_replaced,
-        "move": _description(move),
-        "stop": _description(stop),
+        "move": _value_as_text(move),
+        "stop": _value_as_text(stop),
         "seed_state": seed_state,
     }
 
 
-def _description(value: object) -> str:
+def _value_as_text(value: object) -> str:
     if not is_dataclass(value):
         return str(getattr(value, "__qualname__", type(value).__qualname__))
     # A function's memory address differs between processes.
@@ -133,15 +133,15 @@ def _description(value: object) -> str:
 
 
 @dataclass
-class Keeper:
+class CheckpointFile:
     """Save a run to `path` atomically, and resume it."""
 
     path: Path
     every_s: float
     settings: dict[str, object]
-    _last: float = field(default_factory=time.monotonic)
-    _took: float = 0.0
-    _held: Run | None = None
+    _last_saving: float = field(default_factory=time.monotonic)
+    _saving_time_s: float = 0.0
+    _state_in_file: Run | None = None
 
     def __post_init__(self) -> None:
         if not self.every_s >= 0:
@@ -158,28 +158,28 @@ class Keeper:
 
     def save_if_due(self, now: Run) -> None:
         """Save at most every `every_s` seconds and every ten times the saving time; always if `every_s` is 0."""
-        if self.every_s == 0 or time.monotonic() - self._last >= max(self.every_s, 10.0 * self._took):
+        if self.every_s == 0 or time.monotonic() - self._last_saving >= max(self.every_s, 10.0 * self._saving_time_s):
             self.save(now)
 
     def save(self, now: Run) -> None:
         """Write the file unless it holds this state already; a failure only warns, as the run itself is sound."""
-        if now is self._held:
+        if now is self._state_in_file:
             return
         begun = time.monotonic()
         try:
-            write_bytes_atomically(self.path, self._bytes(now))
-            self._held = now
+            write_bytes_atomically(self.path, self._file_content(now))
+            self._state_in_file = now
         except FileError as error:
             warnings.warn(f"{error}; the run goes on unsaved", NotSavedWarning, stacklevel=2)
         finally:
-            self._last = time.monotonic()
-            self._took = self._last - begun
+            self._last_saving = time.monotonic()
+            self._saving_time_s = self._last_saving - begun
 
-    def _bytes(self, now: Run) -> bytes:
+    def _file_content(self, now: Run) -> bytes:
         head = {
             "format": _FORMAT,
             "settings": self.settings,
-            "moving": _numbers(now.moving),
+            "moving": _numeric_fields(now.moving),
             "log_volume": now.live.log_volume,
             "sizes": [len(d.points) for d in now.dead],
             "rng_state": now.rng_state,
@@ -218,7 +218,9 @@ class Keeper:
                 # Read the state only then: another version or move may have stored other fields.
                 same = found == _FORMAT and settings == self.settings
                 now = (
-                    _run_from(head, {name: file[name] for name in file.files if name != "head"}, move) if same else None
+                    _run_from_file(head, {name: file[name] for name in file.files if name != "head"}, move)
+                    if same
+                    else None
                 )
         except Exception as error:  # a damaged archive can raise whatever its parts do
             raise FileError(
@@ -227,14 +229,14 @@ class Keeper:
         if found != _FORMAT:
             raise FileError(self.path, f"format {found!r}", f"{_FORMAT!r}; delete the file to start anew")
         if now is None:
-            raise self._of_another(settings)
+            raise self._error_of_other_run(settings)
         self._require_same_problem(now, evaluate)
         evaluate.n_calls = now.n_calls
         rng.bit_generator.state = now.rng_state
-        self._last, self._held = time.monotonic(), now
+        self._last_saving, self._state_in_file = time.monotonic(), now
         return now
 
-    def _of_another(self, settings: dict[str, object]) -> FileError:
+    def _error_of_other_run(self, settings: dict[str, object]) -> FileError:
         """Report the first setting in which the file differs from this run."""
         name = next(n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n))
         if name == "seed_state":
@@ -246,7 +248,8 @@ class Keeper:
             )
         return FileError(
             self.path,
-            f"of a run with {name} = {_shortened(settings.get(name))}, not {_shortened(self.settings.get(name))}",
+            f"of a run with {name} = {_shortened_text(settings.get(name))}, "
+            f"not {_shortened_text(self.settings.get(name))}",
             "the same problem, settings and seed; give another file, or delete this one to start anew",
         )
 
@@ -285,7 +288,8 @@ _ORIGIN = ("log_birth", "birth_label", "ident", "parent")
 _RECORD = ("n_at_death", "rank", "n_ranked")
 
 
-def _run_from(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> Run:
+def _run_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> Run:
+    """Rebuild the state of a run from the head and the arrays of a checkpoint; `move` is the one given on resuming."""
     ends = np.cumsum(np.asarray(head["sizes"], dtype=np.int64))
     dead = []
     for end, size in zip(ends, np.diff(ends, prepend=0), strict=True):
@@ -300,8 +304,8 @@ def _run_from(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move
     )
     plain = {name: head[name] for name in _PLAIN}
     plain["notes"] = tuple(plain["notes"])  # type: ignore[arg-type]
-    moving = _with_numbers(move, head["moving"])
-    return Run(live, tuple(dead), moving, rng_state=_state(head["rng_state"]), **plain)  # type: ignore[arg-type]
+    moving = _with_numeric_fields(move, head["moving"])
+    return Run(live, tuple(dead), moving, rng_state=_state_with_arrays(head["rng_state"]), **plain)  # type: ignore[arg-type]
 
 
 def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
@@ -310,19 +314,20 @@ def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bo
         return a.shape == b.shape and bool(((a == b) | (np.abs(a - b) <= _ROUNDING * scale)).all())
 
 
-def _shortened(value: object) -> str:
+def _shortened_text(value: object) -> str:
     text = str(value)
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-def _numbers(move: Move) -> dict[str, float]:
+def _numeric_fields(move: Move) -> dict[str, float]:
     """Return the numeric fields of a move, which hold what it has tuned."""
     if not is_dataclass(move):
         raise ParameterError("move", move, "a dataclass, whose numbers a checkpoint can keep")
     return {f.name: v for f in fields(move) if isinstance(v := getattr(move, f.name), int | float)}
 
 
-def _with_numbers(move: Move, numbers: object) -> Move:
+def _with_numeric_fields(move: Move, numbers: object) -> Move:
+    """Return a move with the tuned fields of the checkpoint; ValueError where they do not fit the move."""
     if not is_dataclass(move) or not isinstance(numbers, dict):
         raise ValueError("the move cannot be restored")
     restored: Move = replace(move, **numbers)
@@ -333,14 +338,14 @@ def _as_json(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
-def _state(value: object) -> dict[str, Any]:
+def _state_with_arrays(value: object) -> dict[str, Any]:
     """Convert the lists in a generator's state back to arrays."""
     if not isinstance(value, dict):
         raise ValueError("no state of a random generator")
 
-    def back(item: object) -> object:
+    def item_with_arrays(item: object) -> object:
         if isinstance(item, dict):
-            return {k: back(v) for k, v in item.items()}
+            return {k: item_with_arrays(v) for k, v in item.items()}
         return np.asarray(item, dtype=np.uint64) if isinstance(item, list) else item
 
-    return {k: back(v) for k, v in value.items()}
+    return {k: item_with_arrays(v) for k, v in value.items()}

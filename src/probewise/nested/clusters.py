@@ -40,7 +40,7 @@ class Clusters:
     def of(groups: list[FloatArray]) -> Clusters:
         """Compute mean and covariance of groups of points, each (n, n_params)."""
         mean = np.stack([g.mean(axis=0) for g in groups])
-        root = np.stack([_root(g) for g in groups])
+        root = np.stack([_covariance_root(g) for g in groups])
         inverse = np.asarray(np.linalg.inv(root), dtype=np.float64)
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         return Clusters(mean, root, inverse, log_det, np.array([len(g) for g in groups]))
@@ -59,7 +59,7 @@ class Clusters:
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Clusters(*map(np.concatenate, pairs))
 
-    def without(self, u: FloatArray, home: IntArray) -> Clusters:
+    def without_point_itself(self, u: FloatArray, home: IntArray) -> Clusters:
         """Return for each point the mean and covariance of its cluster without the point itself.
 
         Parameters
@@ -103,7 +103,7 @@ def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
     queue, done = [points], list[FloatArray]()
     while queue:
         group = queue.pop()
-        halves = _split(group, least) if len(queue) + len(done) + 2 <= _MOST_CLUSTERS else None
+        halves = _split_in_two(group, least) if len(queue) + len(done) + 2 <= _MOST_CLUSTERS else None
         if halves is None:
             done.append(group)
         else:
@@ -117,7 +117,8 @@ def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
     return clusters
 
 
-def _split(points: FloatArray, least: int) -> tuple[FloatArray, FloatArray] | None:
+def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArray] | None:
+    """Split points, (n, n_params), where two Gaussians explain them better than one by enough; None where not."""
     n, n_params = points.shape
     if n < 2 * least:
         return None
@@ -128,7 +129,7 @@ def _split(points: FloatArray, least: int) -> tuple[FloatArray, FloatArray] | No
     axes = np.concatenate([z, z @ vectors / np.sqrt(np.maximum(values, flattest))], axis=1)
     # Two equal modes make the kurtosis small, a small mode beside a large one makes it large.
     fourth = (axes**4).mean(axis=0)
-    whole = n * _log_det(points)
+    whole = n * _covariance_log_det(points)
     n_more = 1 + n_params * (n_params + 3) / 2
     best, halves = n_more + 0.15 * n + 10.0, None
     for axis in {int(np.argmin(fourth)), int(np.argmax(fourth))}:
@@ -147,7 +148,7 @@ def _split(points: FloatArray, least: int) -> tuple[FloatArray, FloatArray] | No
             continue
         a, b = points[~side], points[side]
         entropy = n_one * np.log(n_one / n) + (n - n_one) * np.log(1 - n_one / n)
-        gain = whole - len(a) * _log_det(a) - len(b) * _log_det(b) + entropy
+        gain = whole - len(a) * _covariance_log_det(a) - len(b) * _covariance_log_det(b) + entropy
         if gain > best:
             best, halves = float(gain), (a, b)
     return halves
@@ -158,7 +159,8 @@ def _least_points(n_params: int) -> int:
     return 2 * n_params + 2
 
 
-def _root(points: FloatArray) -> FloatArray:
+def _covariance_root(points: FloatArray) -> FloatArray:
+    """Cholesky factor of the covariance of points (n, n_params), with a small ridge where there is no extent."""
     n_params = points.shape[1]
     centred = points - points.mean(axis=0)
     covariance = centred.T @ centred / max(len(points) - 1, 1)
@@ -167,5 +169,5 @@ def _root(points: FloatArray) -> FloatArray:
     return np.linalg.cholesky(covariance + np.diag(ridge))
 
 
-def _log_det(points: FloatArray) -> float:
-    return float(np.log(np.diag(_root(points))).sum())
+def _covariance_log_det(points: FloatArray) -> float:
+    return float(np.log(np.diag(_covariance_root(points))).sum())

@@ -29,7 +29,7 @@ def to_anesthetic(result: DeadPoints) -> Any:
     ImportError
         If anesthetic is not installed.
     """
-    anesthetic = _optional("anesthetic")
+    anesthetic = _import_optional("anesthetic")
     death, birth = _strict_levels(result)
     return anesthetic.NestedSamples(
         data=np.array(result.theta), columns=list(result.names), logL=death, logL_birth=birth, label="probewise"
@@ -62,7 +62,7 @@ def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.ra
     ImportError
         If arviz is not installed.
     """
-    arviz = _optional("arviz")
+    arviz = _import_optional("arviz")
     if not result.names:
         raise ParameterError("names", result.names, "one parameter or more; without any there are no samples")
     rows = result.rows(n, rng=rng)
@@ -101,7 +101,7 @@ def _strict_levels(result: DeadPoints) -> tuple[FloatArray, FloatArray]:
     return death, np.where(at > 0, strict[at - 1], -np.inf)
 
 
-def _optional(name: str) -> ModuleType:
+def _import_optional(name: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:

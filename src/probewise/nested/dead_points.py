@@ -70,11 +70,11 @@ class DeadPoints(WeightedSamples):
             raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_dead, {len(self.names)}) for {self.names}")
         object.__setattr__(self, "theta", theta)
         for name in PER_POINT:
-            self._freeze(name, frozen(getattr(self, name)))
+            self._store_read_only(name, frozen(getattr(self, name)))
         for name in COUNTS:
-            self._freeze(name, frozen_int(getattr(self, name)))
+            self._store_read_only(name, frozen_int(getattr(self, name)))
 
-    def _freeze(self, name: str, values: FloatArray | IntArray) -> None:
+    def _store_read_only(self, name: str, values: FloatArray | IntArray) -> None:
         object.__setattr__(self, name, require_length(name, values, self.n_dead, "row of theta"))
 
     @property

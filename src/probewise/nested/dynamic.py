@@ -26,7 +26,7 @@ from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integ
 from probewise.nested.merging import JoinedRecord, combined_p_value, seeds_of
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, versions
-from probewise.nested.sampler import least_live, move_at, plain_state, step
+from probewise.nested.sampler import least_live, move_at_volume, plain_state, step
 
 Goal: TypeAlias = Literal["posterior", "evidence"]
 
@@ -92,11 +92,11 @@ def intensified(
     if max_calls is not None:
         require_whole("max_calls", max_calls, least=n_live)
     evaluate = Evaluator(problem)
-    _require_same(result, evaluate)
+    _require_complete_run_of(result, evaluate)
     seed_state = plain_state(rng.bit_generator.state)
-    first, last = _span(result, goal)
-    thread = _thread(result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng)
-    return _joined(result, thread, seed_state, evaluate.n_calls, rng)
+    first, last = _rows_to_intensify(result, goal)
+    thread = _draw_thread(result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng)
+    return _join_thread_to_run(result, thread, seed_state, evaluate.n_calls, rng)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class _Thread:
     n_ranked: IntArray
 
 
-def _require_same(result: NestedResult, evaluate: Evaluator) -> None:
+def _require_complete_run_of(result: NestedResult, evaluate: Evaluator) -> None:
     """Raise ParameterError unless a run is complete and of this problem."""
     if evaluate.names != result.names:
         raise ShapeError(f"the problem has the parameters {evaluate.names}; allowed: those of the run, {result.names}")
@@ -132,7 +132,7 @@ def _require_same(result: NestedResult, evaluate: Evaluator) -> None:
         )
 
 
-def _span(result: NestedResult, goal: Goal) -> tuple[int, int]:
+def _rows_to_intensify(result: NestedResult, goal: Goal) -> tuple[int, int]:
     """Return the rows of the two deaths between which new points count most."""
     weight = result.weight
     if goal == "posterior":
@@ -146,7 +146,7 @@ def _span(result: NestedResult, goal: Goal) -> tuple[int, int]:
     return int(min(first, result.n_dead - 2)), int(min(last, result.n_dead - 1))
 
 
-def _thread(
+def _draw_thread(
     result: NestedResult,
     evaluate: Evaluator,
     move: Move,
@@ -159,11 +159,11 @@ def _thread(
     """Draw new points above the level of row `first` and let them die up to that of row `last`."""
     end = (float(result.log_likelihood[last]), float(result.label[last]))
     bound = Bound(float(result.log_likelihood[first]), float(result.label[first]))
-    above = _alive(result, first)
+    above = _rows_alive_after(result, first)
     known = evaluate.known(result.theta[above], result.log_likelihood[above], result.label[above])
     log_volume = float(result.log_volume[first])
     begin = np.concatenate([rng.permutation(len(above)) for _ in range(math.ceil(n_live / len(above)))])[:n_live]
-    now = move_at(move, log_volume)
+    now = move_at_volume(move, log_volume)
     drawn, tally = now.draw(known.take(begin), bound, known.u, evaluate, rng)
     started = np.where(now is move, above[begin], -1)
     origin = Origin(
@@ -177,7 +177,7 @@ def _thread(
         reached = (float(live.points.log_likelihood[worst]), float(live.points.label[worst])) >= end
         if reached or (max_calls is not None and evaluate.n_calls + 2 * cost > max_calls):
             break
-        now = move_at(moving, live.log_volume)
+        now = move_at_volume(moving, live.log_volume)
         live, gone, tally = step(live, now, evaluate, n_replaced=n_replaced, rng=rng)
         cost = tally.n_evaluated
         moving = moving.adapted(tally) if now is moving else moving
@@ -191,14 +191,14 @@ def _thread(
     return _Thread(points, origin, began, np.concatenate(ranks), np.concatenate(counts))
 
 
-def _alive(result: NestedResult, row: int) -> IntArray:
+def _rows_alive_after(result: NestedResult, row: int) -> IntArray:
     """Rows of the points alive just after the death of a row."""
     level = (result.log_likelihood[row], result.label[row])
     born = (result.log_birth < level[0]) | ((result.log_birth == level[0]) & (result.birth_label <= level[1]))
     return np.flatnonzero(born & (np.arange(result.n_dead) > row))
 
 
-def _joined(
+def _join_thread_to_run(
     result: NestedResult,
     thread: _Thread,
     seed_state: object,

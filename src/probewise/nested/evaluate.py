@@ -175,23 +175,25 @@ class Evaluator:
         parts = np.array_split(theta, min(self.n_parts, len(theta))) if shared else [theta]
         answers: list[object] = []
         try:
-            for answer in self._answers(parts):
+            for answer in self._likelihoods_of_parts(parts):
                 answers.append(answer)  # one by one: their number identifies the part that failed
         except Exception as error:
-            raise NotConvergedError(self._failure(error, parts[len(answers)])) from error
+            raise NotConvergedError(self._failure_message(error, parts[len(answers)])) from error
         # Concatenation copies: a likelihood may return the same array every time.
-        values = np.concatenate([self._numbers(a, part) for a, part in zip(answers, parts, strict=True)])
+        values = np.concatenate(
+            [self._require_log_likelihoods(a, part) for a, part in zip(answers, parts, strict=True)]
+        )
         fine = values < np.inf
         if not fine.all():
             at = int(np.argmin(fine))
             raise NotConvergedError(
-                f"the log likelihood is {values[at]} at {self._show(theta[at])}; "
+                f"the log likelihood is {values[at]} at {self._parameters_as_text(theta[at])}; "
                 "allowed: a finite number, or -inf where the hypothesis is impossible"
             )
         self.n_calls += len(theta)
         return values
 
-    def _answers(self, parts: list[FloatArray]) -> Iterator[object]:
+    def _likelihoods_of_parts(self, parts: list[FloatArray]) -> Iterator[object]:
         """Yield the likelihoods of the parts in order; the parts run in parallel where there is an executor."""
         # Copies: a likelihood that writes into its argument must not change the samples.
         if self.executor is not None and len(parts) > 1:
@@ -207,23 +209,23 @@ class Evaluator:
             for part in parts:
                 yield self.problem.log_likelihood(part.copy())
 
-    def _numbers(self, answer: object, theta: FloatArray) -> FloatArray:
+    def _require_log_likelihoods(self, answer: object, theta: FloatArray) -> FloatArray:
         if isinstance(answer, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(answer).sum())):
             raise NotConvergedError(
                 f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: "
                 "plain numbers; return answer.filled(-np.inf) if masked means impossible; "
-                f"{self._first_in_words(theta)}"
+                f"{self._first_as_text(theta)}"
             )
         if np.asarray(answer).dtype.kind == "c":
             raise NotConvergedError(
                 "the likelihood returned complex numbers; allowed: real ones; return their real part if that is "
-                f"meant; {self._first_in_words(theta)}"
+                f"meant; {self._first_as_text(theta)}"
             )
         try:
             values = np.asarray(answer, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise NotConvergedError(
-                f"the likelihood returned something other than numbers ({error}); {self._first_in_words(theta)}"
+                f"the likelihood returned something other than numbers ({error}); {self._first_as_text(theta)}"
             ) from error
         if values.shape == () and len(theta) == 1:
             return values.reshape(1)  # many functions drop the axis of a batch of one, scipy.stats among them
@@ -231,11 +233,11 @@ class Evaluator:
             raise NotConvergedError(
                 f"the likelihood returned shape {values.shape}; "
                 f"allowed: ({len(theta)},), one number per hypothesis: theta is a batch of shape {theta.shape}, "
-                f"one hypothesis per row; {self._first_in_words(theta)}"
+                f"one hypothesis per row; {self._first_as_text(theta)}"
             )
         return values
 
-    def _failure(self, error: Exception, theta: FloatArray) -> str:
+    def _failure_message(self, error: Exception, theta: FloatArray) -> str:
         """Describe the failure of a batch, (n, n_params), and of which hypothesis in it."""
         why = f"{type(error).__name__}: {error}"
         if self.executor is not None and "pickle" in why.lower():
@@ -246,18 +248,18 @@ class Evaluator:
         # A hypothesis that killed its worker could kill this process too.
         culprit = None if isinstance(error, BrokenExecutor) else self._failing_row(theta)
         if culprit is not None:
-            return f"the likelihood raised {why}; at {self._show(culprit)}"
+            return f"the likelihood raised {why}; at {self._parameters_as_text(culprit)}"
         batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
-        return f"the likelihood raised {why}; {batch}; {self._first_in_words(theta)}"
+        return f"the likelihood raised {why}; {batch}; {self._first_as_text(theta)}"
 
     def _failing_row(self, theta: FloatArray) -> FloatArray | None:
         """Find by bisection a hypothesis that fails by itself; None where only the batch as a whole fails."""
         while len(theta) > 1:
             half = len(theta) // 2
-            theta = theta[:half] if self._fails(theta[:half]) else theta[half:]
-        return theta[0] if self._fails(theta) else None
+            theta = theta[:half] if self._likelihood_fails(theta[:half]) else theta[half:]
+        return theta[0] if self._likelihood_fails(theta) else None
 
-    def _fails(self, theta: FloatArray) -> bool:
+    def _likelihood_fails(self, theta: FloatArray) -> bool:
         try:
             if self.executor is None:
                 self.problem.log_likelihood(theta.copy())
@@ -267,8 +269,8 @@ class Evaluator:
             return True
         return False
 
-    def _first_in_words(self, theta: FloatArray) -> str:
-        return f"first of the {len(theta)} hypotheses asked for: {self._show(theta[0])}"
+    def _first_as_text(self, theta: FloatArray) -> str:
+        return f"first of the {len(theta)} hypotheses asked for: {self._parameters_as_text(theta[0])}"
 
-    def _show(self, row: FloatArray) -> str:
+    def _parameters_as_text(self, row: FloatArray) -> str:
         return ", ".join(f"{name} = {value:.10g}" for name, value in zip(self.names, row, strict=True))

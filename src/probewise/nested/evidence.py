@@ -49,7 +49,7 @@ def integrate(
     log_start_error: float = 0.0,
     n_simulations: int = 200,
 ) -> Evidence:
-    """Sum likelihood over the shells of prior volume between successive deaths.
+    """Estimate the evidence: sum the likelihood over the shells of prior volume between successive deaths.
 
     Parameters
     ----------

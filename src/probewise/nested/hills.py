@@ -14,10 +14,10 @@ from probewise.nested.ascent import Top
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.importance import HeldOut, Posterior, Weighted, weigh_draws
-from probewise.nested.mixture import single
+from probewise.nested.mixture import single_student_t
 from probewise.nested.moves import SliceMove
 from probewise.nested.repartition import principal_root
-from probewise.nested.space import Space, unbounded
+from probewise.nested.space import Space, unbounded_space_of
 from probewise.nested.weights import n_effective
 
 _N_SAMPLES = 1000  # of a hill
@@ -52,16 +52,16 @@ class Hill:
         theta = drawn.samples(_N_SAMPLES, rng=rng)
         x = space.enter(theta)
         shape = Clusters.of([x])
-        return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance(x, shape), _INSIDE)))
+        return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance_in_sds(x, shape), _INSIDE)))
 
     def is_met_by(self, run: Posterior) -> bool:
         """Return whether a run has at least half of this hill's evidence within its ellipsoid."""
-        inside = _distance(self.space.enter(run.theta), self.shape) <= self.radius
+        inside = _distance_in_sds(self.space.enter(run.theta), self.shape) <= self.radius
         near = float(run.weight[inside].sum())
         return near > 0 and run.log_z + math.log(near) > self.log_z + math.log(_MET * _INSIDE)
 
 
-def _distance(x: FloatArray, shape: Clusters) -> FloatArray:
+def _distance_in_sds(x: FloatArray, shape: Clusters) -> FloatArray:
     """Distance of points (n, n_params) from the middle of a cluster, sds, (n,)."""
     return np.asarray(np.linalg.norm((x - shape.mean[0]) @ shape.inverse_root[0].T, axis=1))
 
@@ -71,19 +71,19 @@ def evidence_not_met(hills: Iterable[Hill], run: Posterior) -> float:
     return float(logsumexp([-math.inf, *(hill.log_z for hill in hills if not hill.is_met_by(run))]))
 
 
-def _points_on_hill(n_params: int) -> int:
+def _n_points_on_hill(n_params: int) -> int:
     return max(_PER_PARAM * n_params, 20)
 
 
 def calls_to_weigh_hill(n_params: int) -> float:
     """Return about how many evaluations it takes to weigh a hill: two or three rounds of chains."""
-    return 2.5 * _points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
+    return 2.5 * _n_points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
 
 
 def drawn_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Points:
     """Draw points uniformly from the upper part of a hill, whose covariance is that of a whole normal hill."""
     n_params = top.root.shape[0]
-    n = _points_on_hill(n_params)
+    n = _n_points_on_hill(n_params)
     below = (n_params + 2) / 2
     move = SliceMove(hops=0)
     live = top.highest.u + rng.standard_normal((n, n_params)) @ top.root.T
@@ -104,13 +104,13 @@ def drawn_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> 
 
 def weigh_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
     """Weigh a hill by draws from a Student t about points on it, fitted anew if need be; None where none fits."""
-    space = unbounded(evaluate.problem.prior)
+    space = unbounded_space_of(evaluate.problem.prior)
     x, n_params = space.enter(settled.theta), settled.theta.shape[1]
     mean, covariance = x.mean(axis=0), np.atleast_2d(np.cov(x, rowvar=False))
     n_draws, enough = max(_DRAWS_PER_PARAM * n_params, 200), _ENOUGH * n_params
     for _ in range(_FITS):
-        proposal = single(mean, _WIDER**2 * covariance)
-        drawn = weigh_draws(proposal, 0.0, HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
+        proposal = single_student_t(mean, _WIDER**2 * covariance)
+        drawn = weigh_draws(proposal, 0.0, HeldOut.empty(), space, evaluate, n_draws=n_draws, rng=rng)
         if drawn.n_eff > enough:
             return Hill.of(drawn, space, rng)
         if not drawn.n_eff > 1:

@@ -23,7 +23,7 @@ from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.proposal import Proposal, find_parts, fit_proposals
 from probewise.nested.result import NestedResult
-from probewise.nested.space import Space, unbounded
+from probewise.nested.space import Space, unbounded_space_of
 from probewise.nested.weighted_samples import WeightedSamples
 from probewise.nested.weights import n_effective, resampled
 
@@ -192,7 +192,7 @@ def update(
     evaluate = Evaluator(problem)
     if previous.names != evaluate.names:
         raise ParameterError("previous.names", previous.names, f"the problem's names {evaluate.names}")
-    space = unbounded(problem.prior)
+    space = unbounded_space_of(problem.prior)
     rows = np.unique(previous.rows(1000, rng=rng))
     theta = previous.theta[rows]
     log_likelihood = evaluate.log_likelihood(theta)
@@ -204,7 +204,7 @@ def update(
         proposal = fit_proposals(
             resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
         )[-1]
-        found = weigh_draws(proposal, prior_share, HeldOut.nothing(), space, evaluate, n_draws=n_draws, rng=rng)
+        found = weigh_draws(proposal, prior_share, HeldOut.empty(), space, evaluate, n_draws=n_draws, rng=rng)
         found = with_loss_in_error(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
@@ -237,16 +237,16 @@ class HeldOut:
     n_independent: float
 
     @classmethod
-    def nothing(cls) -> HeldOut:
+    def empty(cls) -> HeldOut:
         """Return an empty set, for plain importance sampling."""
         return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
 
 
 def effective_lineages(found: Posterior) -> float:
-    """Return to how many independent samples a run is equivalent for the shares of the posterior's parts.
+    """Return the number of independent samples that would give the shares of the posterior's parts as precisely.
 
-    Many samples of a run descend from one live point: ln Z of a part followed by n live points has the error
-    sqrt(H memory / n), where a share estimated from n independent samples has the relative error 1 / sqrt(n).
+    Many samples of a run descend from one live point. The log evidence of a part has the error sqrt(H memory / n_live);
+    a share estimated from n independent samples has the relative error 1 / sqrt(n). So n is n_live / (H memory).
     """
     if isinstance(found, Weighted):
         return found.n_eff if found.run is None else effective_lineages(found.run)
@@ -328,7 +328,7 @@ def weigh_draws(
     held_ratio = np.empty(0)
     if len(held.x):
         held_ratio = held.log_density + held.log_likelihood - log_proposal(held.x, held.log_density)
-    log_z, error, missed, log_weight = _bridge_sampled(log_ratio, n_draws, held_ratio, held.n_independent)
+    log_z, error, missed, log_weight = _bridge_sampling_estimate(log_ratio, n_draws, held_ratio, held.n_independent)
     # The mean of weights of infinite variance converges as n^(k - 1) instead of n^(-1/2) (Vehtari et al. 2024).
     error *= len(log_ratio) ** min(max(k - 0.5, 0.0), 1.0)
     n_eff = n_effective(log_weight)
@@ -337,7 +337,7 @@ def weigh_draws(
     )
 
 
-def _bridge_sampled(
+def _bridge_sampling_estimate(
     log_ratio: FloatArray, n_draws: int, held_ratio: FloatArray, n_held: float
 ) -> tuple[float, float, float, FloatArray]:
     """Estimate the evidence from draws and posterior samples by bridge sampling (Meng & Wong 1996).

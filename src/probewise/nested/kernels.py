@@ -151,14 +151,16 @@ class KernelMove:
 
 
 @dataclass(frozen=True, eq=False)
-class _Decided:
+class _LastAccepted:
     """Index of the proposal each chain accepted last, -1 for none, (n_chains,), and the number of acceptances."""
 
     index: FloatArray
     n_accepted: int
 
 
-def _accept_in_turn(possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray) -> _Decided:
+def _accept_in_turn(
+    possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray
+) -> _LastAccepted:
     """Let every chain accept or reject its proposals in turn (Metropolis-Hastings, independent proposals).
 
     `possible` and `log_target`, the log of target over proposal density, have one entry per proposal,
@@ -172,7 +174,7 @@ def _accept_in_turn(possible: BoolArray, log_target: FloatArray, log_now: FloatA
         now[accept] = log_target[k][accept]
         index[accept] = k * n_chains + np.flatnonzero(accept)
         n_accepted += int(accept.sum())
-    return _Decided(index, n_accepted)
+    return _LastAccepted(index, n_accepted)
 
 
 def diversify_by_kernels(

@@ -33,14 +33,14 @@ _FROM_TOP = 3.0  # nats a parameter: a climb ends as near to the top
 _NEAREST = 3
 
 
-def _count_early(run: NestedResult) -> int:
+def _n_early_dead_points(run: NestedResult) -> int:
     """Count the dead points that hold the first tenth of the posterior's mass."""
     return int(np.searchsorted(np.cumsum(run.weight), _BULK))
 
 
 def scale_of_bulk(run: NestedResult, space: Space) -> FloatArray:
     """Sds of the points that died where the posterior's bulk begins, (n_params,)."""
-    last = _count_early(run)
+    last = _n_early_dead_points(run)
     return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
 
 
@@ -53,7 +53,7 @@ def tops_from_early_points(
     """
     n_params = len(evaluate.names)
     n_starts = int(min(max_calls, _SHARE * first.n_calls) / len(_ON_LINE))
-    last = _count_early(first)
+    last = _n_early_dead_points(first)
     if n_starts < 2 or last < first.n_live:
         return []
     # Denser in the beginning: a mode that dies out late has points there, too.
@@ -66,9 +66,9 @@ def tops_from_early_points(
     apart = np.flatnonzero(lie_apart(start, known, scale, 1, evaluate, rng))
     if not apart.size:
         return []
-    chosen = apart[_far_from_each_other(start.u[apart] / scale, start.log_likelihood[apart])]
+    chosen = apart[_order_by_distance(start.u[apart] / scale, start.log_likelihood[apart])]
     roots = np.stack([principal_root(u[row : row + _BLOCK]) for row in rows[chosen]])
-    now, scales = _climbed(start.take(chosen), roots, evaluate, rng)
+    now, scales = _climb_on_random_lines(start.take(chosen), roots, evaluate, rng)
     # Of the evidence below a level a lost mode holds no more than its share of live points there.
     enough = first.log_likelihood[last] - _FROM_TOP * n_params
     high = np.flatnonzero(now.log_likelihood > enough)
@@ -76,7 +76,7 @@ def tops_from_early_points(
     return [Top(now.take(slice(k, k + 1)), now.u[k], scales[k] * roots[k]) for k in high]
 
 
-def _climbed(
+def _climb_on_random_lines(
     start: Points, root: FloatArray, evaluate: Evaluator, rng: np.random.Generator
 ) -> tuple[Points, FloatArray]:
     """Move points to higher places on random lines; steps grow where they succeed and shrink where they fail.
@@ -109,7 +109,10 @@ def _climbed(
 def lie_apart(
     points: Points, known: Points, scale: FloatArray, n_nearest: int, evaluate: Evaluator, rng: np.random.Generator
 ) -> BoolArray:
-    """Mark the points, (n,), that a dip of the likelihood separates from each of their nearest known points."""
+    """Mark the points, (n,), with a dip of the likelihood on the straight line to each of their nearest known points.
+
+    `scale`, (n_params,), is the unit of distance along each coordinate. The evaluations on the lines are counted.
+    """
     from scipy.spatial import cKDTree  # slow to import, and needed by runs only
 
     n, n_params = points.u.shape
@@ -126,7 +129,7 @@ def lie_apart(
     return np.asarray(dip.reshape(n, -1).all(axis=1))
 
 
-def _far_from_each_other(x: FloatArray, height: FloatArray) -> IntArray:
+def _order_by_distance(x: FloatArray, height: FloatArray) -> IntArray:
     """Choose among points (n, n_params) the highest one, then each time the one furthest from those chosen."""
     chosen = [int(height.argmax())]
     square = ((x - x[chosen[0]]) ** 2).sum(axis=1)

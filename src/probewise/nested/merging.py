@@ -27,8 +27,8 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
 
     A point is alive between the level above which it was drawn and its own. Sorted by level, the points
     of all runs form a run whose number of live points at each level is the sum of theirs (Higson,
-    Handley, Hobson & Lasenby 2019, section 4), whatever the numbers of live points and the stops of the
-    runs; the labels make the count exact on plateaus. Merged runs may be merged again. The error of
+    Handley, Hobson & Lasenby 2019, section 4). The runs may differ in their numbers of live points and in
+    where they stop. The labels make the count exact on plateaus. Merged runs may be merged again. The error of
     ln Z falls as one over the root of the number of runs.
 
     Parameters
@@ -65,7 +65,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     agreement = agreement_of(parts)
     check = _joined_checks(parts, evidence.log_z, evidence.error(remembered))
     p_value = combined_p_value([r.insertion_p_value for r in parts])
-    error, doubts = _doubts(agreement, check, p_value, evidence.log_z, evidence.error(remembered))
+    error, doubts = _error_and_doubts(agreement, check, p_value, evidence.log_z, evidence.error(remembered))
     for doubt in doubts:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     inherited = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
@@ -101,7 +101,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     )
 
 
-def _doubts(
+def _error_and_doubts(
     agreement: Agreement, check: Check | None, p_value: float, log_z: float, error: float
 ) -> tuple[float, list[str]]:
     """Return the error of the runs together, widened where they disagree, and the doubts about them in words."""

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise.nested.ascent import Top, climb, end_of
-from probewise.nested.beyond import peaks_above
+from probewise.nested.ascent import Top, climb_to_top, top_from_live_points
+from probewise.nested.beyond import higher_peaks
 from probewise.nested.evaluate import Evaluator, Points, Samplable
 from probewise.nested.hills import Hill, calls_to_weigh_hill, drawn_from_hill, evidence_not_met, weigh_hill
 from probewise.nested.importance import Posterior
@@ -96,17 +96,17 @@ def look_for_missing(
         return Missing()
     evaluate = Evaluator(problem)
 
-    def left(share: float = math.inf) -> int:
+    def calls_left(share: float = math.inf) -> int:
         return int(min(max_calls - evaluate.n_calls, share * run.n_calls))
 
-    top = climb(end_of(run, evaluate), evaluate, max_calls=left(_ASCENT_SHARE), rng=rng)
+    top = climb_to_top(top_from_live_points(run, evaluate), evaluate, max_calls=calls_left(_ASCENT_SHARE), rng=rng)
     if lost is None:
-        tops = tops_from_early_points(run, evaluate, max_calls=left(), rng=rng)
+        tops = tops_from_early_points(run, evaluate, max_calls=calls_left(), rng=rng)
         if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
             tops.append(top)
-        lost = _hills_not_met(tops, run, evaluate, max_calls=left(_WEIGHING_SHARE), rng=rng)
-    peaks = peaks_above(run, top, evaluate, max_calls=left(), rng=rng)
-    above = _hills_not_met(peaks, run, evaluate, max_calls=left(), rng=rng)
+        lost = _hills_not_met(tops, run, evaluate, max_calls=calls_left(_WEIGHING_SHARE), rng=rng)
+    peaks = higher_peaks(run, top, evaluate, max_calls=calls_left(), rng=rng)
+    above = _hills_not_met(peaks, run, evaluate, max_calls=calls_left(), rng=rng)
     return Missing(lost, above, evaluate.n_calls)
 
 

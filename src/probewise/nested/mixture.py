@@ -28,27 +28,28 @@ def fit_mixture(x: FloatArray, weight: FloatArray | None = None, *, rng: np.rand
     n_first, n_params = weight[first].sum(), x.shape[1]
     possible = [n for n in _NUMBERS if n == 1 or _PER_PARAMETER * n * (n_params + 1) < n_first]
 
-    def score(n: int) -> float:
-        fitted = _fitted(x[first], weight[first], n, _TO_CHOOSE, rng)
+    def held_out_score(n: int) -> float:
+        fitted = _fit_components(x[first], weight[first], n, _TO_CHOOSE, rng)
         return float(weight[~first] @ fitted.log_density(x[~first]))
 
-    best = possible[0] if len(possible) == 1 else max(possible, key=score)
-    return _fitted(x, weight, best, _TO_FIT, rng)
+    best = possible[0] if len(possible) == 1 else max(possible, key=held_out_score)
+    return _fit_components(x, weight, best, _TO_FIT, rng)
 
 
-def _fitted(
+def _fit_components(
     x: FloatArray, weight: FloatArray, n_components: int, n_iterations: int, rng: np.random.Generator
 ) -> Proposal:
+    """Fit a mixture of `n_components` Student t by `n_iterations` steps of expectation maximisation."""
     n_params = x.shape[1]
     centre = weight @ x / weight.sum()
     off = x - centre
     whole = (off * weight[:, None]).T @ off / weight.sum()
-    whole_root = _root(whole[None])[0]
+    whole_root = _cholesky_factors(whole[None])[0]
     share, mean, root = _kmeans_start(x, weight, centre, whole_root, n_components, rng)
     # A component borrows one sample's worth of the whole's covariance, scaled to a component's volume.
     borrowed = whole * n_components ** (-2.0 / n_params)
     for _ in range(n_iterations):
-        log_part, square = _densities(x, share, mean, root)
+        log_part, square = _component_densities(x, share, mean, root)
         part = np.exp(log_part - log_part.max(axis=0))
         part *= weight / part.sum(axis=0)
         mass = part.sum(axis=1)
@@ -61,23 +62,24 @@ def _fitted(
         off = x[None] - mean[:, None]
         covariance = (scaled[:, :, None] * off).transpose(0, 2, 1) @ off
         lent = 1.0 if len(mass) > 1 else 0.0
-        root = _root((covariance + lent * borrowed) / (mass + lent)[:, None, None])
+        root = _cholesky_factors((covariance + lent * borrowed) / (mass + lent)[:, None, None])
         share = mass / mass.sum()
-    return _mixture(mean, root, share)
+    return _as_proposal(mean, root, share)
 
 
-def single(mean: FloatArray, covariance: FloatArray) -> Proposal:
+def single_student_t(mean: FloatArray, covariance: FloatArray) -> Proposal:
     """Return one Student t distribution of this mean (n_params,) and covariance (n_params, n_params) of its kernel."""
-    return _mixture(mean[None], _root(covariance[None]), np.ones(1))
+    return _as_proposal(mean[None], _cholesky_factors(covariance[None]), np.ones(1))
 
 
-def _mixture(mean: FloatArray, root: FloatArray, share: FloatArray) -> Proposal:
+def _as_proposal(mean: FloatArray, root: FloatArray, share: FloatArray) -> Proposal:
+    """Return a mixture as a proposal: means (k, n_params), Cholesky factors (k, n_params, n_params), shares (k,)."""
     log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     clusters = Clusters(mean, root, np.asarray(np.linalg.inv(root)), log_det, np.ones(len(share), dtype=np.int64))
     return Proposal(clusters, len(share) * (np.zeros((1, mean.shape[1])),), len(share) * (1.0,), share)
 
 
-def _root(covariance: FloatArray) -> FloatArray:
+def _cholesky_factors(covariance: FloatArray) -> FloatArray:
     """Cholesky factors, (k, n_params, n_params), with a small ridge where there is no extent."""
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     ridge = 1e-10 * variance + 1e-13 * variance.mean(axis=1, keepdims=True) + 1e-24
@@ -113,7 +115,9 @@ def _kmeans_start(
     return mass / mass.sum(), middle + centre @ whole_root.T, spread[:, None, None] * whole_root
 
 
-def _densities(x: FloatArray, share: FloatArray, mean: FloatArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _component_densities(
+    x: FloatArray, share: FloatArray, mean: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Log of share times density up to a constant, and squared distance, of every component, both (k, n)."""
     n_params = x.shape[1]
     white = (x[None] - mean[:, None]) @ np.linalg.inv(root).transpose(0, 2, 1)

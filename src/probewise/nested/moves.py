@@ -159,7 +159,7 @@ class SliceMove:
         """Return the ends of one chain from each start; see `Move`."""
         n_chains, n_params = start.u.shape
         space = evaluate.space
-        walls = _walls(space)
+        walls = _bounds_of_coordinates(space)
         periodic = _PeriodicAxes.cut_where_empty(space.periodic, live)
         if periodic is not None:
             live = periodic.wrapped(live)
@@ -168,9 +168,9 @@ class SliceMove:
         n_lines = max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
-        kind = self._kinds(n_chains, n_steps, n_hops, rng)
-        frames = _frames(kind == _FRAME, n_params, rng)
-        axis = _axes(n_chains, n_steps, n_params, rng)
+        kind = self._kinds_of_steps(n_chains, n_steps, n_hops, rng)
+        frames = _random_directions(kind == _FRAME, n_params, rng)
+        axis = _axes_in_random_order(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
         metrics = _Metrics.of(clusters, start.u, home, live)
@@ -180,7 +180,7 @@ class SliceMove:
         moved = np.zeros(n_chains, dtype=bool)
         n_evaluated = n_tried = n_taken = 0
 
-        def begin(rows: IntArray) -> None:
+        def begin_step(rows: IntArray) -> None:
             """Set up the next step's line, bracket and level."""
             at = step[rows]
             kinds, measure = kind[rows, at], metrics.row_of(rows, home[rows])
@@ -201,14 +201,14 @@ class SliceMove:
                 behind = metrics.own_row[rows[follow]] + 1
                 toward[follow] = 2.0 * (live[(behind + first) % n] - live[(behind + second) % n])
             line[rows] = toward
-            low[rows], high[rows] = _bracket(now.u, rows, toward, walls, rng)
+            low[rows], high[rows] = _random_bracket(now.u, rows, toward, walls, rng)
             level[rows] = now.log_density[rows] - rng.standard_exponential(rows.size)
 
         active = np.arange(n_chains)
-        begin(active)
+        begin_step(active)
         while active.size:
             rows, n_ahead = active, min(_MOST_AHEAD, max(1, n_chains // (2 * active.size)))
-            t, below, above = _candidates(low[rows], high[rows], n_ahead, rng)
+            t, below, above = _candidates_ahead(low[rows], high[rows], n_ahead, rng)
             low[rows], high[rows] = below, above
             chain = rows.repeat(n_ahead)
             ahead = now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * line.take(rows, axis=0)[:, None, :]
@@ -252,7 +252,7 @@ class SliceMove:
                 tried = evaluate.evaluate_mapped(candidate.take(pending, axis=0), theta, log_density, rng)
                 ok[pending] = bound.admits(tried.log_likelihood, tried.label)
                 n_evaluated += pending.size
-            n_needed, delivered = _needed(ok.reshape(-1, n_ahead))
+            n_needed, delivered = _candidates_used(ok.reshape(-1, n_ahead))
             won = delivered.nonzero()[0]
             if won.size:
                 # A chain takes the first of its candidates above the bound.
@@ -269,12 +269,12 @@ class SliceMove:
             if more.size < done.size:
                 active = active[step[active] < n_steps]
             if more.size:
-                begin(more)
+                begin_step(more)
         if periodic is not None:
             now = replace(now, u=periodic.home(now.u))
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
-    def _kinds(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
+    def _kinds_of_steps(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
         """Draw the kind of every step of every chain, (n_chains, n_steps)."""
         lot = rng.random((n_chains, n_steps))
         kind = np.where(lot < self.axes, _AXIS, np.where(lot < self.axes + self.differences, _DIFFERENCE, _FRAME))
@@ -291,7 +291,7 @@ class SliceMove:
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
 
 
-def _candidates(
+def _candidates_ahead(
     low: FloatArray, high: FloatArray, n_ahead: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Draw the next candidates on each line as if all before were rejected, (n, n_ahead), and the bracket if all are.
@@ -307,13 +307,13 @@ def _candidates(
     return t, low, high
 
 
-def _needed(ok: BoolArray) -> tuple[IntArray, BoolArray]:
+def _candidates_used(ok: BoolArray) -> tuple[IntArray, BoolArray]:
     """Count the candidates, of (n, n_ahead), that each step used; also whether one was accepted, both (n,)."""
     delivered = np.asarray(ok.any(axis=1))
     return np.where(delivered, np.argmax(ok, axis=1) + 1, ok.shape[1]), delivered
 
 
-def _frames(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
+def _random_directions(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
     """Draw rows of random orthogonal matrices where `needed`, (n_chains, n_steps), is true.
 
     Returns (n_chains, n_steps rounded up to whole matrices, n_params). Matrices of which no row is needed are not
@@ -327,7 +327,7 @@ def _frames(needed: BoolArray, n_params: int, rng: np.random.Generator) -> Float
     return frames.reshape(n_chains, first.size * n_params, n_params)
 
 
-def _axes(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
+def _axes_in_random_order(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
     """Draw axes, (n_chains, n_steps), in random order without repetition until all were used."""
     n_turns = -(-n_steps // n_params)
     return np.argsort(rng.random((n_chains, n_turns, n_params)), axis=2).reshape(n_chains, -1)[:, :n_steps]
@@ -358,7 +358,7 @@ class _Metrics:
         )
         # A start that is not a live point is in no cluster.
         own_home = np.where(same.any(axis=1), home, -1)
-        each = clusters.joined(clusters.without(u, home))
+        each = clusters.joined(clusters.without_point_itself(u, home))
         conditional = 1.0 / np.sqrt((each.inverse_root**2).sum(axis=1))
         return cls(
             each,
@@ -416,14 +416,14 @@ class _PeriodicAxes:
 Walls: TypeAlias = tuple[FloatArray, FloatArray]
 
 
-def _walls(space: Space) -> Walls | None:
+def _bounds_of_coordinates(space: Space) -> Walls | None:
     """Bounds of each coordinate, infinite for periodic ones; None if no coordinate is bounded."""
     low, high = space.low.copy(), space.high.copy()
     low[list(space.periodic)], high[list(space.periodic)] = -np.inf, np.inf
     return (low, high) if np.isfinite(low).any() or np.isfinite(high).any() else None
 
 
-def _bracket(
+def _random_bracket(
     u: FloatArray, rows: IntArray, line: FloatArray, walls: Walls | None, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Place a bracket of length one at random about each point `u[rows]`, truncated where the line leaves the space."""

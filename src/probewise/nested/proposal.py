@@ -69,7 +69,7 @@ class Proposal:
         return np.asarray(logsumexp(parts, axis=0))
 
 
-def joined(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
+def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) -> Proposal:
     """Combine proposals into a mixture with these shares, which need not be normalised."""
     total = math.fsum(share)
     return Proposal(
@@ -126,17 +126,18 @@ def fit_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal,
     x = x[rng.permutation(len(x))]
     half = len(x) // 2
     if half < _FEW:
-        return (_fit(x, False, None),)
+        return (_fit_kernels(x, False, None),)
 
-    def score(form: tuple[bool, float | None]) -> float:
-        return float(_fit(x[:half], *form).log_density(x[half:]).mean())
+    def held_out_score(form: tuple[bool, float | None]) -> float:
+        return float(_fit_kernels(x[:half], *form).log_density(x[half:]).mean())
 
     wide: list[tuple[bool, float | None]] = [(False, None), (True, None)]
     narrow: list[tuple[bool, float | None]] = [(split, scale) for split in (False, True) for scale in _SCALES]
-    return tuple(_fit(x, *max(forms, key=score)) for forms in (wide, narrow))
+    return tuple(_fit_kernels(x, *max(forms, key=held_out_score)) for forms in (wide, narrow))
 
 
-def _fit(x: FloatArray, split: bool, scale: float | None) -> Proposal:
+def _fit_kernels(x: FloatArray, split: bool, scale: float | None) -> Proposal:
+    """Fit one form of proposal: by cluster if `split`; one kernel each if `scale` is None, else at samples."""
     clusters = find_parts(x) if split else Clusters.of([x])
     home = clusters.assign(x)
     n_params = x.shape[1]

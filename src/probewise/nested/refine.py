@@ -20,9 +20,9 @@ from probewise.nested.importance import (
     with_loss_in_error,
 )
 from probewise.nested.missing import look_for_missing
-from probewise.nested.proposal import fit_proposals, joined
+from probewise.nested.proposal import fit_proposals, mixture_of_proposals
 from probewise.nested.result import NestedResult
-from probewise.nested.space import unbounded
+from probewise.nested.space import unbounded_space_of
 
 _FIRST = 0.75  # share of the better form of density in the mixture
 
@@ -47,8 +47,8 @@ def refine(
     bridge sampling (Meng & Wong 1996), which estimates the share of the posterior that the proposal
     misses. A heavy tail of the weights, which slows the convergence of their mean, increases the error. And
     the run may have lost a part of the posterior: with n_live points and information H it knows the
-    shares of the posterior's parts as precisely as n_live / H independent samples, so a part of share
-    s is lost with probability exp(-s n_live / H); the sum of s times that over the parts found is added.
+    shares of the posterior's parts as precisely as n_live / H independent samples. So a part of share s is
+    lost with probability exp(-s n_live / H); the sum of s times that over the parts found is added.
 
     Parameters
     ----------
@@ -83,21 +83,21 @@ def refine(
         raise ParameterError("n_draws", n_draws, "100 or more")
     if n_pilots < 1:
         raise ParameterError("n_pilots", n_pilots, "1 or more")
-    space = unbounded(problem.prior)
+    space = unbounded_space_of(problem.prior)
     n_lineages = effective_lineages(result)
     fitted, held = split_samples(result, n_lineages, space, rng)
     known = [fitted]
     for _ in range(n_pilots):
         proposals = fit_proposals(np.concatenate(known), rng=rng)
         pilots = [
-            weigh_draws(p, 0.0, HeldOut.nothing(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
+            weigh_draws(p, 0.0, HeldOut.empty(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
             for p in proposals
         ]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         better = pilots[first]
         # The other form keeps a share: it may cover what the better one does not.
         others = (1.0 - _FIRST) / max(len(proposals) - 1, 1)
-        best = joined(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
+        best = mixture_of_proposals(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if better.n_eff > 2 * len(evaluate.names):
             known.append(resampled_for_fit(better.theta, better.log_weight, space, rng))
     found = with_loss_in_error(

@@ -22,7 +22,7 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.clusters import find_clusters
 from probewise.nested.evaluate import Samplable
-from probewise.nested.space import Space, unbounded
+from probewise.nested.space import Space, unbounded_space_of
 from probewise.priors import Prior
 
 _DEGREES_OF_FREEDOM = 5.0
@@ -32,7 +32,7 @@ _LEAST_SAMPLES = 2  # distinct samples per parameter, to determine the axes
 
 
 @dataclass(frozen=True, eq=False)
-class _Parts:
+class _StudentMixture:
     """A mixture of products of Student t in unbounded coordinates x, one part per cluster of samples.
 
     Part k has the probability `share` (n_parts,); in it x = `center` (n_parts, n_params) + `root` (n_parts, n_params,
@@ -77,15 +77,15 @@ class _Parts:
         return np.asarray(self.center[part] + np.einsum("nij,nj->ni", self.root[part], e))
 
     @staticmethod
-    def of(groups: Sequence[FloatArray], widening: float) -> _Parts:
+    def of(groups: Sequence[FloatArray], widening: float) -> _StudentMixture:
         """Compute mean and principal axes of groups of points, each (n, n_params)."""
         n = np.array([len(group) for group in groups])
         root = np.stack([principal_root(group, widening) for group in groups])
-        return _Parts(n / n.sum(), np.stack([group.mean(axis=0) for group in groups]), root)
+        return _StudentMixture(n / n.sum(), np.stack([group.mean(axis=0) for group in groups]), root)
 
 
 @dataclass(frozen=True, eq=False)
-class _Near:
+class _NearPrior:
     """A prior near the posterior: the mixture `parts`; `plain` is the original one.
 
     Chains move in coordinates along the principal axes of `whole`, the one part that all samples give.
@@ -93,8 +93,8 @@ class _Near:
 
     plain: Prior
     space: Space
-    whole: _Parts
-    parts: _Parts
+    whole: _StudentMixture
+    parts: _StudentMixture
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -107,7 +107,7 @@ class _Near:
         return all(bool(np.isfinite(matrix).all()) for matrix in matrices)
 
     @property
-    def coordinates(self) -> _Near:
+    def coordinates(self) -> _NearPrior:
         return self
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -161,7 +161,7 @@ class Repartitioned:
     """A problem with the same evidence and posterior, but a prior near that posterior."""
 
     problem: Samplable
-    prior: _Near
+    prior: _NearPrior
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log likelihood plus the log ratio of the priors, (n, n_params) -> (n,)."""
@@ -209,11 +209,11 @@ def repartitioned(
     n_different, least = len(np.unique(theta, axis=0)), _LEAST_SAMPLES * n_params
     if n_different < least:
         raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
-    space = unbounded(problem.prior)
+    space = unbounded_space_of(problem.prior)
     x = space.enter(theta)
-    whole = _Parts.of([x], widening)
-    parts = _Parts.of(groups_of(x), widening) if clustered else whole
-    return Repartitioned(problem, _Near(problem.prior, space, whole, parts))
+    whole = _StudentMixture.of([x], widening)
+    parts = _StudentMixture.of(groups_of(x), widening) if clustered else whole
+    return Repartitioned(problem, _NearPrior(problem.prior, space, whole, parts))
 
 
 def groups_of(x: FloatArray) -> list[FloatArray]:

@@ -14,12 +14,12 @@ import numpy as np
 
 from probewise._kinds import require_number, require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested.check import checked
+from probewise.nested.check import check_and_repeat
 from probewise.nested.evaluate import Samplable
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.pose import AnyPrior, as_problem
 from probewise.nested.result import NestedResult
-from probewise.nested.sampler import least_live, search
+from probewise.nested.sampler import least_live, run_once
 from probewise.nested.stop import RoundSummary, StopRule
 
 
@@ -74,11 +74,11 @@ def run(
     max_calls
         Limit of likelihood evaluations; at the limit the run ends with a warning.
     max_cost
-        Limit of all evaluations in units of those of the first run; 1 means no check. The rest is spent on a second
-        estimate of the evidence, about a fifth of the first run, and where the two disagree on a more precise second
-        estimate and a run with chains twice as long; and on a look for modes that died out among the live points, after
-        which the run is repeated with hops to those that are found. A disagreement or a lost mode that remains is
-        reported as a warning, and so is a second estimate that does not end within the limits.
+        Limit of all evaluations in units of those of the first run; 1 means no check. First, modes that died out among
+        the live points are looked for; if some of them matter, the run is repeated with hops to them. Then the evidence
+        is estimated again, at about a fifth of the first run's cost. Where the two disagree, a more precise second
+        estimate and a run with chains twice as long follow. A disagreement or a lost mode that remains is reported as a
+        warning, and so is a second estimate that does not end within the limits.
     checkpoint
         File to which the state is saved atomically as the run proceeds; its folder is created if missing. If the file
         exists, the run resumes and ends bit for bit as if it had not been interrupted or killed; `rng` must be in
@@ -116,7 +116,7 @@ def run(
         raise ParameterError("max_cost", max_cost, "1 (no check) or more")
     moving: Move = SliceMove() if move is None else move
     once = partial(
-        search, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
+        run_once, progress=progress, executor=executor, n_workers=n_workers, return_interrupted=return_interrupted
     )
     result = once(
         posed,
@@ -133,7 +133,7 @@ def run(
         # A separate generator that depends only on the state after the run, hence is the same after a resumption.
         checking = np.random.default_rng(rng.integers(2**63, size=4))
         try:
-            result = checked(
+            result = check_and_repeat(
                 result,
                 posed,
                 moving,

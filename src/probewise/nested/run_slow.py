@@ -1,7 +1,7 @@
 """`run_slow`: few evaluations, for likelihoods that take seconds.
 
 The chains of a nested run spend most evaluations far from the posterior. Here draws from the prior are weighted by a
-small power of the likelihood, a density is fitted to them, more are drawn from it, and the power rises to one as the
+small power of the likelihood, a density is fitted to them, and more are drawn from it. The power rises to one as the
 weights allow (adaptive multiple importance sampling; Cornuet, Marin, Mira & Robert 2012). All draws count at every
 power, as draws from the mixture of all densities so far.
 
@@ -36,13 +36,13 @@ from probewise.nested.importance import (
     weigh_draws,
     with_loss_in_error,
 )
-from probewise.nested.mixture import fit_mixture, single
+from probewise.nested.mixture import fit_mixture, single_student_t
 from probewise.nested.pose import AnyPrior, as_problem
-from probewise.nested.proposal import Proposal, joined
+from probewise.nested.proposal import Proposal, mixture_of_proposals
 from probewise.nested.repartition import repartitioned
 from probewise.nested.result import NestedResult
-from probewise.nested.sampler import least_live, search
-from probewise.nested.space import Space, unbounded
+from probewise.nested.sampler import least_live, run_once
+from probewise.nested.space import Space, unbounded_space_of
 from probewise.nested.weights import n_effective, resampled
 
 _LEAST_CALLS = 5000
@@ -72,7 +72,7 @@ _MUCH, _MOST_FITS = 1.3, 3
 
 
 @dataclass(frozen=True, eq=False)
-class _Explored:
+class _WeightedDraws:
     """Draws about the posterior.
 
     In unbounded coordinates, (n, n_params), with log weights that sum to one, (n,); the least effective sample size of
@@ -144,15 +144,15 @@ def run_slow(
     evaluate = Evaluator(posed, executor=executor, n_parts=n_workers or 1)
     report = progress or (lambda n_calls: None)
     n_params = len(evaluate.names)
-    again = partial(search, rng=rng, executor=executor, n_workers=n_workers, return_interrupted=False)
-    space = unbounded(posed.prior) if n_params else None
+    again = partial(run_once, rng=rng, executor=executor, n_workers=n_workers, return_interrupted=False)
+    space = unbounded_space_of(posed.prior) if n_params else None
     explored = None
     if space is not None:
-        explored = _explore(evaluate, space, max_calls=max_calls // 2, report=report, rng=rng)
+        explored = _draw_at_rising_powers(evaluate, space, max_calls=max_calls // 2, report=report, rng=rng)
     if space is None or explored is None:
         n_live = max(least_live(n_params), _N_LIVE_ALONE)
         alone = again(posed, n_live=n_live, max_calls=max_calls - evaluate.n_calls)
-        return _of_run(alone, alone.log_likelihood, evaluate.n_calls + alone.n_calls)
+        return _weighted_from_run(alone, alone.log_likelihood, evaluate.n_calls + alone.n_calls)
     rows = resampled(np.exp(explored.log_weight), _N_SAMPLES, rng)
     near = repartitioned(posed, space.leave(explored.x[rows])[0])
     n_live = max(least_live(n_params), _N_LIVE)
@@ -160,7 +160,7 @@ def run_slow(
     original = replace(second, log_likelihood=second.log_likelihood - near.prior.log_prior_ratio(second.theta))
     report(evaluate.n_calls + second.n_calls)
     wanted = error if n_params <= _DENSE else max(error, _LEAST_ERROR)
-    found = _importance_sampled(
+    found = _draw_until_error(
         explored, original, evaluate, space, wanted=wanted, max_calls=max_calls - second.n_calls, rng=rng
     )
     n_calls = evaluate.n_calls + second.n_calls
@@ -168,13 +168,13 @@ def run_slow(
     thin = () if n_params <= _DENSE else (_THIN,)
     if found.doubts and not found.inherited:
         warned = replace(second, warnings=(*second.warnings, *thin))
-        return _of_run(warned, original.log_likelihood, n_calls, found.pareto_k)
+        return _weighted_from_run(warned, original.log_likelihood, n_calls, found.pareto_k)
     # Nothing smaller was looked for.
     log_z_error = max(found.log_z_error, wanted)
     return replace(found, n_calls=n_calls, log_z_error=log_z_error, inherited=(*found.inherited, *thin))
 
 
-def _of_run(run: NestedResult, log_likelihood: FloatArray, n_calls: int, k: float = math.inf) -> Weighted:
+def _weighted_from_run(run: NestedResult, log_likelihood: FloatArray, n_calls: int, k: float = math.inf) -> Weighted:
     """Return a nested run's samples and evidence, in place of those of draws with Pareto k `k`."""
     return Weighted(
         run.names,
@@ -190,8 +190,8 @@ def _of_run(run: NestedResult, log_likelihood: FloatArray, n_calls: int, k: floa
     )
 
 
-def _importance_sampled(
-    explored: _Explored,
+def _draw_until_error(
+    explored: _WeightedDraws,
     second: NestedResult,
     evaluate: Evaluator,
     space: Space,
@@ -209,12 +209,12 @@ def _importance_sampled(
     for _ in range(_MOST_FITS):
         mixture = fit_mixture(np.concatenate(known), rng=rng)
         forms = [mixture, mixture.widened(_WIDER)]
-        pilots = [draw(form, held=HeldOut.nothing(), n_draws=250 + 75 * n_params) for form in forms]
+        pilots = [draw(form, held=HeldOut.empty(), n_draws=250 + 75 * n_params) for form in forms]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         share = np.full(2, 1.0 - _FIRST)
         share[first] = _FIRST
-        best = joined([*forms, explored.defensive], [*((1.0 - _DEFENSIVE) * share), _DEFENSIVE])
-        variance = _variance(pilots[first], forms[first], best, space)
+        best = mixture_of_proposals([*forms, explored.defensive], [*((1.0 - _DEFENSIVE) * share), _DEFENSIVE])
+        variance = _variance_of_weights(pilots[first], forms[first], best, space)
         left = max_calls - evaluate.n_calls
         n_draws = int(min(max(1.3 * variance / wanted**2, 500 * n_params), max(left, 100)))
         found = draw(best, held=held, n_draws=n_draws, tail=_TAIL)
@@ -225,7 +225,7 @@ def _importance_sampled(
     return replace(found, inherited=inherited_doubts(found, second))
 
 
-def _variance(pilot: Weighted, drawn: Proposal, best: Proposal, space: Space) -> float:
+def _variance_of_weights(pilot: Weighted, drawn: Proposal, best: Proposal, space: Space) -> float:
     """Estimate the variance of weights of mean one of draws from `best`, from weighted draws from another density."""
     if not len(pilot.theta):
         return math.inf
@@ -234,9 +234,9 @@ def _variance(pilot: Weighted, drawn: Proposal, best: Proposal, space: Space) ->
     return max(len(x) * math.exp(float(logsumexp(log_square))) - 1.0, 0.0)
 
 
-def _explore(
+def _draw_at_rising_powers(
     evaluate: Evaluator, space: Space, *, max_calls: int, report: Callable[[int], None], rng: np.random.Generator
-) -> _Explored | None:
+) -> _WeightedDraws | None:
     """Draw at rising powers of the likelihood until the draws weigh the posterior; None where the limit ends it."""
     n_params = len(evaluate.names)
     n_draws, wanted = 300 + 60 * n_params, 150 + 25 * n_params
@@ -250,9 +250,9 @@ def _explore(
         n_eff = n_effective(log_weight)
         n_last += power >= 1.0
         if n_last and (n_eff >= _ENOUGH * wanted or n_last > _MOST_LAST):
-            kept = kept or [_fitted(draws.x, log_weight, rng)]
-            defensive = joined(kept, [1.0] * len(kept))
-            return _Explored(draws.x, log_weight - float(logsumexp(log_weight)), min(least, n_eff), defensive)
+            kept = kept or [_fit_defensive_mixture(draws.x, log_weight, rng)]
+            defensive = mixture_of_proposals(kept, [1.0] * len(kept))
+            return _WeightedDraws(draws.x, log_weight - float(logsumexp(log_weight)), min(least, n_eff), defensive)
         if evaluate.n_calls + n_draws > max_calls:
             return None
         if n_eff < _DENSE * n_params:
@@ -260,7 +260,7 @@ def _explore(
             draws.add(space.draw(n_draws, rng=rng), None)
             continue
         least = min(least, n_eff)
-        proposal = _fitted(draws.x, log_weight, rng)
+        proposal = _fit_defensive_mixture(draws.x, log_weight, rng)
         if _FROM_POWER <= power < 1.0:
             kept.append(proposal)
         draws.add(proposal.draw(n_draws, rng=rng), proposal)
@@ -286,12 +286,12 @@ class _Draws:
         possible = np.isfinite(log_density)
         if possible.any():
             log_likelihood[possible] = self._evaluate.log_likelihood(theta[possible])
-        added = [_log_q(one, x, log_density) for one in self._sources]
+        added = [_log_source_density(one, x, log_density) for one in self._sources]
         self.x = np.concatenate([self.x, x])
         self._log_density = np.concatenate([self._log_density, log_density])
         self._log_likelihood = np.concatenate([self._log_likelihood, log_likelihood])
         known = np.concatenate([self._log_q, np.array(added).reshape(len(added), len(x)).T])
-        self._log_q = np.column_stack([known, _log_q(source, self.x, self._log_density)])
+        self._log_q = np.column_stack([known, _log_source_density(source, self.x, self._log_density)])
         self._sources.append(source)
         self._size.append(len(x))
 
@@ -315,11 +315,12 @@ class _Draws:
         return math.exp(low), at(low)
 
 
-def _log_q(source: Proposal | None, x: FloatArray, log_density: FloatArray) -> FloatArray:
+def _log_source_density(source: Proposal | None, x: FloatArray, log_density: FloatArray) -> FloatArray:
+    """Log density of a source at draws `x`, (n,); for None that of the prior, `log_density`."""
     return log_density if source is None else source.log_density(x)
 
 
-def _fitted(x: FloatArray, log_weight: FloatArray, rng: np.random.Generator) -> Proposal:
+def _fit_defensive_mixture(x: FloatArray, log_weight: FloatArray, rng: np.random.Generator) -> Proposal:
     """Fit a mixture to weighted draws, and one component wider than all of them."""
     # Weights are cut at their mean times sqrt(n) (Ionides 2008), lest one draw take the fit.
     alive = np.flatnonzero(np.isfinite(log_weight))
@@ -330,5 +331,5 @@ def _fitted(x: FloatArray, log_weight: FloatArray, rng: np.random.Generator) -> 
     x, weight = x[alive[rows]], np.maximum(weight[rows], 1.0 / _MOST_FITTED)
     weight = weight / weight.sum()
     off = x - weight @ x
-    wide = single(weight @ x, _WIDENING**2 * (off * weight[:, None]).T @ off)
-    return joined([fit_mixture(x, weight, rng=rng), wide], [0.75, 0.25])
+    wide = single_student_t(weight @ x, _WIDENING**2 * (off * weight[:, None]).T @ off)
+    return mixture_of_proposals([fit_mixture(x, weight, rng=rng), wide], [0.75, 0.25])

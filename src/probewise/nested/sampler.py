@@ -24,7 +24,7 @@ from probewise._kinds import (
     require_whole,
 )
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested.checkpoint import Dead, Keeper, Live, Origin, Run, settings_of
+from probewise.nested.checkpoint import CheckpointFile, Dead, Live, Origin, Run, settings_of
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import chain_memory
@@ -49,7 +49,7 @@ def least_live(n_params: int) -> int:
     return max(LIVE_PER_PARAM * n_params, 10)
 
 
-def move_at(move: Move, log_volume: float) -> Move:
+def move_at_volume(move: Move, log_volume: float) -> Move:
     """Return draws from the whole prior while more than a twentieth of its volume is left, then the move itself."""
     volume = math.exp(log_volume)
     return move if volume <= _PRIOR_VOLUME else PriorRejection(volume)
@@ -91,7 +91,7 @@ def step(
     return Live(points, Origin.join(known, fresh), log_volume), dead, tally
 
 
-def search(
+def run_once(
     problem: Samplable,
     *,
     rng: np.random.Generator,
@@ -129,21 +129,21 @@ def search(
     rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(plain_state(rng.bit_generator.state))
     if n_params == 0:
-        return _without_parameters(evaluate, n_live, seed_state)
+        return _result_without_parameters(evaluate, n_live, seed_state)
     moving: Move = SliceMove() if move is None else move
     keeper = None
     if checkpoint is not None:
         settings = settings_of(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
-        with contextlib.suppress(OSError):  # `Keeper` reports a folder that cannot be created
+        with contextlib.suppress(OSError):  # `CheckpointFile` reports a folder that cannot be created
             Path(checkpoint).parent.mkdir(parents=True, exist_ok=True)
-        keeper = Keeper(Path(checkpoint), checkpoint_every_s, settings)
+        keeper = CheckpointFile(Path(checkpoint), checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
     now = _first_live_points(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)
-    under_way = _Search(evaluate, rng, n_live, n_replaced, rule, seed_state, keeper, now)
+    under_way = _RunUnderWay(evaluate, rng, n_live, n_replaced, rule, seed_state, keeper, now)
     try:
-        return under_way.to_end(max_calls, progress)
+        return under_way.run_to_end(max_calls, progress)
     except NotConvergedError as error:
         if under_way.now.dead:
             error.partial = under_way.finish("the likelihood failed", f"the likelihood failed: {error}")
@@ -164,7 +164,7 @@ def search(
 
 
 @dataclass
-class _Search:
+class _RunUnderWay:
     """A run of nested sampling under way; `now` is its state after the last whole round."""
 
     evaluate: Evaluator
@@ -173,7 +173,7 @@ class _Search:
     n_replaced: int
     rule: StopRule
     seed_state: str
-    keeper: Keeper | None
+    keeper: CheckpointFile | None
     now: Run
 
     def save(self) -> None:
@@ -188,16 +188,16 @@ class _Search:
         # the generator's seed sequence, which its state does not include.
         self.rng.bit_generator.state = self.now.rng_state
         summing = np.random.default_rng(self.rng.integers(2**63, size=4))
-        return _result(self.evaluate, noted, self.n_live, reason, self.seed_state, summing)
+        return _final_result(self.evaluate, noted, self.n_live, reason, self.seed_state, summing)
 
-    def to_end(self, max_calls: int | None, progress: Callable[[RoundSummary], None] | None) -> NestedResult:
+    def run_to_end(self, max_calls: int | None, progress: Callable[[RoundSummary], None] | None) -> NestedResult:
         """Do rounds until the rule ends them, or the next one might exceed `max_calls` evaluations."""
         while self.now.ended is None:
             # A round can cost twice the last one: the volume halves while points are drawn from the prior.
             if max_calls is not None and self.evaluate.n_calls + 2 * self.now.last_cost > max_calls:
                 reason = f"stopped at {self.evaluate.n_calls} of max_calls = {max_calls} likelihood evaluations"
                 return self.finish(reason, f"{reason}; log Z lacks what a full run would have found")
-            after, state = _round(self.now, self.evaluate, self.n_replaced, self.rng)
+            after, state = _do_round(self.now, self.evaluate, self.n_replaced, self.rng)
             # One assignment, so that an interruption leaves a round either complete or not begun.
             self.now = replace(after, ended=self.rule(state))
             if progress is not None:
@@ -251,10 +251,10 @@ def _require_options(
     require_flag("return_interrupted", return_interrupted)
 
 
-def _round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, RoundSummary]:
+def _do_round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, RoundSummary]:
     """Replace the worst points once and add the dead ones to the evidence; return the new state and its summary."""
     live, moving = now.live, now.moving
-    move = move_at(moving, live.log_volume)
+    move = move_at_volume(moving, live.log_volume)
     chains = move is moving
     fresh, gone, tally = step(live, move, evaluate, n_replaced=n_replaced, rng=rng)
     edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
@@ -336,7 +336,7 @@ def _first_live_points(
     return Run(live, (), move, log_volume, error, (), n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
 
 
-def _result(
+def _final_result(
     evaluate: Evaluator, now: Run, n_live: int, reason: str, seed_state: str, rng: np.random.Generator
 ) -> NestedResult:
     """Let the remaining live points die and compute the result."""
@@ -403,7 +403,7 @@ def _result(
     )
 
 
-def _without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> NestedResult:
+def _result_without_parameters(evaluate: Evaluator, n_live: int, seed_state: str) -> NestedResult:
     """Evaluate the single hypothesis of a problem without free parameters."""
     theta = np.empty((1, 0))
     log_likelihood = evaluate.log_likelihood(theta)

@@ -135,7 +135,7 @@ class _PriorCoordinates:
         return self.coordinates.leave(u)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        if isinstance(self.coordinates, _DrawsItself):
+        if isinstance(self.coordinates, _OwnPriorDraws):
             return self.coordinates.draw(n, rng=rng)
         return self.enter(self.prior.from_unit_cube(rng.random((n, len(self.prior.names)))))
 
@@ -147,7 +147,7 @@ class _HasCoordinates(Protocol):
 
 
 @runtime_checkable
-class _DrawsItself(Protocol):
+class _OwnPriorDraws(Protocol):
     """Coordinates that draw from the prior themselves, because some of them match no parameters."""
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...
@@ -170,7 +170,7 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
     return _UnitCube(prior, tuple(prior.names.index(name) for name in periodic))
 
 
-def unbounded(prior: Prior) -> Space:
+def unbounded_space_of(prior: Prior) -> Space:
     """Choose unbounded coordinates, as fitted densities need them: the prior's own, else normal scores.
 
     Raises

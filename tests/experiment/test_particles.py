@@ -10,15 +10,15 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
-from probewise.experiment.evidence import bridged, redrawn
+from probewise.experiment.evidence import bridged_evidence, importance_resampled
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.particles import (
     Particles,
     _LastReading,
-    _move,
-    _partitioned,
+    _move_by_metropolis,
+    _partition_rows,
     prior_particles,
-    resized,
+    resample_and_move,
     update,
 )
 from probewise.experiment.stopping_rule import information
@@ -173,7 +173,7 @@ def test_a_missing_reading_changes_nothing(small):
 def test_a_bridge_finds_the_evidence_anew(small, lattice, n):
     """Whatever evidence was carried: within five stated errors, and 0.05 for the lattice."""
     posterior = replace(carried(small, steps=n, fall_back=None), log_z=123.0)
-    found = bridged(posterior, problem_of(small, n), rng=rng(5), n_draws=3000)
+    found = bridged_evidence(posterior, problem_of(small, n), rng=rng(5), n_draws=3000)
     assert found.error < 0.1
     assert found.log_z == pytest.approx(by_lattice(small, lattice, n)[0], abs=5 * found.error + 0.05)
 
@@ -186,7 +186,7 @@ def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_bega
     points = posterior.samples(2000, rng=rng(1))
     left = points[:, 0] < mean[0]
     uneven = np.concatenate([points[left], points[~left][: left.sum() // 9]])
-    found = redrawn(uneven, posterior.names, problem, rng=rng(2), n_draws=8000)
+    found = importance_resampled(uneven, posterior.names, problem, rng=rng(2), n_draws=8000)
     assert found.mean()[0] == pytest.approx(mean[0], abs=0.15 * sd[0])
     assert found.log_z == pytest.approx(log_z, abs=5 * found.log_z_error + 0.05)
 
@@ -200,8 +200,8 @@ def test_the_genealogy_tells_when_few_samples_at_the_start_are_ancestors_of_all(
 
 def test_samples_can_be_made_fewer_and_more(small):
     before, problem = particles(small, steps=3, fall_back=None), problem_of(small, 3)
-    fewer = resized(before, 1000, problem, rng=rng(1))
-    more = resized(fewer, 3000, problem, rng=rng(2))
+    fewer = resample_and_move(before, 1000, problem, rng=rng(1))
+    more = resample_and_move(fewer, 3000, problem, rng=rng(2))
     assert [len(p.weighted.theta) for p in (fewer, more)] == [1000, 3000]
     assert len(np.unique(more.weighted.theta, axis=0)) > 2500
     assert more.log_z == before.log_z
@@ -243,9 +243,9 @@ def test_kernels_follow_a_bent_shell():
 
 def test_samples_that_all_descend_from_one_are_moved_as_one_part():
     """Copies of one sample are in one part; a part with hardly any would have no kernels."""
-    alike = _partitioned(np.zeros(40, dtype=np.int64))
+    alike = _partition_rows(np.zeros(40, dtype=np.int64))
     assert [len(part) for part in alike] == [40]
-    halves = _partitioned(np.arange(40))
+    halves = _partition_rows(np.arange(40))
     assert [len(part) for part in halves] == [20, 20]
 
 
@@ -253,7 +253,7 @@ def test_copies_of_one_sample_are_not_moved(small):
     """They are left where they are, and the posterior is marked as strained."""
     problem = small.experiment().problem([Reading(40.0, Pose(50.0, 30.0, 0.0), 1.0)])
     theta = np.repeat(problem.prior.from_unit_cube(np.full((1, len(problem.prior.names)), 0.5)), 60, axis=0)
-    cloud = _LastReading(problem).cloud(theta)
-    moved, moves = _move(cloud, 1.0, _LastReading(problem), np.random.default_rng(1))
+    cloud = _LastReading(problem).evaluate_samples(theta)
+    moved, moves = _move_by_metropolis(cloud, 1.0, _LastReading(problem), np.random.default_rng(1))
     assert moves.accepted == 0.0
     np.testing.assert_array_equal(moved.theta, theta)

@@ -49,7 +49,7 @@ from probewise.inquiry import Readout, prior_entropy
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
 from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
-from probewise.study.concealed import _arm
+from probewise.study.concealed import _arm_in_concealed_world
 from probewise.study.rows import REFERENCE
 from probewise.study.trial import Trial, timed_steps
 
@@ -293,7 +293,7 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     far = outline.far_side
     opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])
     tried = np.concatenate([opposite, [[x, y]]])
-    assert outline.seen_with(tried).tolist() == ([True, False, False] if asked_deg else [True, True, True])
+    assert outline.leaves_no_far_side(tried).tolist() == ([True, False, False] if asked_deg else [True, True, True])
     if asked_deg is None:
         assert far is None
         return
@@ -338,7 +338,9 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     """A step of the light that had moved the circle by 8 mm at a claimed 2.4 mm: two readings more find both."""
     trial = ConcealedTrial("ambient_step", 1, 0, 0.9, 40, 8101)
     experiment = replace(experiment_of(REFERENCE), trust=0.9)
-    steps = [s for s, _ in timed_steps(_arm(trial), experiment, seed=8101, circle=0, max_readings=40)]
+    steps = [
+        s for s, _ in timed_steps(_arm_in_concealed_world(trial), experiment, seed=8101, circle=0, max_readings=40)
+    ]
     known = [step.number for step in steps if step.widest_mm < 4.0 and step.chance_off < 0.01]
     assert known[0] < steps[-1].number
     assert steps[-1].map.label == NAMES

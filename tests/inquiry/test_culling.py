@@ -6,7 +6,7 @@ import pytest
 from probewise.effects import GainDrift
 from probewise.inquiry import Grid
 from probewise.inquiry.culling import CullingBounds
-from probewise.inquiry.forecast import predicted
+from probewise.inquiry.forecast import predict_where_visible
 from probewise.scene import AnyOf, Circle, Ellipse, Field, HypothesisScene, Rectangle, RegularPolygon
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels
 
@@ -36,7 +36,7 @@ def hypotheses(shape, n=40):
 @pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: type(shape).__name__)
 def test_what_is_not_asked_is_what_would_be_answered(shape):
     model, theta = chain(shape), hypotheses(shape)
-    assert predicted(model, theta, PLAN) == pytest.approx(model.predict(theta, PLAN), abs=1e-6)
+    assert predict_where_visible(model, theta, PLAN) == pytest.approx(model.predict(theta, PLAN), abs=1e-6)
 
 
 def test_most_hypotheses_are_not_asked_about_most_places():

@@ -14,7 +14,7 @@ from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
 from probewise.inquiry import Goal, Grid, Prospect, UtilityMap, choose, choose_several, reachable_rows, utility_map
-from probewise.inquiry.forecast import thinned
+from probewise.inquiry.forecast import resampled_hypotheses
 from probewise.nested.importance import Weighted
 
 
@@ -84,7 +84,7 @@ def inquire(
     drawn.flags.writeable = False
     theta, weight = posterior.theta, posterior.weight
     if experiment.trust < 1:  # samples of several kinds: use no more than for one
-        some, share = thinned(weight, experiment.n_particles)
+        some, share = resampled_hypotheses(weight, experiment.n_particles)
         theta, weight = theta[some], share / share.sum()
     prospect = Prospect(
         experiment.forecast,

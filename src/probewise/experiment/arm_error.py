@@ -1,8 +1,8 @@
 """Effect of an error in the arm's geometry on the posterior of the shape.
 
 A geometry fitted to marks has one error that all readings of a run share: the sensor stood elsewhere than commanded. No
-reading of the run shows that error; it moves the whole shape. To first order, for any likelihood, the posterior mean
-of the shape moves by the posterior covariance of its parameters with the slope of the log likelihood by the error. So
+reading of the run shows that error; it moves the whole shape. To first order, for any likelihood, the posterior mean of
+the shape moves by a covariance over the posterior: of its parameters with the log likelihood's slope by the error. So
 the samples at the end of a run suffice, without another inference.
 
 If the log likelihood is quadratic, its slope by the error is a linear function of its slopes by the shape's parameters,
@@ -190,7 +190,7 @@ def _mean_shifts(
         by_shape.append(_slopes_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
-    theta, slope, known = (_centred(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
+    theta, slope, known = (_centred_columns(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
     root = np.sqrt(weight)[:, None]
     coefficients = np.linalg.lstsq(root * known, root * slope, rcond=None)[0]
     out = np.zeros((len(mean), off.shape[2]))
@@ -198,7 +198,8 @@ def _mean_shifts(
     return out
 
 
-def _centred(columns: FloatArray, weight: FloatArray) -> FloatArray:
+def _centred_columns(columns: FloatArray, weight: FloatArray) -> FloatArray:
+    """Subtract the weighted mean of each column, (n_samples, n_columns) with weights (n_samples,)."""
     return columns - weight @ columns
 
 

@@ -37,8 +37,8 @@ _AT_EDGE = 1.0  # spacings of the grid within which a reading is at the edge
 def bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout) -> FloatArray:
     """Return the expected information of a reading about the name alone: the smaller of two estimates.
 
-    Both err upwards. By a Gaussian for each name, names seem to differ whose predictions have a few stragglers; by the
-    cells of the reading, names that agree but have few hypotheses.
+    Both err upwards. The estimate by a Gaussian for each name does so where a few predictions lie far from the others.
+    The estimate by the cells of the reading does so where a name has few hypotheses.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def _bits_by_gaussians(
 def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout) -> FloatArray:
     """Return the information from the distribution of the reading over its cells, of all hypotheses and each name's."""
     given = GivenReading(answers, weight, readout, fine=_CELL)
-    told = entropy_bits(given.mass)
+    told = entropy_bits(given.weight_by_cell)
     for own in each:
         part = float(weight[own].sum())
         told -= part * entropy_bits(given.sum_by_cell(own / part))
@@ -131,10 +131,10 @@ class Outline:
         diameter = float(np.linalg.norm(edge[:, None] - edge, axis=2).max())
         unread = cls(edge, nearest, np.full(len(edge), np.inf), spacing, diameter)
         taken = np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings]).reshape(-1, 2)
-        apart = unread.apart_with(taken).min(axis=1, initial=np.inf)
+        apart = unread.distances_with_reading(taken).min(axis=1, initial=np.inf)
         return cls(edge, nearest, apart, spacing, diameter)
 
-    def apart_with(self, places_mm: FloatArray) -> FloatArray:
+    def distances_with_reading(self, places_mm: FloatArray) -> FloatArray:
         """Return `apart_mm` with one more reading at each of these places, (n_places, 2) -> (n, n_places)."""
         apart = np.linalg.norm(self.edge_mm[:, None] - places_mm, axis=2)
         at_edge = apart.min(axis=0) <= _AT_EDGE * self.spacing_mm
@@ -146,9 +146,9 @@ class Outline:
         farthest = int(self.apart_mm.argmax())
         return int(self.nearest[farthest]) if self.apart_mm[farthest] > _FAR * self.diameter_mm else None
 
-    def seen_with(self, places_mm: FloatArray) -> BoolArray:
+    def leaves_no_far_side(self, places_mm: FloatArray) -> BoolArray:
         """Return whether one more reading at each place leaves no far side, (n_places, 2) -> (n_places,)."""
-        return np.asarray(self.apart_with(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
+        return np.asarray(self.distances_with_reading(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
 
 
 def places_of(prospect: Prospect) -> FloatArray:

@@ -37,7 +37,7 @@ class Bridged:
     n_calls: int
 
 
-def bridged(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int) -> Bridged:
+def bridged_evidence(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int) -> Bridged:
     """Estimate the evidence of a problem.
 
     Parameters
@@ -64,7 +64,7 @@ def bridged(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Gener
         return Bridged(posterior.log_z, max(posterior.log_z_error, _UNKNOWN), 0)  # too few to fit kernels
     found = []
     for own, other in (halves, halves[::-1]):
-        density = _Density.about(posterior.theta[other], rng=rng)
+        density = _KernelDensity.about(posterior.theta[other], rng=rng)
         drawn = density.draw(n_draws // 2, rng=rng)
         log_prior = problem.prior.log_prob(drawn)
         possible = np.isfinite(log_prior)
@@ -75,14 +75,14 @@ def bridged(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Gener
         theta = posterior.theta[own]
         at_samples = problem.prior.log_prob(theta) + posterior.log_likelihood[own] - density.log_density(theta)
         n_distinct = len(np.unique(own))
-        found.append(_bridge(log_ratio, at_samples, n_distinct))
+        found.append(_bridge_estimate(log_ratio, at_samples, n_distinct))
     (one, e1), (other_z, e2) = found
     log_z = float(logsumexp([one, other_z])) - math.log(2.0)
     error = max(0.5 * math.hypot(e1, e2), 0.5 * abs(one - other_z))
     return Bridged(log_z, error, n_draws)
 
 
-def redrawn(
+def importance_resampled(
     points: FloatArray, names: tuple[str, ...], problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
 ) -> Weighted:
     """Sample the posterior by importance sampling from kernels about points.
@@ -94,14 +94,14 @@ def redrawn(
     names
         Names of the parameters.
     problem, rng, n_draws
-        As for `bridged`.
+        As for `bridged_evidence`.
 
     Raises
     ------
     NotConvergedError
         If no draw could have given the readings.
     """
-    density = _Density.about(points, rng=rng)
+    density = _KernelDensity.about(points, rng=rng)
     theta = density.draw(n_draws, rng=rng)
     theta = theta[np.isfinite(problem.prior.log_prob(theta))]
     log_likelihood = problem.log_likelihood(theta) if len(theta) else np.empty(0)
@@ -117,14 +117,14 @@ def redrawn(
 
 
 @dataclass(frozen=True, eq=False)
-class _Density:
+class _KernelDensity:
     """A mixture of kernels with local widths, and some wider ones."""
 
     near: LocalKernels
     far: LocalKernels
 
     @classmethod
-    def about(cls, points: FloatArray, *, rng: np.random.Generator) -> _Density:
+    def about(cls, points: FloatArray, *, rng: np.random.Generator) -> _KernelDensity:
         return cls(LocalKernels.about(points, rng=rng), LocalKernels.about(points, rng=rng, widened=_WIDE))
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -136,7 +136,7 @@ class _Density:
         return np.asarray(np.logaddexp(near + math.log1p(-_OF_WIDE), far + math.log(_OF_WIDE)))
 
 
-def _bridge(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> tuple[float, float]:
+def _bridge_estimate(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> tuple[float, float]:
     """Return the log evidence and its error from log ratios of target to density at draws and samples."""
     n_draws = len(at_draws)
     if not np.isfinite(at_draws).any():
@@ -145,8 +145,8 @@ def _bridge(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> t
     log_z = float(logsumexp(at_draws)) - math.log(n_draws)
     for _ in range(_STEPS):
         # expit weights each point between the two ends of the bridge.
-        up = _log_mean(np.log(np.maximum(expit(at_draws - log_z + lean), 1e-300)))
-        down = _log_mean(np.log(np.maximum(expit(-(at_samples - log_z + lean)), 1e-300)))
+        up = _log_mean_exp(np.log(np.maximum(expit(at_draws - log_z + lean), 1e-300)))
+        down = _log_mean_exp(np.log(np.maximum(expit(-(at_samples - log_z + lean)), 1e-300)))
         step = up - down - lean
         log_z += step
         if abs(step) < _CLOSE:
@@ -159,5 +159,5 @@ def _bridge(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> t
     return log_z, math.sqrt(variance)
 
 
-def _log_mean(log_values: FloatArray) -> float:
+def _log_mean_exp(log_values: FloatArray) -> float:
     return float(logsumexp(log_values)) - math.log(len(log_values))

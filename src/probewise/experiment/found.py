@@ -51,7 +51,7 @@ def found_shape(run: Exploration) -> FoundShape:
     """Summarise the posterior after the last reading: the most probable shape and its parameters."""
     shape, last = run.experiment.shape, run.last
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
-    name = last.likely_shape or _name(shape)
+    name = last.likely_shape or _shape_name(shape)
     if isinstance(shape, AnyOf):
         own = shape.which(theta) == shape.labels.index(name)
         theta, weight = theta[own], weight[own]
@@ -111,7 +111,7 @@ def samples_csv(run: Exploration) -> str:
     return text.getvalue()
 
 
-def _name(shape: Shape) -> str:
+def _shape_name(shape: Shape) -> str:
     if isinstance(shape, RegularPolygon):
         return _POLYGONS.get(shape.n_sides, f"regular polygon of {shape.n_sides} sides")
     return type(shape).__name__.lower()

@@ -43,7 +43,9 @@ class Hidden:
         values = floats(theta, called)
         if values.shape != (len(prior.names),):
             raise ParameterError(called, theta, f"{len(prior.names)} numbers, {', '.join(prior.names)}")
-        for parameter, value, low, high in zip(prior.names, values.tolist(), *_bounds(prior, values), strict=True):
+        for parameter, value, low, high in zip(
+            prior.names, values.tolist(), *_parameter_ranges(prior, values), strict=True
+        ):
             if not low <= value <= high:
                 option = called.partition(" ")[0]
                 raise ParameterError(
@@ -76,10 +78,10 @@ class Hidden:
         known = {**{name: make(field) for name, make in SHAPES.items()}, **members}
         if isinstance(truth, Mapping) and len(truth) == 1 and set(truth) <= set(known):
             ((name, values),) = truth.items()
-            return cls.given(name, known[name], _in_order(known[name].prior.names, values))
+            return cls.given(name, known[name], _theta_by_name(known[name].prior.names, values))
         if isinstance(truth, Mapping) and not set(truth) & set(members[first].prior.names):
             raise ParameterError("truth", truth, f"one shape of {', '.join(known)} with its parameters")
-        return cls.given(first, members[first], _in_order(members[first].prior.names, truth))
+        return cls.given(first, members[first], _theta_by_name(members[first].prior.names, truth))
 
     @property
     def document(self) -> dict[str, str | float]:
@@ -112,7 +114,7 @@ def members_of(shape: Shape) -> dict[str, Shape]:
     return dict(shape.shapes) if isinstance(shape, AnyOf) else {type(shape).__name__.lower(): shape}
 
 
-def _in_order(names: Sequence[str], values: object) -> FloatArray:
+def _theta_by_name(names: Sequence[str], values: object) -> FloatArray:
     """Convert parameters given by name to the shape's order, (n_params,)."""
     if not isinstance(values, Mapping):
         return floats(values, "truth")  # type: ignore[arg-type]
@@ -121,7 +123,7 @@ def _in_order(names: Sequence[str], values: object) -> FloatArray:
     return np.array([require_finite_number(f"truth[{name!r}]", values[name]) for name in names])
 
 
-def _bounds(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _parameter_ranges(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return the range of each parameter given the others, all (n_params,)."""
     own = np.eye(len(theta), dtype=np.bool_)
     with np.errstate(invalid="ignore"):  # of a ratio of infinities

@@ -117,22 +117,24 @@ def recording_of(
     names = sorted({name for reading in readings for name in reading.covariates})
     zeros = np.zeros(n, dtype=np.int64)
     plan = Plan(
-        x_mm=_column(readings, lambda r: r.pose.x_mm),
-        y_mm=_column(readings, lambda r: r.pose.y_mm),
-        orientation_rad=_column(readings, lambda r: r.pose.orientation_rad),
-        time_s=_column(readings, lambda r: r.time_s),
+        x_mm=_covariate_column(readings, lambda r: r.pose.x_mm),
+        y_mm=_covariate_column(readings, lambda r: r.pose.y_mm),
+        orientation_rad=_covariate_column(readings, lambda r: r.pose.orientation_rad),
+        time_s=_covariate_column(readings, lambda r: r.time_s),
         scan=zeros,
         scan_names=(PATTERN,),
         pattern=zeros,
         pattern_names=(PATTERN,),
         patterns={} if patterns is None else patterns,
-        covariates={name: _column(readings, lambda r, name=name: r.covariates.get(name, math.nan)) for name in names},
+        covariates={
+            name: _covariate_column(readings, lambda r, name=name: r.covariates.get(name, math.nan)) for name in names
+        },
         instrumentation=Instrumentation() if instrumentation is None else instrumentation,
     )
-    return Recording(plan, _column(readings, lambda r: r.value), source)
+    return Recording(plan, _covariate_column(readings, lambda r: r.value), source)
 
 
-def _column(readings: Sequence[Reading], value: Any) -> FloatArray:
+def _covariate_column(readings: Sequence[Reading], value: Any) -> FloatArray:
     return np.array([value(reading) for reading in readings], dtype=np.float64)
 
 
@@ -148,12 +150,12 @@ def read_journal(path: str | Path) -> Journal:
     *lines, tail = raw.split(b"\n")
     if not lines:
         raise FileError(path, "no whole first line", f'a journal, whose first line says "format": "{FORMAT}"', row=1)
-    settings = _parse(path, lines[0], 1)
+    settings = _parse_line(path, lines[0], 1)
     if settings.get("format") != FORMAT:
         raise FileError(
             path, f"format {shown(settings.get('format'))}", f'"{FORMAT}", the version this package writes', row=1
         )
-    entries = [_entry(path, _parse(path, line, row), row) for row, line in enumerate(lines[1:], start=2)]
+    entries = [_parse_entry(path, _parse_line(path, line, row), row) for row, line in enumerate(lines[1:], start=2)]
     for row, entry in enumerate(entries, start=2):
         if entry.index != row - 1:
             raise FileError(
@@ -162,8 +164,8 @@ def read_journal(path: str | Path) -> Journal:
     notes: list[str] = []
     n_torn = 0
     if tail:
-        head = _first_part(tail)
-        saved = _salvaged(path, head, len(entries) + 1)
+        head = _part_up_to_reading(tail)
+        saved = _entry_without_summary(path, head, len(entries) + 1)
         if saved is None:
             head = b""
             notes.append(f"the last line of {path} was torn while it was written and is dropped")
@@ -174,14 +176,14 @@ def read_journal(path: str | Path) -> Journal:
     return Journal(str(path), settings, tuple(entries), tuple(notes), len(raw) - n_torn, n_torn)
 
 
-def _parse(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
+def _parse_line(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
     value = json_of(path, line, "one JSON object a line", row=row)
     if not isinstance(value, dict):
         raise FileError(path, f"a JSON {type(value).__name__}", "one JSON object a line", row=row)
     return value
 
 
-def _first_part(tail: bytes) -> bytes:
+def _part_up_to_reading(tail: bytes) -> bytes:
     """Return the part of an incomplete line up to its reading, without the summary."""
     mark = _SUMMARY_KEY.encode()
     head = tail.split(mark)[0]
@@ -189,31 +191,31 @@ def _first_part(tail: bytes) -> bytes:
     return head[: len(head) - torn]
 
 
-def _salvaged(path: str | Path, head: bytes, index: int) -> Entry | None:
+def _entry_without_summary(path: str | Path, head: bytes, index: int) -> Entry | None:
     """Recover the reading from the first part of a line; None if the reading itself is incomplete."""
     # The covariates come last and are an object: only a complete first part becomes valid with one more brace.
     try:
-        entry = _entry(path, _parse(path, head + b"}", index + 1), index + 1)
+        entry = _parse_entry(path, _parse_line(path, head + b"}", index + 1), index + 1)
     except FileError:
         return None
     return entry if entry.index == index else None
 
 
-def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
+def _parse_entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
     """Parse a measurement from a line's JSON object; errors name the row and the column."""
     column = "index"
     try:
         index = line["index"]
         column = "pose"
-        pose = _pose(line["pose"])
+        pose = _parse_pose(line["pose"])
         column = "time_s"
-        time_s = _number(line["time_s"])
+        time_s = _parse_number(line["time_s"])
         column = "reading"
         value = _or_nan(line["reading"])
         column = "covariates"
         covariates = {str(name): _or_nan(number) for name, number in line["covariates"].items()}
         column = "belief"
-        summary = _summary(line["belief"]) if "belief" in line else None
+        summary = _parse_summary(line["belief"]) if "belief" in line else None
     except KeyError as error:
         raise FileError(path, f"{error} is missing", "a line as explore writes it", row=row, column=column) from error
     except (TypeError, ValueError, AttributeError) as error:
@@ -221,9 +223,9 @@ def _entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
     return Entry(index, Reading(value, pose, time_s, covariates), summary)
 
 
-def _summary(line: Mapping[str, Any]) -> PosteriorSummary:
-    mean, sd = ({name: _number(value) for name, value in line[key].items()} for key in ("mean", "sd"))
-    return PosteriorSummary(mean, sd, _number(line["bits"]), _pose(line["next"]))
+def _parse_summary(line: Mapping[str, Any]) -> PosteriorSummary:
+    mean, sd = ({name: _parse_number(value) for name, value in line[key].items()} for key in ("mean", "sd"))
+    return PosteriorSummary(mean, sd, _parse_number(line["bits"]), _parse_pose(line["next"]))
 
 
 def _or_null(value: float) -> float | None:
@@ -232,23 +234,23 @@ def _or_null(value: float) -> float | None:
 
 
 def _or_nan(value: float | None) -> float:
-    return math.nan if value is None else _number(value)
+    return math.nan if value is None else _parse_number(value)
 
 
-def _number(value: object) -> float:
+def _parse_number(value: object) -> float:
     """Return a JSON number as a float; texts are refused."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{shown(value)} is no number")
     return float(value)
 
 
-def _pose(line: Mapping[str, Any]) -> Pose:
+def _parse_pose(line: Mapping[str, Any]) -> Pose:
     height_mm = line.get("height_mm")
-    place = (_number(line["x_mm"]), _number(line["y_mm"]), _number(line["orientation_rad"]))
-    return Pose(*place, None if height_mm is None else _number(height_mm))
+    place = (_parse_number(line["x_mm"]), _parse_number(line["y_mm"]), _parse_number(line["orientation_rad"]))
+    return Pose(*place, None if height_mm is None else _parse_number(height_mm))
 
 
-def _pose_line(pose: Pose) -> dict[str, float]:
+def _pose_as_json(pose: Pose) -> dict[str, float]:
     """Convert a pose to JSON; with the height only if it was chosen."""
     return {name: value for name, value in dataclasses.asdict(pose).items() if value is not None}
 
@@ -258,7 +260,7 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
 
     Version, arm and the name of the sensor's file may differ.
     """
-    there, here = _flat(journal.settings), _flat(json.loads(json.dumps(settings)))
+    there, here = _flattened_settings(journal.settings), _flattened_settings(json.loads(json.dumps(settings)))
     different = sorted(name for name in {*there, *here} - _FREE if there.get(name) != here.get(name))
     if different:
         had = "; ".join(f"{name} {shown(there.get(name))} there, {shown(here.get(name))} here" for name in different)
@@ -270,7 +272,7 @@ def require_same_settings(journal: Journal, settings: Mapping[str, Any]) -> None
         )
 
 
-def _flat(settings: Mapping[str, Any]) -> dict[str, Any]:
+def _flattened_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Flatten nested settings, such as "options.repeats", so that a message shows only the differences."""
     out: dict[str, Any] = {}
     for name, value in settings.items():
@@ -301,7 +303,7 @@ class JournalWriter:
         """
         path = Path(path)
         if path.exists():
-            raise _exists(path)
+            raise _error_of_existing_file(path)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -309,7 +311,7 @@ class JournalWriter:
         with contextlib.ExitStack() as stack:
             stack.enter_context(locked(path))
             if path.exists():
-                raise _exists(path)
+                raise _error_of_existing_file(path)
             write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
             file = stack.enter_context(open(path, "ab", buffering=0))
             return cls(path, file, stack.pop_all())
@@ -343,12 +345,12 @@ class JournalWriter:
         """Write a reading, the first part of its line."""
         line = {
             "index": index,
-            "pose": _pose_line(reading.pose),
+            "pose": _pose_as_json(reading.pose),
             "time_s": reading.time_s,
             "reading": _or_null(reading.value),
             "covariates": {name: _or_null(value) for name, value in reading.covariates.items()},
         }
-        self._write(json.dumps(line, allow_nan=False)[:-1])
+        self._write_to_disk(json.dumps(line, allow_nan=False)[:-1])
 
     def summary(self, summary: PosteriorSummary) -> None:
         """Write the summary after that reading, the rest of its line."""
@@ -356,9 +358,9 @@ class JournalWriter:
             "mean": dict(summary.mean),
             "sd": dict(summary.sd),
             "bits": summary.bits,
-            "next": _pose_line(summary.next_pose),
+            "next": _pose_as_json(summary.next_pose),
         }
-        self._write(_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n")
+        self._write_to_disk(_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n")
 
     def close(self) -> None:
         """Close the file and let other processes write to it."""
@@ -372,7 +374,7 @@ class JournalWriter:
     ) -> None:
         self.close()
 
-    def _write(self, text: str) -> None:
+    def _write_to_disk(self, text: str) -> None:
         left = memoryview(text.encode())
         try:
             while left:
@@ -382,5 +384,5 @@ class JournalWriter:
             raise FileError(self.path, f"cannot be written ({error.strerror})", "a file on a disk with room") from error
 
 
-def _exists(path: Path) -> FileError:
+def _error_of_existing_file(path: Path) -> FileError:
     return FileError(path, "a file of this name exists", "a new file; or resume the journal that is there")

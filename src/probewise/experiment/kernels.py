@@ -47,7 +47,7 @@ class LocalKernels:
         scale = np.maximum(points.std(axis=0), 1e-300)
         rows = rng.permutation(n_samples)[: min(most, (n_samples + 1) // 2)]
         n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
-        near = _nearest(away / scale, rows, n_near)
+        near = _nearest_points(away / scale, rows, n_near)
         centre = away[rows]
         spread = away[near] - away[near].mean(axis=1, keepdims=True)
         overall = np.atleast_2d(np.cov(points, rowvar=False))
@@ -68,7 +68,7 @@ class LocalKernels:
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         pull = np.einsum("kij,kj->ki", precision, centre)
         constant = -0.5 * (np.einsum("ki,ki->k", pull, centre) + log_det + n_params * math.log(2 * math.pi))
-        upper = _upper(n_params)
+        upper = _upper_triangle(n_params)
         product = -np.where(upper[0] == upper[1], 0.5, 1.0) * precision[:, upper[0], upper[1]]
         form = np.concatenate([constant[:, None], pull, product], axis=1).T
         return cls(origin, centre, root, form)
@@ -81,7 +81,7 @@ class LocalKernels:
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the natural log of the density, (n, n_params) -> (n,)."""
-        upper = _upper(points.shape[1])
+        upper = _upper_triangle(points.shape[1])
         out = np.empty(len(points))
         for start in range(0, len(points), _BLOCK):
             away = points[start : start + _BLOCK] - self.origin
@@ -94,7 +94,7 @@ class LocalKernels:
         return out - math.log(len(self.centre))
 
 
-def _nearest(points: FloatArray, rows: IntArray, n: int) -> IntArray:
+def _nearest_points(points: FloatArray, rows: IntArray, n: int) -> IntArray:
     """Return the `n` nearest points to each of some points, themselves included, (n_rows, n)."""
     if len(points) > _FEW:
         return np.asarray(cKDTree(points).query(points[rows], k=n)[1].reshape(len(rows), n))
@@ -104,6 +104,6 @@ def _nearest(points: FloatArray, rows: IntArray, n: int) -> IntArray:
 
 
 @cache
-def _upper(n_params: int) -> tuple[IntArray, IntArray]:
+def _upper_triangle(n_params: int) -> tuple[IntArray, IntArray]:
     """Return the indices of the upper triangle of a matrix."""
     return np.triu_indices(n_params)

@@ -92,7 +92,7 @@ def kinds_of(
     quick, chain = models
     ways = Counter(rival.name for rival in rivals)
     kinds = []
-    for part in _parts(shape, sensor_prior, prior):
+    for part in _parts_of_shape(shape, sensor_prior, prior):
         own, log_prior = part.prior, math.log(part.share)
         plain = log_prior + math.log(trust)
         whole, model = _with_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
@@ -131,7 +131,7 @@ def _with_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) 
 
 
 @dataclass(frozen=True, eq=False)
-class _Part:
+class _ShapePart:
     """One shape: its prior with the sensor's, its prior probability, and the columns of its parameters.
 
     `number` is its index in the set, None for a single shape; `n_sensor` the number of columns before the shape's.
@@ -167,16 +167,16 @@ class _Part:
         return _RestrictedModel(whole, (*self.prior.names, *more), columns, others)
 
 
-def _parts(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_Part]:
+def _parts_of_shape(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_ShapePart]:
     """List the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
     if not isinstance(shape, AnyOf):
-        return [_Part("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
+        return [_ShapePart("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
     parts = []
     for k, (name, member) in enumerate(shape.shapes.items()):
         columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns[k]])
         own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
-        parts.append(_Part(name, shape.weights[k], own, prior, columns, k, n_sensor))
+        parts.append(_ShapePart(name, shape.weights[k], own, prior, columns, k, n_sensor))
     return parts
 
 

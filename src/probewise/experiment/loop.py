@@ -126,7 +126,7 @@ def step(
         carried = experiment.learning.updated(state.posterior, problem.recording, rng=rng)
     wary = carried.wary
     posterior = wary.joined(rng=rng)
-    if experiment.trust < 1 and _is_known(experiment, posterior, None, "", rng)[0]:
+    if experiment.trust < 1 and _stopping_rule_met(experiment, posterior, None, "", rng)[0]:
         carried = experiment.learning.reconsidered(carried, problem.recording, rng=rng)
         wary = carried.wary
         posterior = wary.joined(rng=rng)
@@ -143,14 +143,14 @@ def step(
     drawn = experiment.learning.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
     likely = max(shapes, key=shapes.__getitem__, default="")
 
-    def arms() -> ArmError | None:
+    def error_of_arm() -> ArmError | None:
         if experiment.fitted_arm is None:
             return None
         of = (experiment, experiment.fitted_arm, readings, posterior, wary)
         return arm_error(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
 
-    arm = arms() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
-    known, off = _is_known(experiment, posterior, arm, likely, rng)
+    arm = error_of_arm() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
+    known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
     prospect, utilities = inquire(
         experiment, posterior, drawn, field, at=reading, goal=_remaining_goal(experiment, arm)
     )
@@ -159,8 +159,8 @@ def step(
         utilities, asks = utility_near_end(experiment, wary, prospect, utilities, readings, rng=rng, known=known)
         asks = asks and (max_readings is None or len(readings) < max_readings)
     if arm is None and (utilities.flat or (max_readings is not None and len(readings) >= max_readings)):
-        arm = arms()
-        known, off = _is_known(experiment, posterior, arm, likely, rng)
+        arm = error_of_arm()
+        known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
     reason = stop_reason(experiment, sd, known and not asks, p_value, utilities, len(readings), max_readings, arm_sd)
     pose, *planned = state.planned or next_poses(experiment, prospect, utilities, rng=rng)
@@ -199,7 +199,7 @@ def _remaining_goal(experiment: Experiment, arm: ArmError | None) -> Goal | None
     return dataclasses.replace(goal, sd=math.sqrt(left)) if left > 0 else None
 
 
-def _is_known(
+def _stopping_rule_met(
     experiment: Experiment, posterior: Weighted, arm: ArmError | None, likely: str, rng: np.random.Generator
 ) -> tuple[bool, float]:
     """Return whether a posterior meets the stopping rule, arm included, and the chance that a length is off."""
@@ -324,7 +324,7 @@ def _steps(
     first = _rng_of(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
     state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
-    with _writer(path, before, settings) as writer:
+    with _journal_writer(path, before, settings) as writer:
         stopped = False
         while not stopped:
             number = len(state.readings) + 1
@@ -343,7 +343,7 @@ def _steps(
                 max_readings=max_readings,
             )
             if writer is not None and (entry is None or entry.summary is None):
-                writer.summary(_summary(info, state))
+                writer.summary(_journal_summary(info, state))
             if entry is not None:
                 info = dataclasses.replace(info, replayed=True)
                 # The journal's pose is used, even if another machine's arithmetic would choose another.
@@ -363,7 +363,7 @@ def _require_readable(experiment: Experiment, reading: Reading) -> None:
         raise LinkError(f"what the instrument returned is beyond the sensor: {error}") from error
 
 
-def _writer(
+def _journal_writer(
     path: Path | None, before: Journal | None, settings: Mapping[str, Any]
 ) -> contextlib.AbstractContextManager[JournalWriter | None]:
     if before is not None:
@@ -384,7 +384,7 @@ def _rng_of(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
 
 
-def _summary(info: Step, state: ExplorationState) -> PosteriorSummary:
+def _journal_summary(info: Step, state: ExplorationState) -> PosteriorSummary:
     known = [(n, float(m), float(s)) for n, m, s in zip(info.names, info.mean, info.sd, strict=True) if np.isfinite(m)]
     known += [(name, mean, sd) for name, (mean, sd) in info.sensor.items()]
     return PosteriorSummary({n: m for n, m, _ in known}, {n: s for n, _, s in known}, info.bits, state.next_pose)

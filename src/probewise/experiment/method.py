@@ -76,13 +76,13 @@ class SequentialMonteCarlo:
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.updated`."""
-        return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._solved(rng))
+        return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._nested_solver(rng))
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.reconsidered`."""
-        return reconsidered(posterior, recording, self.n_particles, rng=rng, from_scratch=self._solved(rng))
+        return reconsidered(posterior, recording, self.n_particles, rng=rng, from_scratch=self._nested_solver(rng))
 
-    def _solved(self, rng: np.random.Generator) -> Callable[[SensorProblem], NestedResult]:
+    def _nested_solver(self, rng: np.random.Generator) -> Callable[[SensorProblem], NestedResult]:
         return lambda problem: from_scratch(problem, self.n_live, rng)
 
     def drawn(

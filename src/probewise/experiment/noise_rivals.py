@@ -35,7 +35,7 @@ _LEAST = -1e300  # log of a probability of zero, for differences
 _FREE = 2  # readings that determine the lattice
 
 
-def _mean_over(nodes: list[FloatArray]) -> FloatArray:
+def _log_mean_over_nodes(nodes: list[FloatArray]) -> FloatArray:
     """Return the log of the mean over equally weighted nodes of equal shape; called too often for scipy's version."""
     stacked = np.stack(nodes)
     most = np.maximum(stacked.max(axis=0), _LEAST)
@@ -65,7 +65,7 @@ class OutlierLaw:
         for share, size in zip(self.shares, self.sizes, strict=True):
             wide = _log_density_if_wide(readings, predicted, self.sd * size, self.step)
             nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
-        return _mean_over(nodes)
+        return _log_mean_over_nodes(nodes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class LostReadingLaw:
         within = (readings >= low) & (readings <= high)
         anywhere = np.where(within, math.log((self.step or 1.0) / (high - low)), -np.inf)
         lost = logsumexp(np.broadcast_arrays(exactly, to_black, anywhere), axis=0) - math.log(3.0)
-        return _mean_over(
+        return _log_mean_over_nodes(
             [np.logaddexp(kept + math.log1p(-share), lost + math.log(share)).sum(axis=1) for share in _SHARES.tolist()]
         )
 
@@ -114,7 +114,7 @@ class CorrelatedLaw:
             sd = self.sd * math.sqrt(1.0 - rho**2)
             later = _log_density_of_each(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
             nodes.append(first + later.sum(axis=1))
-        return _mean_over(nodes)
+        return _log_mean_over_nodes(nodes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +131,7 @@ class SignalDependentLaw:
         """See `Likelihood.log_prob`."""
         u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
         seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
-        return _mean_over(
+        return _log_mean_over_nodes(
             [
                 _log_density_of_each(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(axis=1)
                 for ratio in SignalDependentNoise().prior.from_unit_cube(u)[:, 0].tolist()
@@ -159,16 +159,17 @@ class FlickerLaw:
             phases = [
                 _log_density_if_wide(readings, predicted + amplitude * sine, sd, self.step) for sine in sines.tolist()
             ]
-            nodes.append(_mean_over(phases).sum(axis=1))
-        return _mean_over(nodes)
+            nodes.append(_log_mean_over_nodes(phases).sum(axis=1))
+        return _log_mean_over_nodes(nodes)
 
 
 @dataclass(frozen=True, eq=False)
 class LatticeLaw:
     """Likelihood with coarser rounding than declared; without a lattice, the same as the declared noise.
 
-    Three values or more show their lattice. Of readings that should not be rounded at all, two values that recur do,
-    and one value that recurs shows that there is one, of a step to be marginalised over.
+    A lattice is the set of multiples of the coarser step. Three different values or more determine it. If the declared
+    noise is not rounded, two values that recur determine it too. One value that recurs shows that there is a lattice;
+    its step is then marginalised over.
     """
 
     sd: float
@@ -177,13 +178,15 @@ class LatticeLaw:
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """See `Likelihood.log_prob`."""
         least = max(_COARSE * self.sd, 1.5 * self.step)
-        steps, n_free = self._steps(readings)
-        nodes = [self._rounded_to(coarse, n_free, readings, predicted) for coarse in steps if coarse > least]
+        steps, n_free = self._possible_steps(readings)
+        nodes = [
+            self._log_prob_if_rounded_to(coarse, n_free, readings, predicted) for coarse in steps if coarse > least
+        ]
         if not nodes:
             return np.asarray(_log_density_of_each(readings, predicted, self.sd, self.step).sum(axis=1))
-        return _mean_over(nodes)
+        return _log_mean_over_nodes(nodes)
 
-    def _steps(self, readings: FloatArray) -> tuple[list[float], int]:
+    def _possible_steps(self, readings: FloatArray) -> tuple[list[float], int]:
         """Return possible steps of a lattice, equally weighted, and how many readings determine it."""
         values = np.unique(readings)
         recur = not self.step and len(values) < len(readings)
@@ -193,7 +196,9 @@ class LatticeLaw:
             return [float(values[1] - values[0])], _FREE
         return [lattice_step(readings)], _FREE
 
-    def _rounded_to(self, coarse: float, n_free: int, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    def _log_prob_if_rounded_to(
+        self, coarse: float, n_free: int, readings: FloatArray, predicted: FloatArray
+    ) -> FloatArray:
         fine = self.step or _EXACT * self.sd
         surprise = (len(readings) - n_free) * math.log(coarse / fine)
         density = _log_density_of_each(readings, predicted, self.sd, coarse) - math.log(coarse)

@@ -84,7 +84,7 @@ class NestedSampling:
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """See `Method.updated`: nested sampling anew, once for each kind of hypotheses."""
         found = tuple(
-            self._sampled_anew(had, kind, recording, rng)
+            self._sample_by_nested_sampling(had, kind, recording, rng)
             for kind, had in zip(previous.kinds, previous.particles, strict=True)
         )
         now = replace(previous, particles=found)
@@ -109,7 +109,7 @@ class NestedSampling:
                 drawn.append(kind.placed(moved, rng))
         return np.concatenate(drawn)
 
-    def _sampled_anew(
+    def _sample_by_nested_sampling(
         self, had: Particles, kind: HypothesisKind, recording: Recording, rng: np.random.Generator
     ) -> Particles:
         """Sample one kind by nested sampling; its evidence is zero if none of its hypotheses is possible."""
@@ -125,11 +125,11 @@ class NestedSampling:
             )
         except NotConvergedError:  # no hypothesis of this kind could have given the readings
             return replace(had, weighted=replace(had.weighted, log_z=-math.inf, log_z_error=math.inf))
-        found = _weighted(result, had.weighted.n_calls + result.n_calls)
+        found = _weighted_samples_of(result, had.weighted.n_calls + result.n_calls)
         return Particles(found, np.arange(len(found.theta)))
 
 
-def _weighted(result: NestedResult, n_calls: int) -> Weighted:
+def _weighted_samples_of(result: NestedResult, n_calls: int) -> Weighted:
     """Return the weighted samples of a run, with the number of evaluations so far."""
     return Weighted(
         result.names,
@@ -237,7 +237,7 @@ def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
             f"{black.size} readings over black and {white.size} over white",
             "two or more of each, far from any edge: repeated readings over a black and over a white sheet",
         )
-    return _naive_of(black, white, scale_of(sensor.instrumentation).step)
+    return _naive_from_readings(black, white, scale_of(sensor.instrumentation).step)
 
 
 def levels_in(world: World, scale: LegoScale, *, rng: np.random.Generator, n_each: int = _N_EACH) -> Naive:
@@ -251,10 +251,10 @@ def levels_in(world: World, scale: LegoScale, *, rng: np.random.Generator, n_eac
         )
         for albedo in (0.0, 1.0)
     )
-    return _naive_of(black, white, scale.step)
+    return _naive_from_readings(black, white, scale.step)
 
 
-def _naive_of(black: FloatArray, white: FloatArray, step: float | None) -> Naive:
+def _naive_from_readings(black: FloatArray, white: FloatArray, step: float | None) -> Naive:
     """Estimate the naive model from readings over black and over white."""
     return Naive.estimated(black, white, sd_floor=_least_sd(abs(float(white.mean() - black.mean())), step))
 

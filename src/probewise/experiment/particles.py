@@ -1,7 +1,7 @@
 """Sequential Monte Carlo: reweight samples after each reading, and resample and move them when needed.
 
-Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweights the samples; if the effective sample size
-falls below half, the reading's likelihood is tempered, and at each temperature the samples are resampled and moved by
+Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweights the samples. If the effective sample size
+falls below half, the reading's likelihood is tempered. At each temperature the samples are resampled and moved by
 Metropolis-Hastings steps on all readings so far. The evidence is the product of the mean weights. Thousands of samples
 represent what a long search has excluded. The error of the evidence is estimated from the genealogy: if few initial
 samples are ancestors of the current ones, another start would have given another evidence (Lee & Whiteley 2018).
@@ -162,7 +162,7 @@ def update(
         reading, the evidence is zero and the samples are unchanged.
     """
     last = _LastReading(problem)
-    previous = replace(previous, log_z_limit=previous.log_z_limit + last.perfect)
+    previous = replace(previous, log_z_limit=previous.log_z_limit + last.perfect_log_likelihood)
     before = previous.weighted
     n = len(before.theta)
     effort = THOROUGH if effort is None else effort
@@ -173,21 +173,21 @@ def update(
     strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
     if last.misfit_nats(predicted) > _SURPRISED:
         if fall_back is not None:
-            return _from_scratch(fall_back(), n, last, n, rng)
+            return _particles_from_run(fall_back(), n, last, n, rng)
         strained = True
-    now = _Cloud(before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods(predicted))
+    now = _EvaluatedSamples(before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods(predicted))
     log_weight, base = before.log_weight, before.log_likelihood
     log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
     while True:
-        all_at_once = n_effective(_reweighed(log_weight, now.after, base))
+        all_at_once = n_effective(_updated_log_weights(log_weight, now.after, base))
         if all_at_once == 0.0:
             if fall_back is not None:
-                return _from_scratch(fall_back(), n, last, n_calls, rng)
+                return _particles_from_run(fall_back(), n, last, n_calls, rng)
             return replace(previous, weighted=replace(before, log_z=-math.inf, log_z_error=math.inf), strained=True)
         given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
         strained |= given_up and all_at_once < least
         share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
-        weighed = _reweighed(log_weight, now.at(share), base)
+        weighed = _updated_log_weights(log_weight, now.at(share), base)
         gained = float(logsumexp(weighed))
         log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
         n_eff = n_effective(log_weight)
@@ -195,11 +195,13 @@ def update(
         if share == 1.0 and n_eff >= least:
             break
         rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
-        now, moves = _move(now.take(rows), share, last, rng, _partitioned(rows) if fall_back is None else None, effort)
+        now, moves = _move_by_metropolis(
+            now.take(rows), share, last, rng, _partition_rows(rows) if fall_back is None else None, effort
+        )
         n_calls, n_resampled, ancestor = n_calls + moves.n_calls, n_resampled + 1, ancestor[rows]
         if moves.accepted < _STIFF:
             if fall_back is not None:
-                return _from_scratch(fall_back(), n, last, n_calls, rng)
+                return _particles_from_run(fall_back(), n, last, n_calls, rng)
             strained = True
         base, log_weight = now.at(share), np.full(n, -math.log(n))
         if share == 1.0:
@@ -230,7 +232,7 @@ def update(
     )
 
 
-def resized(
+def resample_and_move(
     particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: MoveEffort | None = None
 ) -> Particles:
     """Resample to another number of samples, and move them apart.
@@ -241,28 +243,30 @@ def resized(
     if n == len(had.theta) or had.log_z == -math.inf:
         return particles
     rows = resampled(had.weight, n, rng)
-    start = _Cloud(had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1)))
+    start = _EvaluatedSamples(
+        had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1))
+    )
     moved, moves = (
-        _move(start, 1.0, _LastReading(problem), rng, effort=effort)
+        _move_by_metropolis(start, 1.0, _LastReading(problem), rng, effort=effort)
         if len(problem.recording)
-        else (start, _Moves(0.0, 0))
+        else (start, _MoveCounts(0.0, 0))
     )
     found = replace(_equally_weighted(moved, had), n_calls=had.n_calls + moves.n_calls)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
 
 
-def sampled(
+def particles_from_posterior(
     found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: MoveEffort | None = None
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     last = _LastReading(problem)
-    cloud = last.cloud(found.theta[resampled(found.weight, n, rng)])
-    moved, moves = _move(cloud, 1.0, last, rng, effort=effort)
+    cloud = last.evaluate_samples(found.theta[resampled(found.weight, n, rng)])
+    moved, moves = _move_by_metropolis(cloud, 1.0, last, rng, effort=effort)
     drawn = replace(_equally_weighted(moved, found), n_calls=found.n_calls + n + moves.n_calls)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 
 
-def _equally_weighted(cloud: _Cloud, of: Weighted) -> Weighted:
+def _equally_weighted(cloud: _EvaluatedSamples, of: Weighted) -> Weighted:
     n = len(cloud.theta)
     even = np.full(n, -math.log(n))
     return replace(
@@ -271,7 +275,7 @@ def _equally_weighted(cloud: _Cloud, of: Weighted) -> Weighted:
 
 
 @dataclass(frozen=True, eq=False)
-class _Cloud:
+class _EvaluatedSamples:
     """Samples with their log prior, and log likelihood without and with the last reading."""
 
     theta: FloatArray
@@ -283,12 +287,12 @@ class _Cloud:
         """Return the log likelihood with the last reading's raised to a power `share`."""
         return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
 
-    def take(self, rows: IntArray) -> _Cloud:
-        return _Cloud(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
+    def take(self, rows: IntArray) -> _EvaluatedSamples:
+        return _EvaluatedSamples(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
 
-    def put(self, rows: BoolArray, other: _Cloud) -> _Cloud:
-        """Replace rows by those of another cloud."""
-        return _Cloud(
+    def put(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
+        """Overwrite rows with the samples of `other`, in the same order."""
+        return _EvaluatedSamples(
             np.where(rows[:, None], other.theta, self.theta),
             np.where(rows, other.log_prior, self.log_prior),
             np.where(rows, other.before, self.before),
@@ -308,10 +312,10 @@ class _LastReading:
         if not recording.usable[-1]:
             return 0.0
         best = scores(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
-        return float(self.perfect - best)
+        return float(self.perfect_log_likelihood - best)
 
     @property
-    def perfect(self) -> float:
+    def perfect_log_likelihood(self) -> float:
         """Log likelihood of the last reading under a perfect prediction; zero if it is missing."""
         recording = self.problem.recording
         reading = recording.readings[-1:]
@@ -322,15 +326,15 @@ class _LastReading:
         usable = self.problem.recording.usable
         earlier = usable.copy()
         earlier[-1] = False
-        return self._score(predicted, earlier), self._score(predicted, usable)
+        return self._log_likelihood_of_rows(predicted, earlier), self._log_likelihood_of_rows(predicted, usable)
 
-    def _score(self, predicted: FloatArray, rows: BoolArray) -> FloatArray:
+    def _log_likelihood_of_rows(self, predicted: FloatArray, rows: BoolArray) -> FloatArray:
         """Return the log likelihood of these readings; zero for none."""
         if not rows.any():
             return np.zeros(len(predicted))
         return scores(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
 
-    def cloud(self, theta: FloatArray) -> _Cloud:
+    def evaluate_samples(self, theta: FloatArray) -> _EvaluatedSamples:
         """Evaluate samples; the model is not evaluated outside the prior."""
         problem = self.problem
         log_prior = problem.prior.log_prob(theta)
@@ -339,23 +343,25 @@ class _LastReading:
         if possible.any():
             predicted = problem.model.predict(theta[possible], problem.recording.plan)
             before[possible], after[possible] = self.log_likelihoods(predicted)
-        return _Cloud(theta, log_prior, before, after)
+        return _EvaluatedSamples(theta, log_prior, before, after)
 
 
 @dataclass(frozen=True)
-class _Moves:
+class _MoveCounts:
+    """Mean number of accepted steps per sample, and number of likelihood evaluations."""
+
     accepted: float
     n_calls: int
 
 
-def _move(
-    start: _Cloud,
+def _move_by_metropolis(
+    start: _EvaluatedSamples,
     share: float,
     last: _LastReading,
     rng: np.random.Generator,
     parts: Sequence[IntArray] | None = None,
     effort: MoveEffort | None = None,
-) -> tuple[_Cloud, _Moves]:
+) -> tuple[_EvaluatedSamples, _MoveCounts]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
     A round is a proposal from kernels fitted to samples, then one along the difference of two of them (ter Braak 2006):
@@ -364,17 +370,17 @@ def _move(
     """
     n, n_params = start.theta.shape
     if len(np.unique(start.theta[:, 0])) <= 2 * n_params:  # too few distinct samples to fit kernels
-        return start, _Moves(0.0, 0)
+        return start, _MoveCounts(0.0, 0)
     parts = [np.arange(n)] if parts is None else parts
     effort = THOROUGH if effort is None else effort
     kernels = [LocalKernels.about(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
     now, accepted, n_calls = start, 0.0, 0
     for _ in range(_MOST_ROUNDS):
-        for propose in (_from_kernels, _along_differences):
+        for propose in (_propose_from_kernels, _propose_along_differences):
             theta, log_ratio = np.empty_like(now.theta), np.empty(n)
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
-            proposed = last.cloud(theta)
+            proposed = last.evaluate_samples(theta)
             odds = proposed.log_prior + proposed.at(share) - now.log_prior - now.at(share) + log_ratio
             taken = np.log(rng.random(n)) < odds
             now = now.put(taken, proposed)
@@ -382,16 +388,18 @@ def _move(
             accepted += float(taken.mean())
         if accepted >= effort.steps_per_sample:
             break
-    return now, _Moves(accepted, n_calls)
+    return now, _MoveCounts(accepted, n_calls)
 
 
-def _from_kernels(theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def _propose_from_kernels(
+    theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
     """Propose from the kernels, independent of the current samples; also return the log ratio of densities."""
     proposed = kernels.draw(len(theta), rng=rng)
     return proposed, kernels.log_density(theta) - kernels.log_density(proposed)
 
 
-def _along_differences(
+def _propose_along_differences(
     theta: FloatArray, kernels: LocalKernels, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Propose steps along the difference of two other samples, scaled by a factor over two orders of magnitude."""
@@ -401,30 +409,32 @@ def _along_differences(
     return theta + length * (theta[one] - theta[other]), np.zeros(n)
 
 
-def _partitioned(rows: IntArray) -> list[IntArray]:
+def _partition_rows(rows: IntArray) -> list[IntArray]:
     """Partition resampled `rows` with copies of a sample together; one part if others would be too small."""
     parts = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
 
-def _next_power(log_weight: FloatArray, base: FloatArray, now: _Cloud, share: float, enough: float) -> float:
+def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, share: float, enough: float) -> float:
     """Return the largest power of the last reading's likelihood with enough effective samples, by bisection."""
     low, high = share, 1.0
     for _ in range(30):
         middle = 0.5 * (low + high)
         low, high = (
-            (middle, high) if n_effective(_reweighed(log_weight, now.at(middle), base)) >= enough else (low, middle)
+            (middle, high)
+            if n_effective(_updated_log_weights(log_weight, now.at(middle), base)) >= enough
+            else (low, middle)
         )
     return max(low, share + 1e-6)
 
 
-def _reweighed(log_weight: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray:
+def _updated_log_weights(log_weight: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray:
     """Return weights updated for new likelihoods; excluded samples remain excluded."""
     alive = np.isfinite(log_weight)
     return np.asarray(np.where(alive, log_weight + after - np.where(alive, before, 0.0), -np.inf))
 
 
-def _from_scratch(
+def _particles_from_run(
     run: NestedResult,
     n: int,
     last: _LastReading,
@@ -432,8 +442,8 @@ def _from_scratch(
     rng: np.random.Generator,
 ) -> Particles:
     """Resample as many samples as before from a run, and move them apart."""
-    found = last.cloud(run.samples(n, rng=rng))
-    moved, moves = _move(found, 1.0, last, rng)
+    found = last.evaluate_samples(run.samples(n, rng=rng))
+    moved, moves = _move_by_metropolis(found, 1.0, last, rng)
     even = np.full(n, -math.log(n))
     calls = n_calls + run.n_calls + n + moves.n_calls
     drawn = Weighted(

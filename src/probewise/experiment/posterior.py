@@ -17,7 +17,7 @@ from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.experiment.evidence import Bridged, bridged, redrawn
+from probewise.experiment.evidence import Bridged, bridged_evidence, importance_resampled
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import (
     BRIEF,
@@ -25,9 +25,9 @@ from probewise.experiment.particles import (
     THOROUGH,
     MoveEffort,
     Particles,
+    particles_from_posterior,
     prior_particles,
-    resized,
-    sampled,
+    resample_and_move,
     update,
 )
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
@@ -81,7 +81,7 @@ class Posterior:
     @property
     def probability(self) -> FloatArray:
         """Probability of each kind, (n_kinds,), summing to one."""
-        return _normalised(self.log_odds)
+        return _normalised_odds(self.log_odds)
 
     @property
     def log_z(self) -> float:
@@ -142,7 +142,7 @@ class Posterior:
 def prior_posterior(kinds: Sequence[HypothesisKind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
     """Draw samples of every kind's prior."""
     shares = [math.exp(kind.log_prior) for kind in kinds]
-    sizes = [_size(kind, p, n_particles) for kind, p in zip(kinds, shares, strict=True)]
+    sizes = [_n_samples_of_kind(kind, p, n_particles) for kind, p in zip(kinds, shares, strict=True)]
     drawn = (prior_particles(kind.prior, n, rng=rng) for kind, n in zip(kinds, sizes, strict=True))
     return Posterior(tuple(kinds), tuple(drawn))
 
@@ -181,10 +181,10 @@ def updated(
         found = update(only, problem, rng=rng, fall_back=lambda: from_scratch(problem))
         return replace(previous, particles=(found,))
     doubted = any(kind.left_out for kind in previous.kinds)
-    particles = _with_last_reading(previous, problems, STEADY if doubted else THOROUGH, rng)
+    particles = _update_every_kind(previous, problems, STEADY if doubted else THOROUGH, rng)
     now = replace(previous, particles=tuple(particles))
     if doubted:
-        particles = _sampled_from_others(now, problems, n_particles, rng)
+        particles = _with_rivals_sampled_again(now, problems, n_particles, rng)
         now = replace(previous, particles=tuple(particles))
         particles = [
             _with_bridged_evidence(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
@@ -199,15 +199,15 @@ def updated(
     if not np.isfinite(now.log_odds).any():
         raise NotConvergedError("no hypothesis of any kind could have given these readings")
     for k, p in enumerate(now.probability):
-        had, n = len(particles[k].ancestor), _size(now.kinds[k], p, n_particles)
+        had, n = len(particles[k].ancestor), _n_samples_of_kind(now.kinds[k], p, n_particles)
         if n > had or p < _IMPROBABLE:
-            particles[k] = resized(
+            particles[k] = resample_and_move(
                 particles[k], n, problems[k], rng=rng, effort=BRIEF if now.kinds[k].left_out else None
             )
     return replace(now, particles=tuple(particles))
 
 
-def _with_last_reading(
+def _update_every_kind(
     previous: Posterior, problems: list[SensorProblem], usual: MoveEffort, rng: np.random.Generator
 ) -> list[Particles]:
     """Update every kind with the last reading, improbable rivals with less effort."""
@@ -233,21 +233,23 @@ def reconsidered(
     are hopelessly improbable.
     """
     problems = [kind.problem(recording) for kind in posterior.kinds]
-    now = replace(posterior, particles=tuple(_sampled_from_others(posterior, problems, n_particles, rng, each=True)))
+    now = replace(
+        posterior, particles=tuple(_with_rivals_sampled_again(posterior, problems, n_particles, rng, each=True))
+    )
     return _reestimated_where_doubtful(
         now, problems, min(n_particles, _MOST_DRAWS), from_scratch, rng, most_off=_OFF_AT_THE_END
     )
 
 
-def _sampled_from_others(
+def _with_rivals_sampled_again(
     now: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator, *, each: bool = False
 ) -> list[Particles]:
-    """Sample a rival anew, from what other kinds believe, where its own samples may have lost the truth.
+    """Sample rivals anew from the samples of other kinds, where their own samples may have lost the truth.
 
-    They may have after a reading that few of them were near. And a rival whose effect can be negligible cannot be much
-    less likely than the plain model: if it claims to be, its samples are elsewhere. With `each`, every rival, but for
-    those whose samples were found in this way and have followed the readings since. A rival that no fit brought near
-    the best kind is fitted again when the readings since could have made good what it lacked.
+    That can happen after a reading that few of them predict. And a rival whose effect can be negligible cannot be much
+    less likely than the plain model: if it seems to be, its samples are in the wrong place. With `each`, every rival is
+    sampled anew, except those whose samples were found in this way and have followed the readings since. A rival whose
+    fits all came out far below the best kind is fitted again when the readings since could have made up the difference.
     """
     particles, log_odds = list(now.particles), now.log_odds
     for k, (kind, problem) in enumerate(zip(now.kinds, problems, strict=True)):
@@ -264,8 +266,8 @@ def _sampled_from_others(
         best = max(alike, key=lambda j: log_odds[j])
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
         donors += [own.weighted] if own.log_z > hopeless else []
-        n = max(len(own.ancestor), _size(kind, 0.0, n_particles))
-        anew = _from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
+        n = max(len(own.ancestor), _n_samples_of_kind(kind, 0.0, n_particles))
+        anew = _sample_from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
         found = anew.samples
         if anew.promised < hopeless:
             particles[k] = replace(own, log_z_limit=max(anew.promised, own.log_z) + _RULED_OUT)
@@ -275,21 +277,23 @@ def _sampled_from_others(
             continue
         if found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
             continue
-        fresh = sampled(found, n, problem, rng=rng, effort=BRIEF)
-        fresh = _restarted(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS)))
+        fresh = particles_from_posterior(found, n, problem, rng=rng, effort=BRIEF)
+        fresh = _as_independent_start(
+            fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS))
+        )
         particles[k] = replace(fresh, refitted=found.n_eff >= _WELL_FOUND, strained=found.n_eff < _LEAST_FOUND)
     return particles
 
 
 @dataclass(frozen=True, eq=False)
-class _FromOthers:
+class _SamplesFromOthers:
     """Samples of a kind, None if none was found, and the log evidence that fits promise, infinite without fits."""
 
     samples: Weighted | None
     promised: float = math.inf
 
 
-def _from_others(
+def _sample_from_others(
     kind: HypothesisKind,
     problem: SensorProblem,
     own: Weighted,
@@ -297,7 +301,7 @@ def _from_others(
     n: int,
     hopeless: float,
     rng: np.random.Generator,
-) -> _FromOthers:
+) -> _SamplesFromOthers:
     """Sample a kind's posterior with what others believe: refits of it, or the samples themselves for a noise law.
 
     No samples are drawn if the fits promise less than `hopeless`.
@@ -305,13 +309,13 @@ def _from_others(
     noise = declared_noise(kind.likelihood)
     if kind.effect is not None:
         if noise is None:
-            return _FromOthers(None)
+            return _SamplesFromOthers(None)
         sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
         found = fit_kind(kind, problem, donors, noise_sd=sd, rng=rng)
         if found.highest_log_z < hopeless:
-            return _FromOthers(None, found.highest_log_z)
+            return _SamplesFromOthers(None, found.highest_log_z)
         with_own = own.log_z > hopeless
-        return _FromOthers(
+        return _SamplesFromOthers(
             sampled_about_fits(found, problem, own, n_draws=2 * n, with_own=with_own, rng=rng), found.highest_log_z
         )
     n_own = len(kind.prior.names)
@@ -319,19 +323,21 @@ def _from_others(
     if own.log_z > hopeless:
         points.append(own.samples(n // 2, rng=rng))
     try:
-        return _FromOthers(redrawn(np.concatenate(points), kind.prior.names, problem, rng=rng, n_draws=n))
+        return _SamplesFromOthers(
+            importance_resampled(np.concatenate(points), kind.prior.names, problem, rng=rng, n_draws=n)
+        )
     except NotConvergedError:
-        return _FromOthers(None)
+        return _SamplesFromOthers(None)
 
 
-def _size(kind: HypothesisKind, probability: float, n_particles: int) -> int:
-    """Return the number of samples of a kind by its probability; improbable rivals have few."""
+def _n_samples_of_kind(kind: HypothesisKind, probability: float, n_particles: int) -> int:
+    """Return the number of samples of a kind: fewer the less probable it is, and for rivals at most half."""
     if kind.left_out:
         return max(n_particles // next(part for least, part in _SUSPECTED if probability >= least), 100)
     return n_particles if probability >= _IMPROBABLE else n_particles // _FEWER
 
 
-def _normalised(log_odds: FloatArray) -> FloatArray:
+def _normalised_odds(log_odds: FloatArray) -> FloatArray:
     """Return probabilities in the ratios of exp(log_odds), summing to one."""
     share = np.exp(log_odds - log_odds.max())
     return np.asarray(share / share.sum())
@@ -350,7 +356,7 @@ def _reestimated_where_doubtful(
     particles, settled = list(now.particles), set[int]()
     while (k := _most_doubtful(now, settled, most_off)) is not None:
         settled.add(k)
-        particles[k] = _reestimated(particles[k], problems[k], n, from_scratch, rng)
+        particles[k] = _reestimate_kind(particles[k], problems[k], n, from_scratch, rng)
         now = replace(now, particles=tuple(particles))
     return now
 
@@ -386,15 +392,15 @@ def _probability_of_log_odds(odds: float) -> float:
     return float(expit(odds))
 
 
-def _reestimated(
+def _reestimate_kind(
     particles: Particles, problem: SensorProblem, n: int, from_scratch: FromScratch, rng: np.random.Generator
 ) -> Particles:
     """Re-estimate a kind's evidence from all readings, and its samples too if they may be incomplete."""
     had = particles.weighted
     if not particles.strained:
-        found = bridged(had, problem, rng=rng, n_draws=n)
+        found = bridged_evidence(had, problem, rng=rng, n_draws=n)
         if abs(found.log_z - had.log_z) < _TOLD_APART:
-            return _restarted(particles, found)
+            return _as_independent_start(particles, found)
     try:
         run = from_scratch(problem)
     except NotConvergedError:  # no hypothesis of this kind could have given the readings
@@ -402,21 +408,25 @@ def _reestimated(
     points = run.samples(n // 2, rng=rng)
     if particles.log_z > -math.inf:
         points = np.concatenate([points, had.samples(n // 2, rng=rng)])
-    drawn = redrawn(points, problem.prior.names, problem, rng=rng, n_draws=2 * n)
-    fresh = sampled(replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng)
-    fresh = _restarted(fresh, bridged(fresh.weighted, problem, rng=rng, n_draws=n))
+    drawn = importance_resampled(points, problem.prior.names, problem, rng=rng, n_draws=2 * n)
+    fresh = particles_from_posterior(
+        replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng
+    )
+    fresh = _as_independent_start(fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=n))
     return replace(fresh, weighted=replace(fresh.weighted, run=run), refitted=True)
 
 
 def _with_bridged_evidence(particles: Particles, problem: SensorProblem, rng: np.random.Generator) -> Particles:
     """Re-estimate the evidence of hurried samples by bridge sampling; the moved samples themselves are valid."""
-    found = bridged(particles.weighted, problem, rng=rng, n_draws=min(2 * len(particles.ancestor), _DRAWS))
+    found = bridged_evidence(particles.weighted, problem, rng=rng, n_draws=min(2 * len(particles.ancestor), _DRAWS))
     return (
-        replace(_restarted(particles, found), strained=particles.strained) if math.isfinite(found.log_z) else particles
+        replace(_as_independent_start(particles, found), strained=particles.strained)
+        if math.isfinite(found.log_z)
+        else particles
     )
 
 
-def _restarted(particles: Particles, found: Bridged) -> Particles:
+def _as_independent_start(particles: Particles, found: Bridged) -> Particles:
     """Return the samples with a new evidence as an independent start."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)

@@ -138,7 +138,7 @@ def fit_kind(
         # A start that no step has moved keeps its slopes.
         if len(moved):
             at_theta = readings[usable] - noise_sd * residual[moved]
-            own = _slopes(predict, theta[moved], at_theta, _NUDGE * scale) / noise_sd
+            own = _prediction_slopes(predict, theta[moved], at_theta, _NUDGE * scale) / noise_sd
             normal[moved] = own.transpose(0, 2, 1) @ own + ridge
             slope[moved] = own
         pull = (slope.transpose(0, 2, 1) @ residual[:, :, None])[:, :, 0]
@@ -161,7 +161,7 @@ def fit_kind(
     return Fits(theta, np.where(np.isfinite(normal).all(axis=(1, 2)), score, -np.inf), normal)
 
 
-def _slopes(
+def _prediction_slopes(
     predict: Callable[[FloatArray], FloatArray], theta: FloatArray, at_theta: FloatArray, nudge: FloatArray
 ) -> FloatArray:
     """Differentiate predictions at theta, (n, n_points), by forward differences: (n, n_points, n_params)."""
@@ -203,7 +203,7 @@ def sampled_about_fits(
     """
     n_params = found.theta.shape[1]
     best = found.good[np.argsort(-found.log_z)][:_KEPT]
-    densities = [LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse(found.precision[best]))]
+    densities = [LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse_precision(found.precision[best]))]
     if with_own and len(rows := _resampled_rows(own, n_params, rng)):
         densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
     first = _importance_sampled(own, problem, densities, n_draws // 2, rng)
@@ -215,7 +215,7 @@ def sampled_about_fits(
     return _importance_sampled(first, problem, [near, near, far, *densities], n_draws, rng) or first
 
 
-def _inverse(precision: FloatArray) -> FloatArray:
+def _inverse_precision(precision: FloatArray) -> FloatArray:
     """Invert (n, n_params, n_params), whose parameters may differ by many powers of ten, positive definite."""
     size = 1.0 / np.sqrt(np.diagonal(precision, axis1=1, axis2=2))
     both = size[:, :, None] * size[:, None, :]

@@ -108,9 +108,9 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     shown = {**ON_FIELD, **WITH_CARDS} if cards_of(model) else ON_FIELD
     for name, wide in shown.items():
         reach_mm = math.hypot(*field_mm) if wide else _SCAN_MM
-        effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _there_and_back(reach_mm)))
+        effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _plan_there_and_back(reach_mm)))
         if effect is not None and name not in carried:
-            found += [Rival(name, effect=way) for way in _ways(effect, field_mm)]
+            found += [Rival(name, effect=way) for way in _effects_in_run(effect, field_mm)]
     noise = declared_noise(likelihood)
     if noise is not None:
         laws = noise_laws(*noise, (model.levels.i_min, model.levels.i_max))
@@ -118,8 +118,8 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     return tuple(found)
 
 
-def _ways(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[EffectWithSentence]:
-    """List the ways in which an effect may act in a run: one that changes with time does so at the run's own pace."""
+def _effects_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[EffectWithSentence]:
+    """List the forms in which an effect may act in a run: one that changes with time does so at the run's own pace."""
     if effect.name in OF_MOTION:
         return [Shown(effect, field_mm), FromRest(Shown(effect, field_mm))]
     if effect.name not in _IN_TIME:
@@ -160,8 +160,8 @@ def declared_noise(likelihood: Likelihood) -> tuple[float, float] | None:
     return None
 
 
-def _there_and_back(length_mm: float) -> Plan:
-    """Lay out one scan there and back over the time that a run may take: what scales are taken from."""
+def _plan_there_and_back(length_mm: float) -> Plan:
+    """Lay out one scan of `length_mm` there and back, over the time that a run may take; it sets effects' scales."""
     n = 2 * int(_DURATION_S / EACH_S / 2) + 1
     zeros = np.zeros(n, dtype=np.int64)
     return Plan(

@@ -73,7 +73,7 @@ def sensor_prior(sensor: FittedSensor, change: Change | None = None) -> Product:
     """
     change = Change() if change is None else change
     n = sensor.n_gaussians
-    moments = _moments(footprint_of(sensor.samples[:, : 6 * n], n))
+    moments = _footprint_moments(footprint_of(sensor.samples[:, : 6 * n], n))
     mean, sd = sensor.mean(), sensor.sd()
     level = change.level * abs(mean["I_max"] - mean["I_min"])
     return Product(
@@ -88,7 +88,7 @@ def sensor_prior(sensor: FittedSensor, change: Change | None = None) -> Product:
     )
 
 
-def _moments(footprint: Footprint) -> Mapping[str, FloatArray]:
+def _footprint_moments(footprint: Footprint) -> Mapping[str, FloatArray]:
     """Return mean and sd of whole footprints along the sensor's axes, (n_samples,) each."""
     weight = footprint.weight[:, 0]
     u, v = (weight * footprint.u_mm[:, 0]).sum(axis=1), (weight * footprint.v_mm[:, 0]).sum(axis=1)

@@ -54,8 +54,8 @@ def utility_near_end(
 ) -> tuple[UtilityMap, bool]:
     """Return the map of the utility over designs for all kinds, or the given one far from the end.
 
-    `known` says whether the posterior meets the stopping rule. The second value returned says whether the run has to
-    take another reading even so.
+    `known` says whether the posterior meets the stopping rule. The second value returned is True if the run has to take
+    another reading all the same, on the far side of the shape.
 
     Candidates are the designs with the largest information, those at edges and centres of probable shapes and on the
     far side, earlier places, and some random ones.
@@ -69,36 +69,42 @@ def utility_near_end(
         return utilities, False
     outline = Outline.of(prospect, experiment.shape.region(_mean_shape(experiment, prospect)), readings)
     far = () if outline is None or outline.far_side is None else (outline.far_side,)
-    rows = np.union1d(_candidates(experiment, prospect, utilities, theta, readings, rng), far).astype(np.int64)
-    plan = Pace.of(readings).on(_plan(prospect, rows, readings[-1]))
+    rows = np.union1d(_candidate_designs(experiment, prospect, utilities, theta, readings, rng), far).astype(np.int64)
+    plan = Pace.of(readings).on(_plan_of_candidates(prospect, rows, readings[-1]))
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
     names = np.array([kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own])
-    seen = np.ones(len(rows), dtype=np.bool_) if outline is None else outline.seen_with(places_of(prospect)[rows])
+    seen = (
+        np.ones(len(rows), dtype=np.bool_) if outline is None else outline.leaves_no_far_side(places_of(prospect)[rows])
+    )
     if known and not far:
         utility = bits_of_names(weight, answers, names, prospect.readout)
-        return _map(prospect, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
+        return _map_of_candidates(prospect, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
     utility = _expected_bits(weight, answers, prospect)
     if known:
         # The far side first: it has to be read in any case, and tells something about the names too.
         there = seen if seen.any() else np.isin(rows, far)
-        return _map(prospect, utilities, rows, np.where(there, np.maximum(utility, _LEAST_BITS), 0.0), FAR_SIDE), True
+        return _map_of_candidates(
+            prospect, utilities, rows, np.where(there, np.maximum(utility, _LEAST_BITS), 0.0), FAR_SIDE
+        ), True
     order = np.argsort(-utility, kind="stable")
     best = np.unique(np.concatenate([order[:_ENDING], order[seen[order]][:_ENDING]]))
     chance = _probability_of_knowing(
         lengths, weight, answers[:, best], prospect, goal.sd, OFF_SDS * experiment.stop_sd_mm
     )
     if chance.max() < _LEAST_CHANCE:
-        return _map(prospect, utilities, rows, utility, _LABEL), False
+        return _map_of_candidates(prospect, utilities, rows, utility, _LABEL), False
     # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
     ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_of_names(
         weight, answers[:, best], names, prospect.readout
     )
-    return _map(prospect, utilities, rows[best], ends, _ENDS), False
+    return _map_of_candidates(prospect, utilities, rows[best], ends, _ENDS), False
 
 
-def _map(prospect: Prospect, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str) -> UtilityMap:
+def _map_of_candidates(
+    prospect: Prospect, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str
+) -> UtilityMap:
     """Return the map of the utility of some available designs, (n,)."""
     values = np.zeros(len(prospect.designs))
     values[prospect.rows[rows]] = utility
@@ -134,7 +140,7 @@ def _draw_hypotheses(
     return theta, np.concatenate(lengths), share / share.sum()
 
 
-def _candidates(
+def _candidate_designs(
     experiment: Experiment,
     prospect: Prospect,
     utilities: UtilityMap,
@@ -162,7 +168,7 @@ def _candidates(
     return np.unique(np.concatenate([best, nearest, rng.integers(len(there), size=_ANYWHERE)]))
 
 
-def _plan(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
+def _plan_of_candidates(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
     """Return a plan with each candidate as a scan from the arm's current place, with its own direction and time."""
     n = len(rows)
     at = prospect.rows[rows]
@@ -179,7 +185,7 @@ def _expected_bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) 
     given = GivenReading(answers, weight, prospect.readout)
     middle = np.array([0.5 * float(answers.min() + answers.max())])
     of_noise = float(entropy_bits(prospect.readout.probability(middle, fine=1.0))[0])
-    return np.maximum(entropy_bits(given.mass) - of_noise, 0.0)
+    return np.maximum(entropy_bits(given.weight_by_cell) - of_noise, 0.0)
 
 
 def _probability_of_knowing(
@@ -189,8 +195,8 @@ def _probability_of_knowing(
     away = lengths - weight @ lengths
     given = GivenReading(answers, weight, prospect.readout)
     out = np.empty(answers.shape[1])
-    for design, mass in enumerate(given.mass):
-        joint = given.joint(design)
+    for design, mass in enumerate(given.weight_by_cell):
+        joint = given.weight_by_hypothesis(design)
         ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
         for length in away.T:
             mean = length @ joint / mass

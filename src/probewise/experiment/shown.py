@@ -26,7 +26,7 @@ _SMALLEST = 4.0
 
 @dataclass(frozen=True, eq=False)
 class Shown(WrappedEffect[Any]):
-    """An effect whose prior leaves out the sizes that a run on a field of this width and height cannot show."""
+    """An effect whose prior excludes sizes too small to show in a run on a field of this width and height, mm."""
 
     effect: NamedEffect[Any]
     field_mm: tuple[float, float]
@@ -43,9 +43,11 @@ class Shown(WrappedEffect[Any]):
             return Product({own.size: size, "x": x, "y": y, "r": own.radius})
         if not isinstance(own, Product):
             return own
-        return Product({name: self._marginal(name, marginal) for name, marginal in own.marginals.items()})
+        return Product(
+            {name: self._marginal_of_shown_sizes(name, marginal) for name, marginal in own.marginals.items()}
+        )
 
-    def _marginal(self, name: str, marginal: Any) -> Any:
+    def _marginal_of_shown_sizes(self, name: str, marginal: Any) -> Any:
         if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
             return replace(marginal, smallest=_SMALLEST)
         return self.within_run.get(name, marginal)

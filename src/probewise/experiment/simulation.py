@@ -244,13 +244,13 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
         samples = [sensor.samples[:, sensor.names.index(name)] for name in names]
         if estimated and all(own.std() > 0 for own in samples):
             acting = FromRest(cast(EffectWithSentence, effect)) if effect.name in OF_MOTION else effect
-            effects.append(Estimated(acting, values, tuple(map(_known_to, samples))))
+            effects.append(Estimated(acting, values, tuple(map(_marginal_of_samples, samples))))
         else:
             effects.append(Known(effect, values))
     return Chain(sensor.mixture(), levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)
 
 
-def _known_to(samples: FloatArray) -> Marginal:
+def _marginal_of_samples(samples: FloatArray) -> Marginal:
     """Return what is known of a parameter, from its posterior samples, (n_samples,); what is positive stays so."""
     if (samples > 0).all():
         log = np.log(samples)

@@ -131,7 +131,7 @@ class Step(ShowsItself):
     def summary(self) -> str:
         """Return a one-line summary of the reading and the posterior."""
         believed = ", ".join(
-            f"{name} {mean:.{_decimals(name)}f} ± {sd:.{_decimals(name)}f}"
+            f"{name} {mean:.{_n_decimals(name)}f} ± {sd:.{_n_decimals(name)}f}"
             for name, mean, sd in zip(self.names, self.mean, self.sd, strict=True)
             if np.isfinite(mean)
         )
@@ -262,18 +262,18 @@ class Exploration(ShowsItself):
             f"fit          p = {last.p_value:.2g} (how often a right hypothesis fits no better)",
         ]
         if self.hidden is not None:
-            lay = ", ".join(f"{name} {value:.{_decimals(name)}f}" for name, value in self.hidden.parameters.items())
+            lay = ", ".join(f"{name} {value:.{_n_decimals(name)}f}" for name, value in self.hidden.parameters.items())
             lines.append(f"hidden       {self.hidden.name}: {lay}")
         lines += [f"{label:<12} p = {probability:.3f}" for label, probability in last.shapes.items()]
         width = max(9, *(len(name) for name in (*last.names, *last.sensor)))
         lines += [
-            f"{name:<{width}}  {mean:.{1 + _decimals(name)}f} ± {sd:.{1 + _decimals(name)}f}"
+            f"{name:<{width}}  {mean:.{1 + _n_decimals(name)}f} ± {sd:.{1 + _n_decimals(name)}f}"
             for name, mean, sd in zip(last.names, last.mean, self.sd, strict=True)
             if np.isfinite(mean)
         ]
         if self.arm is not None:
             own = ", ".join(
-                f"{name} {sd:.{1 + _decimals(name)}f}"
+                f"{name} {sd:.{1 + _n_decimals(name)}f}"
                 for name, mean, sd in zip(last.names, last.mean, self.arm.sd, strict=True)
                 if np.isfinite(mean) and name != "shape"
             )
@@ -282,7 +282,7 @@ class Exploration(ShowsItself):
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.notes)])
 
 
-def _decimals(name: str) -> int:
+def _n_decimals(name: str) -> int:
     """Return the number of decimals of a parameter by its unit: as many for 1 mrad as for 0.1 mm."""
     return 3 if name.endswith("_rad") else 1
 

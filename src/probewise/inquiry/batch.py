@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.inquiry.choice import choose
-from probewise.inquiry.forecast import thinned
+from probewise.inquiry.forecast import resampled_hypotheses
 from probewise.inquiry.prospect import Prospect
 
 _OUTCOMES = 16  # simulated outcomes of the readings chosen so far
@@ -40,20 +40,20 @@ def choose_several(prospect: Prospect, n: int, *, rng: np.random.Generator) -> t
         raise ParameterError("n", n, "1 or more")
     everywhere = np.ones(len(prospect.rows), dtype=np.bool_)
     chosen = [choose(prospect.information(prospect.weight), everywhere, rng=rng)]
-    rows, share = thinned(prospect.weight, _FEW)
+    rows, share = resampled_hypotheses(prospect.weight, _FEW)
     few = replace(prospect, theta=prospect.theta[rows], weight=share / share.sum())
     weights = [few.weight] * _OUTCOMES
     for _ in range(n - 1):
-        weights = _after_simulated(few, chosen[-1], weights, rng)
+        weights = _weights_after_simulated(few, chosen[-1], weights, rng)
         gain = np.mean([few.information(weight) for weight in weights], axis=0)
         chosen.append(choose(gain, everywhere, rng=rng))
     return tuple(int(prospect.rows[row]) for row in chosen)
 
 
-def _after_simulated(
+def _weights_after_simulated(
     prospect: Prospect, row: int, weights: list[FloatArray], rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Simulate an outcome of one design for each posterior, and update the posterior."""
+    """Simulate an outcome of design `row` under each posterior, and return the weights of each updated by it."""
     readout = prospect.readout
     level = prospect.forecast.predict(prospect.theta, prospect.plan.take(prospect.rows[[row]]))[:, 0]
     sd = readout.noise_sd / np.sqrt(prospect.designs.n_repeats[prospect.rows[row]])

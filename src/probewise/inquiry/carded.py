@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.forecast import Forecast, PredictiveDistributions, by_level, thinned
+from probewise.inquiry.forecast import Forecast, PredictiveDistributions, resampled_hypotheses, weight_by_level
 from probewise.recordings.plan import Plan
 from probewise.scene.cards import Card, CardedScene, seen_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -98,7 +98,7 @@ class CardedForecast:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """See `Forecast.predict`."""
-        return CardedModel(self.chain, _AsModel(self.base)).predict(theta, plan)
+        return CardedModel(self.chain, _ForecastAsModel(self.base)).predict(theta, plan)
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
@@ -110,13 +110,13 @@ class CardedForecast:
         near = np.flatnonzero(sum(share[0] for share in covered) > _SHOWS)
         if not near.size:
             return base
-        asked, share = thinned(weight, _MOST_ASKED)
+        asked, share = resampled_hypotheses(weight, _MOST_ASKED)
         answers = model.predict(theta[asked], there.take(near))
         return _CardedPredictive(base, asked, share / weight[asked], answers, near, len(rows))
 
 
 @dataclass(frozen=True, eq=False)
-class _AsModel:
+class _ForecastAsModel:
     """Adapter that makes a forecast a sensor model."""
 
     forecast: Forecast
@@ -149,7 +149,7 @@ class _CardedPredictive:
         own, n = weight[self.asked] * self.stands_for, len(self.near)
         levels = self.levels
         index = np.rint((self.answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
-        mass_there = by_level(np.clip(index, 0, len(levels) - 1), own, len(levels))
+        mass_there = weight_by_level(np.clip(index, 0, len(levels) - 1), own, len(levels))
         number = np.full(self.n_rows, -1)
         number[self.near] = np.arange(n)
         for at, mass in self.base.maps(weight):

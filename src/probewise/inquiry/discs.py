@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.effects import EdgeBlur, Halo, Known
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
-from probewise.inquiry.scanlines import ROWS, Interval, Ring, Spans, single
+from probewise.inquiry.scanlines import ROWS, Interval, Ring, Spans, to_single_precision
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
@@ -74,13 +74,13 @@ class DiscTable:
         low, high = shape.radius_mm
         bends = (1.0 / high, 1.0 / low)
         if isinstance(model, NaiveSensor):
-            dark, bright = _levels(model, high)
+            dark, bright = _levels_outside_and_inside(model, high)
             return cls(dark, bright, 0.0, bends, frozen(np.empty((0, 0, 0))))
         if not isinstance(model.ssf, FixedMixture) or not all(map(is_alike_everywhere, model.effects)):
             return None
-        dark, bright = _levels(model, high)
-        directions = _direction(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
-        margin = _margin(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
+        dark, bright = _levels_outside_and_inside(model, high)
+        directions = _unit_vectors(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
+        margin = _margin_of_discs(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
         if margin >= _PROBE_MM:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
@@ -124,9 +124,11 @@ class DiscTable:
         x, y, distance = (values.ravel()[near] for values in (away_x, away_y, distance))
         angle = _pseudo_angle(cosine * x + sine * y, cosine * y - sine * x)
         n_bends, n_directions, n_distances = self.levels.shape
-        bend, along_bend = _cell((1.0 / theta[:, 2] - self.bend_per_mm[0]) * self._per_bend, n_bends)
-        turn, along_turn = _cell(angle * ((n_directions - 1) / 4.0), n_directions)
-        step, along = _cell((distance + self.margin_mm) * self._per_mm, n_distances)
+        bend, along_bend = _index_and_fraction(
+            (1.0 / theta[:, 2] - self.bend_per_mm[0]) * self._entries_per_bend, n_bends
+        )
+        turn, along_turn = _index_and_fraction(angle * ((n_directions - 1) / 4.0), n_directions)
+        step, along = _index_and_fraction((distance + self.margin_mm) * self._entries_per_mm, n_distances)
         corner = (bend[hypothesis] * n_directions + turn) * n_distances + step
         along_bend = along_bend[hypothesis]
         flat = self.levels.reshape(-1)
@@ -167,25 +169,25 @@ class DiscTable:
         per_level = 1.0 / (levels[1] - levels[0])
         dark, bright = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64).tolist()
         nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int16)
-        margin = self._margin_of(nearest, (dark, bright))
-        discs = single(theta)
+        margin = self._distance_to_constant_level(nearest, (dark, bright))
+        discs = to_single_precision(theta)
         mass = np.empty((grid.n_places, n_levels))
         turn = turn_rad.reshape(grid.n_y, grid.n_x)
         for start in range(0, grid.n_y, ROWS):
-            y_mm = single(grid.y_mm[start : start + ROWS])
-            spans = _spans(discs, grid, y_mm, margin)
+            y_mm = to_single_precision(grid.y_mm[start : start + ROWS])
+            spans = _spans_of_discs(discs, grid, y_mm, margin)
             ring = spans.ring()
             level: IntArray = np.full(len(ring.place), bright)  # a place exactly on the edge is inside
             if margin > 0.0:
                 away = _EdgePairs.of(discs, spans, ring, y_mm, turn[start : start + ROWS].ravel())
-                level = nearest.reshape(-1)[self._entry(away)]
+                level = nearest.reshape(-1)[self._nearest_entry(away)]
             rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
             mass[rows] = spans.histogram(weight, ring, level, (dark, bright), n_levels)
         return mass
 
     mass = level_histogram  # its old name
 
-    def _margin_of(self, nearest: IntArray, ends: tuple[int, int]) -> float:
+    def _distance_to_constant_level(self, nearest: IntArray, ends: tuple[int, int]) -> float:
         """Return the distance from an edge beyond which the nearest of a list of levels is constant."""
         if self.margin_mm == 0.0:
             return 0.0
@@ -193,16 +195,16 @@ class DiscTable:
         off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
         return float(np.abs(distance[off]).max(initial=0.0))
 
-    def _entry(self, away: _EdgePairs) -> IntArray:
+    def _nearest_entry(self, away: _EdgePairs) -> IntArray:
         """Return the index of the table's nearest entry for pairs of disc and place."""
         _, n_directions, n_distances = self.levels.shape
         step = away.distance_mm + np.float32(self.margin_mm)
-        step *= self._per_mm
+        step *= self._entries_per_mm
         step += 0.5
         turn = _pseudo_angle(away.x_mm, away.y_mm)
         turn *= (n_directions - 1) / 4.0
         turn += 0.5
-        bend = (1.0 / away.radius_mm - self.bend_per_mm[0]) * self._per_bend + 0.5
+        bend = (1.0 / away.radius_mm - self.bend_per_mm[0]) * self._entries_per_bend + 0.5
         entry = bend.astype(np.int32) * n_directions
         entry += turn.astype(np.int32)
         entry *= n_distances
@@ -210,11 +212,11 @@ class DiscTable:
         return np.asarray(entry)
 
     @property
-    def _per_mm(self) -> float:
+    def _entries_per_mm(self) -> float:
         return float((self.levels.shape[2] - 1) / (2.0 * self.margin_mm))
 
     @property
-    def _per_bend(self) -> float:
+    def _entries_per_bend(self) -> float:
         return float((self.levels.shape[0] - 1) / (self.bend_per_mm[1] - self.bend_per_mm[0]))
 
 
@@ -223,7 +225,7 @@ def is_alike_everywhere(effect: AnyEffect) -> bool:
     return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
 
 
-def _spans(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> Spans:
+def _spans_of_discs(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> Spans:
     """Return the intervals in which discs, (n_samples, 3), cross rows of a grid, (n_rows,), in single precision."""
     x, y, radius = discs.T
     every_up = y_mm[:, None] - y
@@ -252,12 +254,12 @@ class _EdgePairs:
     def of(cls, discs: FloatArray, spans: Spans, ring: Ring, y_mm: FloatArray, turn_rad: FloatArray) -> Self:
         own = discs[spans.hypothesis]
         up, radius = (y_mm[spans.row] - own[:, 1])[ring.span], own[:, 2][ring.span]
-        x = single(ring.column)
+        x = to_single_precision(ring.column)
         x *= np.float32(spans.grid.width_mm / (spans.grid.n_x - 1))
         x -= own[:, 0][ring.span]
         distance = np.sqrt(x * x + up * up) - radius
         if turn_rad.any():
-            cosine, sine = (single(f(turn_rad))[ring.place] for f in (np.cos, np.sin))
+            cosine, sine = (to_single_precision(f(turn_rad))[ring.place] for f in (np.cos, np.sin))
             return cls(cosine * x + sine * up, cosine * up - sine * x, radius, distance)
         return cls(x, up, radius, distance)
 
@@ -268,7 +270,7 @@ def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(2.0 - np.copysign(1.0 + across, y))
 
 
-def _direction(pseudo_angle: FloatArray) -> FloatArray:
+def _unit_vectors(pseudo_angle: FloatArray) -> FloatArray:
     """Convert pseudo-angles to unit vectors, (n, 2)."""
     upper = pseudo_angle <= 2.0
     across = np.where(upper, 1.0 - pseudo_angle, pseudo_angle - 3.0)
@@ -276,7 +278,7 @@ def _direction(pseudo_angle: FloatArray) -> FloatArray:
     return np.asarray(np.stack([across, up], axis=-1) / np.hypot(across, up)[:, None])
 
 
-def _cell(position: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
+def _index_and_fraction(position: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
     """Split positions in units of the spacing into the index below and the fraction to the next."""
     below = np.clip(position.astype(np.int64), 0, n - 2)
     return below, position - below
@@ -293,7 +295,7 @@ def _levels_about(model: SensorModel, radius_mm: float, directions: FloatArray, 
     return predicted.reshape(len(directions), len(distance_mm))
 
 
-def _levels(model: SensorModel, radius_mm: float) -> tuple[float, float]:
+def _levels_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[float, float]:
     """Return the levels far outside and at the middle of a large disc."""
     east = np.array([[1.0, 0.0]])
     dark, bright = _levels_about(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
@@ -304,7 +306,7 @@ def _levels(model: SensorModel, radius_mm: float) -> tuple[float, float]:
     return float(dark), float(bright)
 
 
-def _margin(
+def _margin_of_discs(
     model: SensorModel, low_mm: float, high_mm: float, directions: FloatArray, dark: float, bright: float
 ) -> float:
     """Return the distance from a disc's edge beyond which the reading is constant, for small and large discs alike."""

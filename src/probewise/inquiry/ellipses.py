@@ -8,8 +8,8 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.inquiry.scanlines import Interval, single
-from probewise.inquiry.unit_gaussian import seen_of_bend
+from probewise.inquiry.scanlines import Interval, to_single_precision
+from probewise.inquiry.unit_gaussian import mass_within_bend
 from probewise.scene import EllipseRegion
 from probewise.sensor import FixedMixture
 
@@ -51,13 +51,15 @@ class Ellipses:
         away = np.linalg.norm(footprint.means_mm - middle, axis=1).max()
         half_mm = np.linalg.norm(turn[:, :, 1] * region.semi_axes_mm, axis=1)
         return cls(
-            single(region.center_mm[:, 1] + np.stack([-half_mm, half_mm])),
-            single(footprint.weights),
-            single(np.stack([*(region.center_mm - middle).T, form[:, 0, 0], form[:, 0, 1], form[:, 1, 1]])),
-            single((1.0 / axes[:, 1]).max(axis=0)),
-            single(away / region.semi_axes_mm.min(axis=1)),
-            single(np.concatenate([into, constant[..., None]], axis=-1).transpose(0, 2, 3, 1)),
-            single(axes),
+            to_single_precision(region.center_mm[:, 1] + np.stack([-half_mm, half_mm])),
+            to_single_precision(footprint.weights),
+            to_single_precision(
+                np.stack([*(region.center_mm - middle).T, form[:, 0, 0], form[:, 0, 1], form[:, 1, 1]])
+            ),
+            to_single_precision((1.0 / axes[:, 1]).max(axis=0)),
+            to_single_precision(away / region.semi_axes_mm.min(axis=1)),
+            to_single_precision(np.concatenate([into, constant[..., None]], axis=-1).transpose(0, 2, 3, 1)),
+            to_single_precision(axes),
         )
 
     def along(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
@@ -86,7 +88,7 @@ class CrossedEllipses:
     axes: FloatArray
 
     def within(self, reach: float) -> Interval:
-        """Return the interval deeper than `reach` sds inside the edge; for negative `reach`, up to that far outside.
+        """Return the interval of x deeper than `reach` sds inside the edge; if negative, up to that far outside.
 
         An ellipse scaled by 1 + d / (its shortest semi-axis) contains all points within d of it; and likewise inwards.
         """
@@ -102,29 +104,29 @@ class CrossedEllipses:
 
         The nearest point is found by one step along the circle of curvature from the point on the same ray.
         """
-        out = single(np.zeros(x_mm.shape))
+        out = to_single_precision(np.zeros(x_mm.shape))
         for share, slope, base, axes in zip(self.share, self.slope, self.base, self.axes, strict=True):
             p, q = (np.abs(s.take(crossing) * x_mm + b.take(crossing)) for s, b in zip(slope, base, strict=True))
             a, b = (axis.take(crossing) for axis in axes)
-            cosine, sine = _direction(p / a, q / b)
+            cosine, sine = _unit_vector(p / a, q / b)
             bent = a * a - b * b
             u, v = bent / a * (cosine * cosine * cosine), -bent / b * (sine * sine * sine)  # the centre of curvature
-            ratio = _length(a * cosine - u, b * sine - v) / np.maximum(_length(p - u, q - v), _TINY)
-            cosine, sine = _direction(
+            ratio = _vector_length(a * cosine - u, b * sine - v) / np.maximum(_vector_length(p - u, q - v), _TINY)
+            cosine, sine = _unit_vector(
                 np.maximum((p - u) * ratio + u, 0.0) / a, np.maximum((q - v) * ratio + v, 0.0) / b
             )
             steep_p, steep_q = cosine / a, sine / b
-            steep = _length(steep_p, steep_q)
+            steep = _vector_length(steep_p, steep_q)
             distance = ((a * cosine - p) * steep_p + (b * sine - q) * steep_q) / steep
             around = a * b * steep
-            out = out + share * seen_of_bend(distance, 1.0 / (around * around * steep))
+            out = out + share * mass_within_bend(distance, 1.0 / (around * around * steep))
         return out
 
 
-def _length(x: FloatArray, y: FloatArray) -> FloatArray:
+def _vector_length(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.sqrt(x * x + y * y)
 
 
-def _direction(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    length = np.maximum(_length(x, y), _TINY)
+def _unit_vector(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    length = np.maximum(_vector_length(x, y), _TINY)
     return x / length, y / length

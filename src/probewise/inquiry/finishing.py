@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.inquiry.forecast import thinned
+from probewise.inquiry.forecast import resampled_hypotheses
 from probewise.inquiry.given_reading import GivenReading
 from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.utility import InformationGain, Utility
@@ -72,13 +72,13 @@ def _is_near(prospect: Prospect, goal: Goal) -> bool:
 
 def _probability_of_ending(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
     """Return the probability that a reading at each design reaches the target precision, (n_designs,)."""
-    rows, share = thinned(prospect.weight, _MOST_ASKED)
+    rows, share = resampled_hypotheses(prospect.weight, _MOST_ASKED)
     away = prospect.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()
     answers = prospect.forecast.predict(prospect.theta[rows], prospect.plan.take(prospect.rows[designs]))
     given = GivenReading(answers, share, prospect.readout)
-    ends = np.ones(given.mass.shape, dtype=np.bool_)
+    ends = np.ones(given.weight_by_cell.shape, dtype=np.bool_)
     for length in away.T:
-        mean = given.sum_by_cell(length) / given.mass
-        ends &= given.sum_by_cell(length**2) / given.mass - mean**2 < goal.sd**2
-    return np.asarray((given.mass * ends).sum(axis=1) / given.mass.sum(axis=1))
+        mean = given.sum_by_cell(length) / given.weight_by_cell
+        ends &= given.sum_by_cell(length**2) / given.weight_by_cell - mean**2 < goal.sd**2
+    return np.asarray((given.weight_by_cell * ends).sum(axis=1) / given.weight_by_cell.sum(axis=1))

@@ -85,14 +85,14 @@ class DirectForecast:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """See `Forecast.predict`."""
-        return predicted(self.model, theta, plan)
+        return predict_where_visible(self.model, theta, plan)
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
         """See `Forecast.predictive`."""
-        asked, share = thinned(weight, _MOST_ASKED)
-        answers = predicted(self.model, theta[asked], plan.take(rows))
+        asked, share = resampled_hypotheses(weight, _MOST_ASKED)
+        answers = predict_where_visible(self.model, theta[asked], plan.take(rows))
         levels = spread_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD, most=MOST_LEVELS)
         per_level = 1.0 / (levels[1] - levels[0])
         index = np.rint((answers - levels[0]) * per_level).astype(np.int32)
@@ -113,11 +113,11 @@ class _DirectPredictive:
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
         """See `PredictiveDistributions.maps`."""
         own, n_levels = weight[self.asked] * self.stands_for, len(self.levels)
-        for _, at, _ in by_combination(self.rows, self.n_places):
-            yield at, by_level(self.index[:, at], own, n_levels)
+        for _, at, _ in rows_by_combination(self.rows, self.n_places):
+            yield at, weight_by_level(self.index[:, at], own, n_levels)
 
 
-def by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
+def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
     """Sum the weights, (n,), of hypotheses that predict each level, index (n, n_designs) -> (n_designs, n_levels)."""
     n_designs = index.shape[1]
     key = index + np.arange(n_designs) * n_levels
@@ -125,7 +125,7 @@ def by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
     return np.asarray(counted.reshape(n_designs, n_levels), dtype=np.float64)
 
 
-def by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:
+def rows_by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:
     """Split rows of designs, (n,), by combination: its number, indices of its rows, and their places."""
     combination, place = np.divmod(rows, n_places)
     for number in np.unique(combination).tolist():
@@ -133,7 +133,7 @@ def by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArra
         yield number, at, place[at]
 
 
-def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
+def predict_where_visible(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
     """Predict every hypothesis at every row of a long plan, skipping rows that cannot see it: (n_samples, n_points)."""
     bounds = CullingBounds.of(model, theta, plan)
     if bounds is not None:
@@ -150,13 +150,13 @@ def predicted(model: SensorModel, theta: FloatArray, plan: Plan) -> FloatArray:
 
 
 def spread_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
-    """Return evenly spaced levels between two readings, at most `spacing` apart, but at most `most` levels."""
+    """Return evenly spaced levels between two readings: at most `spacing` apart, unless that takes more than `most`."""
     low, high = min(low, high), max(low, high)
     n = max(2, int(np.ceil((high - low) / spacing)) + 1)
     return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
 
 
-def thinned(weight: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
+def resampled_hypotheses(weight: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
     """Return indices of at most `n` hypotheses and their weights, by systematic resampling with a fixed start."""
     some = np.flatnonzero(weight > 0)
     if len(some) <= n:

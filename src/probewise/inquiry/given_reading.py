@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.inquiry.forecast import MOST_LEVELS, by_level, spread_levels
+from probewise.inquiry.forecast import MOST_LEVELS, spread_levels, weight_by_level
 from probewise.inquiry.readout import Readout
 
 _PER_SD = 2.0  # levels of the predicted reading per noise sd
@@ -39,14 +39,14 @@ class GivenReading:
         self._chance = readout.probability(levels, fine=fine, most=MOST_LEVELS)
 
     @cached_property
-    def mass(self) -> FloatArray:
+    def weight_by_cell(self) -> FloatArray:
         """Total weight in each cell, (n_designs, n_cells); never 0."""
         return np.maximum(self.sum_by_cell(np.ones(len(self._weight))), _LEAST)
 
     def sum_by_cell(self, values: FloatArray) -> FloatArray:
         """Sum weight times value, each with the probability of the cell: values (n,) -> (n_designs, n_cells)."""
-        return np.asarray(by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
+        return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
 
-    def joint(self, design: int) -> FloatArray:
+    def weight_by_hypothesis(self, design: int) -> FloatArray:
         """Weight of each hypothesis in each cell of one design, (n, n_cells)."""
         return np.asarray(self._weight[:, None] * self._chance[self._index[:, design]])

@@ -28,7 +28,7 @@ class ParameterValue:
     n_bins: int = 16
 
     def __post_init__(self) -> None:
-        _require_bins(self.n_bins)
+        _require_enough_bins(self.n_bins)
 
     def __str__(self) -> str:
         return self.name
@@ -37,7 +37,7 @@ class ParameterValue:
         """See `Label`."""
         if self.name not in names:
             raise ParameterError("parameter", self.name, f"one of {', '.join(names)}")
-        return _evenly_binned(theta[:, names.index(self.name)], weight, self.n_bins)
+        return _bins_of_equal_weight(theta[:, names.index(self.name)], weight, self.n_bins)
 
 
 @dataclass(frozen=True)
@@ -48,14 +48,14 @@ class FunctionValue:
     n_bins: int = 16
 
     def __post_init__(self) -> None:
-        _require_bins(self.n_bins)
+        _require_enough_bins(self.n_bins)
 
     def __str__(self) -> str:
         return "a function of the parameters"
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
         """See `Label`."""
-        return _evenly_binned(np.asarray(self.function(theta)), weight, self.n_bins)
+        return _bins_of_equal_weight(np.asarray(self.function(theta)), weight, self.n_bins)
 
 
 @dataclass(frozen=True)
@@ -72,12 +72,12 @@ class WhichShape:
         return np.floor(theta[:, names.index("shape")]).astype(np.int64)
 
 
-def _require_bins(n_bins: int) -> None:
+def _require_enough_bins(n_bins: int) -> None:
     if n_bins < 2:
         raise ParameterError("n_bins", n_bins, "2 or more")
 
 
-def _evenly_binned(values: FloatArray, weight: FloatArray, n_bins: int) -> IntArray:
+def _bins_of_equal_weight(values: FloatArray, weight: FloatArray, n_bins: int) -> IntArray:
     """Return the bin of each value, for bins of equal weight numbered from the lowest."""
     order = np.argsort(values, kind="stable")
     before = np.cumsum(weight[order]) - 0.5 * weight[order]

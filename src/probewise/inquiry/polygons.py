@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.inquiry.scanlines import Interval, single
-from probewise.inquiry.unit_gaussian import N_OPENINGS, seen_of_corner
+from probewise.inquiry.scanlines import Interval, to_single_precision
+from probewise.inquiry.unit_gaussian import N_OPENINGS, mass_within_corner
 from probewise.scene import PolygonRegion
 from probewise.sensor import FixedMixture
 
@@ -22,9 +22,9 @@ _LEAST = np.float32(1e-9)
 class EdgesInFootprintSds:
     """Edges of polygons as half-planes, in sds of each Gaussian of the footprint across the edge.
 
-    Distance inside edge k = across x + up y + offset, arrays (n_gaussians, n_edges, n_polygons). `opening` numbers
-    the corner of edges k and m (see `seen_of_corner`), (n_gaussians, 2^n_edges, n_polygons), at 2^k + 2^m; `share` is
-    the weight of each Gaussian. `rows_mm` (2, n_polygons) are the lowest and the highest corner.
+    Distance inside edge k = across x + up y + offset, arrays (n_gaussians, n_edges, n_polygons). `opening`
+    (n_gaussians, 2^n_edges, n_polygons), at 2^k + 2^m, numbers the corner of edges k and m; see `mass_within_corner`.
+    `share` is the weight of each Gaussian. `rows_mm` (2, n_polygons) are the lowest and the highest corner.
     """
 
     rows_mm: FloatArray
@@ -56,11 +56,11 @@ class EdgesInFootprintSds:
             opening[:, 2**k + 2**m] = kind[:, k, m]
         from_start = footprint.means_mm[:, None, None] - edges[:, :, 0]
         return cls(
-            single(np.stack([edges[:, :, 0, 1].min(axis=1), edges[:, :, 0, 1].max(axis=1)])),
-            single(footprint.weights),
-            single(normal[..., 0].T / sd),
-            single(normal[..., 1].T / sd),
-            single(np.einsum("gpki,pki->gkp", from_start, normal) / sd),
+            to_single_precision(np.stack([edges[:, :, 0, 1].min(axis=1), edges[:, :, 0, 1].max(axis=1)])),
+            to_single_precision(footprint.weights),
+            to_single_precision(normal[..., 0].T / sd),
+            to_single_precision(normal[..., 1].T / sd),
+            to_single_precision(np.einsum("gpki,pki->gkp", from_start, normal) / sd),
             opening,
         )
 
@@ -84,7 +84,7 @@ class CrossedPolygons:
     which: IntArray
 
     def within(self, reach: float) -> Interval:
-        """Return the interval deeper than `reach` sds inside every edge; for negative `reach`, up to that far outside.
+        """Return the interval of x deeper than `reach` sds inside every edge; if negative, up to that far outside.
 
         For several Gaussians, the outermost counts outside the polygon, and the innermost inside.
         """
@@ -98,7 +98,7 @@ class CrossedPolygons:
     def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
         """Return the share of the footprint over the polygon for places of crossings, both (n_pairs,)."""
         which = self.which.take(crossing)
-        out = single(np.zeros(x_mm.shape))
+        out = to_single_precision(np.zeros(x_mm.shape))
         for share, slope, base, opening in zip(self.share, self.slope, self.base, self.opening, strict=True):
             inside = []
             for a, b in zip(slope, base, strict=True):
@@ -113,7 +113,7 @@ class CrossedPolygons:
             edges = np.zeros(nearest.shape, dtype=np.uint8)
             for k, distance in enumerate(inside):
                 edges |= (distance <= second).view(np.uint8) << np.uint8(k)
-            out = out + share * seen_of_corner(
+            out = out + share * mass_within_corner(
                 nearest, second, opening.take(edges * np.int64(opening.shape[1]) + which)
             )
         return out

@@ -96,7 +96,7 @@ class Prospect:
         """Return the expected information in bits of a reading at every design, for weights (n_samples,)."""
         out = np.empty(len(self.rows))
         for at, mass in self.predictive.maps(weight):
-            chance = self._chance(at)
+            chance = self._cell_probability(at)
             out[at] = np.maximum(_entropy_of_readings(mass, chance) - _entropy_of_noise(mass, chance), 0.0)
         return out
 
@@ -107,10 +107,10 @@ class Prospect:
         """
         out = np.empty(len(self.rows))
         for at, mass in self.predictive.maps(weight):
-            out[at] = _entropy_of_readings(mass, self._chance(at))
+            out[at] = _entropy_of_readings(mass, self._cell_probability(at))
         return out
 
-    def _chance(self, at: IntArray) -> FloatArray:
+    def _cell_probability(self, at: IntArray) -> FloatArray:
         """Return the probability of each cell given each level, for designs with equal repeats."""
         n = int(self.designs.n_repeats[self.rows[at[0]]])
         chance = self.readout.probability(self.predictive.levels, repeats=n, fine=_CELL, most=MOST_LEVELS)

@@ -59,13 +59,13 @@ class Spans:
         """
         per_mm = np.float32((grid.n_x - 1) / grid.width_mm)
 
-        def columns(interval: Interval) -> tuple[IntArray, IntArray]:
-            first = whole(np.ceil(np.clip(interval[0] * per_mm, 0.0, grid.n_x)))
-            last = whole(np.floor(np.clip(interval[1] * per_mm, -1.0, grid.n_x - 1.0)))
+        def columns_in(interval: Interval) -> tuple[IntArray, IntArray]:
+            first = to_int32(np.ceil(np.clip(interval[0] * per_mm, 0.0, grid.n_x)))
+            last = to_int32(np.floor(np.clip(interval[1] * per_mm, -1.0, grid.n_x - 1.0)))
             return np.minimum(first, last + 1), last
 
-        first, last = columns(outer)
-        inner_first, inner_last = columns(inner)
+        first, last = columns_in(outer)
+        inner_first, inner_last = columns_in(inner)
         none = np.flatnonzero(inner_first > inner_last)
         inner_first[none], inner_last[none] = last[none] + 1, last[none]
         return cls(grid, n_rows, row, hypothesis, first, last, inner_first, inner_last)
@@ -77,10 +77,10 @@ class Spans:
         begin = np.concatenate([self.first, self.inner_last + 1])
         # Repeating is the slow step: it is done once, and everything else is indexed.
         span = np.repeat(np.arange(2 * n), count)
-        column = whole(begin - np.cumsum(count) + count)[span]
-        column += whole(np.arange(len(span)))
+        column = to_int32(begin - np.cumsum(count) + count)[span]
+        column += to_int32(np.arange(len(span)))
         span[int(count[:n].sum()) :] -= n
-        return Ring(span, column, column + whole(self.row * self.grid.n_x)[span])
+        return Ring(span, column, column + to_int32(self.row * self.grid.n_x)[span])
 
     def histogram(
         self, weight: FloatArray, ring: Ring, level: IntArray, ends: tuple[int, int], n_levels: int
@@ -103,13 +103,13 @@ class Spans:
         n_places = self.n_rows * self.grid.n_x
         near = np.bincount(ring.place * n_levels + level, weight[self.hypothesis][ring.span], n_places * n_levels)
         mass = near.reshape(n_places, n_levels).astype(np.float64, copy=False)  # integers if there are no pairs
-        inside = self._inside(weight)
+        inside = self._weight_deep_inside(weight)
         outside = weight.sum() - inside - mass.sum(axis=1)
         mass[:, ends[1]] += inside
         mass[:, ends[0]] += outside
         return mass
 
-    def _inside(self, weight: FloatArray) -> FloatArray:
+    def _weight_deep_inside(self, weight: FloatArray) -> FloatArray:
         """Return the weight of the shapes that contain each place deep inside, (n_rows * n_x,)."""
         width = self.grid.n_x + 1
         own, size = weight[self.hypothesis], self.n_rows * width
@@ -118,11 +118,11 @@ class Spans:
         return np.cumsum((begins - ends).reshape(self.n_rows, width), axis=1)[:, :-1].ravel()
 
 
-def single(values: NDArray[Any]) -> FloatArray:
+def to_single_precision(values: NDArray[Any]) -> FloatArray:
     """Round to single precision, which the type checker does not distinguish from double."""
     return cast(FloatArray, np.asarray(values, dtype=np.float32))
 
 
-def whole(values: NDArray[Any]) -> IntArray:
+def to_int32(values: NDArray[Any]) -> IntArray:
     """Truncate to 32-bit integers, which the type checker does not distinguish from 64-bit ones."""
     return cast(IntArray, values.astype(np.int32))

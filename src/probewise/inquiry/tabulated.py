@@ -18,8 +18,8 @@ from probewise.inquiry.forecast import (
     DirectForecast,
     Forecast,
     PredictiveDistributions,
-    by_combination,
-    predicted,
+    predict_where_visible,
+    rows_by_combination,
     spread_levels,
 )
 from probewise.inquiry.grid import Grid
@@ -49,7 +49,7 @@ class DiscForecast:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """See `Forecast.predict`."""
-        return predicted(self.model, theta, plan)
+        return predict_where_visible(self.model, theta, plan)
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
@@ -75,7 +75,7 @@ class _DiscPredictive:
         """See `PredictiveDistributions.maps`: one map per orientation of the sensor; the table has no other setting."""
         some = weight > 0
         stood, mass = None, np.empty(0)
-        for number, at, places in by_combination(self.rows, self.grid.n_places):
+        for number, at, places in rows_by_combination(self.rows, self.grid.n_places):
             turn = self.turns_rad[number]
             if stood is None or not np.array_equal(stood, turn):
                 stood, mass = (
@@ -120,14 +120,14 @@ class TabulatedForecast:
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """See `Forecast.predict`: by the tables; for many places, only where shapes are visible."""
         if len(plan) > _FEW:
-            return predicted(self.model, theta, plan)
-        ways, which = np.unique(np.stack([plan.orientation_rad, _heights(plan)]), axis=1, return_inverse=True)
+            return predict_where_visible(self.model, theta, plan)
+        ways, which = np.unique(np.stack([plan.orientation_rad, _relative_heights(plan)]), axis=1, return_inverse=True)
         out = np.empty((len(theta), len(plan)))
         for number, way in enumerate(ways.T.tolist()):
             rows = np.flatnonzero(which.ravel() == number)
-            shapes = self._shapes(theta, *way)
+            shapes = self._shapes_under_sensor(theta, *way)
             if shapes is None or ways.shape[1] > _MOST_WAYS:
-                return predicted(self.model, theta, plan)
+                return predict_where_visible(self.model, theta, plan)
             dark, bright = self._levels_at(way[1])
             out[:, rows] = dark + (bright - dark) * shapes.seen(plan.x_mm[rows], plan.y_mm[rows])
         return out
@@ -136,14 +136,14 @@ class TabulatedForecast:
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
         """See `Forecast.predictive`; by direct predictions if the orientation changes from place to place."""
-        turns, heights = (a.reshape(-1, designs.grid.n_places) for a in (plan.orientation_rad, _heights(plan)))
+        turns, heights = (a.reshape(-1, designs.grid.n_places) for a in (plan.orientation_rad, _relative_heights(plan)))
         asked = partial(DirectForecast(self.model).predictive, theta, weight, designs, plan, rows, noise_sd)
         if (turns != turns[:, :1]).any() or set(plan.covariates) - {"height_mm"}:
             return asked()
         ways = list(zip(turns[:, 0].tolist(), heights[:, 0].tolist(), strict=True))
         shapes_at = {}
         for turn, height in dict.fromkeys(ways):
-            shapes = self._shapes(theta, turn, height)
+            shapes = self._shapes_under_sensor(theta, turn, height)
             if shapes is None:
                 return asked()
             shapes_at[turn, height] = _ShapesAt(shapes, *self._levels_at(height))
@@ -152,7 +152,7 @@ class TabulatedForecast:
         levels = spread_levels(low, high, noise_sd / _PER_SD, most=MOST_LEVELS)
         return _TabulatedPredictive(shapes_at, ways, designs.grid, rows, levels)
 
-    def _shapes(self, theta: FloatArray, turn_rad: float, height: float) -> TabulatedShapes | None:
+    def _shapes_under_sensor(self, theta: FloatArray, turn_rad: float, height: float) -> TabulatedShapes | None:
         """Return the shapes under the sensor at an orientation, and at `height` times that of its calibration."""
         cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
         stands = height * np.array([[cosine, -sine], [sine, cosine]])
@@ -169,7 +169,7 @@ class TabulatedForecast:
         """Return whether tables and model agree, at places about the edges of some shapes from the prior."""
         prior, rng = self.shape.prior, np.random.default_rng(0)
         theta = prior.from_unit_cube(rng.random((_N_CHECKED, len(prior.names))))
-        shapes = self._shapes(theta, 0.0, highest)
+        shapes = self._shapes_under_sensor(theta, 0.0, highest)
         dark, bright = self._levels_at(highest)
         if shapes is None or dark == bright:
             return False
@@ -205,7 +205,7 @@ class _TabulatedPredictive:
     def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
         """See `PredictiveDistributions.maps`: one map per orientation and height, for all numbers of repeats."""
         stood, mass = None, np.empty(0)
-        for number, at, places in by_combination(self.rows, self.grid.n_places):
+        for number, at, places in rows_by_combination(self.rows, self.grid.n_places):
             if stood != self.ways[number]:
                 stood = self.ways[number]
                 shapes, dark, bright = self.shapes_at[stood]
@@ -219,7 +219,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
     `highest` is the largest height of the sensor over that of its calibration; None: always the calibrated height.
     """
     if cards_of(model):
-        return _over_cards(model, highest)
+        return _forecast_over_cards(model, highest)
     table = DiscTable.of(model) if highest is None else None
     if table is not None:
         return DiscForecast(table if table.margin_mm else model, table)
@@ -229,20 +229,20 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
 
 
 def _tabulated_chain(model: Chain) -> TabulatedChain | None:
-    """Evaluate a chain with effects by the table of the same chain without the effects that no table can hold."""
+    """Return a chain with effects over the table of the chain without those that no table holds; None if impossible."""
     table = DiscTable.of(replace(model, effects=tuple(filter(is_alike_everywhere, model.effects))))
     return None if table is None else TabulatedChain.of(model, table)
 
 
-def _over_cards(model: SensorModel, highest: float | None) -> Forecast:
-    """Use tables for the shape alone, if possible, with cards on top."""
+def _forecast_over_cards(model: SensorModel, highest: float | None) -> Forecast:
+    """Return the forecast of a model with known cards: by tables, if possible, for the shape alone."""
     if not isinstance(model, Chain) or model.effects or highest is not None:
         return DirectForecast(model)
     base = forecast_of(replace(model, scene=HypothesisScene(model.scene.shape)))  # type: ignore[attr-defined]
     return DirectForecast(model) if isinstance(base, DirectForecast) else CardedForecast(base, model)
 
 
-def _heights(plan: Plan) -> FloatArray:
+def _relative_heights(plan: Plan) -> FloatArray:
     """Return the height of every row over that of the calibration, (n_points,)."""
     ratio = height_ratio(plan)
     return np.ones(len(plan)) if ratio is None else ratio

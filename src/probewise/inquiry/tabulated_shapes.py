@@ -13,13 +13,13 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.ellipses import Ellipses
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.polygons import EdgesInFootprintSds
-from probewise.inquiry.scanlines import ROWS, Interval, Spans, single, whole
+from probewise.inquiry.scanlines import ROWS, Interval, Spans, to_int32, to_single_precision
 from probewise.inquiry.unit_gaussian import REACH
 from probewise.scene import EllipseRegion, MixtureOfRegions, PolygonRegion, Region
 from probewise.sensor import FixedMixture
 
 
-class _Crossed(Protocol):
+class _CrossedShapes(Protocol):
     """Shapes of one kind, each intersected by a row of places."""
 
     def within(self, reach: float) -> Interval:
@@ -31,7 +31,7 @@ class _Crossed(Protocol):
         ...
 
 
-class _SameShapes(Protocol):
+class _ShapesOfOneKind(Protocol):
     """Shapes of one kind under a footprint."""
 
     @property
@@ -39,7 +39,7 @@ class _SameShapes(Protocol):
         """Lowest and highest y of each shape, (2, n_shapes)."""
         ...
 
-    def along(self, which: IntArray, y_mm: FloatArray) -> _Crossed:
+    def along(self, which: IntArray, y_mm: FloatArray) -> _CrossedShapes:
         """Intersect shapes with rows of places, arrays of one shape."""
         ...
 
@@ -52,15 +52,15 @@ class TabulatedShapes:
     """
 
     n_shapes: int
-    parts: tuple[tuple[IntArray, _SameShapes], ...]
+    parts: tuple[tuple[IntArray, _ShapesOfOneKind], ...]
     footprint_mm: tuple[float, float]
 
     @classmethod
     def of(cls, region: Region, footprint: FixedMixture) -> Self | None:
         """Build from the regions of hypotheses; None unless all are white ellipses or convex polygons."""
         parts = []
-        for rows, part in _by_kind(region):
-            kind = _kind_of(part, footprint)
+        for rows, part in _regions_by_kind(region):
+            kind = _shapes_of_region(part, footprint)
             if kind is None:
                 return None
             parts.append((rows, kind))
@@ -73,8 +73,8 @@ class TabulatedShapes:
         out = np.empty((self.n_shapes, len(x_mm)))
         for rows, kind in self.parts:
             every = np.repeat(np.arange(len(rows)), len(x_mm))
-            crossed = kind.along(every, np.tile(single(y_mm), len(rows)))
-            seen = crossed.seen(np.arange(len(every)), np.tile(single(x_mm), len(rows)))
+            crossed = kind.along(every, np.tile(to_single_precision(y_mm), len(rows)))
+            seen = crossed.seen(np.arange(len(every)), np.tile(to_single_precision(x_mm), len(rows)))
             out[rows] = seen.reshape(len(rows), len(x_mm))
         return out
 
@@ -110,26 +110,26 @@ class TabulatedShapes:
             own = weight[rows]
             bottom, top = kind.rows_mm + np.array([[-pad_mm], [pad_mm]], dtype=np.float32)
             for start in range(0, grid.n_y, ROWS):
-                y_mm = single(grid.y_mm[start : start + ROWS])
+                y_mm = to_single_precision(grid.y_mm[start : start + ROWS])
                 row, which = np.nonzero((y_mm[:, None] >= bottom) & (y_mm[:, None] <= top) & (own > 0))
                 crossed = kind.along(which, y_mm[row])
                 spans = Spans.between(grid, len(y_mm), row, which, crossed.within(-reach), crossed.within(reach))
                 ring = spans.ring()
-                seen = crossed.seen(ring.span, single(grid.x_mm)[ring.column])
-                level = whole(lowest + per_share * seen + 0.5)
+                seen = crossed.seen(ring.span, to_single_precision(grid.x_mm)[ring.column])
+                level = to_int32(lowest + per_share * seen + 0.5)
                 block = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
                 mass[block] += spans.histogram(own, ring, level, ends, n_levels)
         return mass
 
 
-def _by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
+def _regions_by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
     if isinstance(region, MixtureOfRegions):
         yield from region.rows_and_regions()
     else:
         yield np.arange(region.n_regions), region
 
 
-def _kind_of(region: Region, footprint: FixedMixture) -> _SameShapes | None:
+def _shapes_of_region(region: Region, footprint: FixedMixture) -> _ShapesOfOneKind | None:
     if not isinstance(region, (EllipseRegion, PolygonRegion)) or (region.outside, region.inside) != (0.0, 1.0):
         return None
     return (

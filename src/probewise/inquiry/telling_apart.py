@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise.errors import ParameterError, ShapeError
-from probewise.inquiry.forecast import MOST_LEVELS, predicted, spread_levels
+from probewise.inquiry.forecast import MOST_LEVELS, predict_where_visible, spread_levels
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
@@ -62,7 +62,7 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
         raise ParameterError(
             "rivals", [rival.probability for rival in rivals], "two models or more, one of them above 0"
         )
-    answers = [predicted(rival.model, rival.theta, plan) for rival in rivals]
+    answers = [predict_where_visible(rival.model, rival.theta, plan) for rival in rivals]
     low, high = min(a.min() for a in answers), max(a.max() for a in answers)
     levels = spread_levels(float(low), float(high), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
     chance = readout.probability(levels, most=MOST_LEVELS)
@@ -80,7 +80,7 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
 
 
 def _level_distribution(answers: FloatArray, levels: FloatArray) -> FloatArray:
-    """Return the share of samples that predict each level, (n_samples, n_points) -> (n_points, n_levels)."""
+    """Return the share of samples whose prediction is nearest to each level: (n_points, n_levels)."""
     n_samples, n_points = answers.shape
     index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
     key = index + np.arange(n_points) * len(levels)

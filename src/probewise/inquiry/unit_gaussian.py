@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.inquiry.scanlines import single, whole
+from probewise.inquiry.scanlines import to_int32, to_single_precision
 
 REACH = 4.0
 """Sds beyond which an edge is negligible: 3e-5 of the span."""
@@ -26,29 +26,29 @@ _N_BENDS = 64
 _NODES = 40
 
 
-def seen_of_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> FloatArray:
-    """Return the mass of the unit Gaussian within two edges: bivariate normal CDF of their distances.
+def mass_within_corner(first: FloatArray, second: FloatArray, opening: IntArray) -> FloatArray:
+    """Return the mass of the unit Gaussian inside both edges of a corner: bivariate normal CDF of their distances.
 
     `opening` numbers the correlation r of the two distances: floor((arcsin(r) / pi + 1 / 2) N_OPENINGS).
     """
     index = opening * (_N * _N) + _index_of(second) * _N
     index += _index_of(first)
-    return np.asarray(_corners().reshape(-1)[index])
+    return np.asarray(_corner_table().reshape(-1)[index])
 
 
-def seen_of_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
-    """Return the mass of the unit Gaussian within a curved edge; `bend` is the curvature times the sd."""
-    index = np.minimum(whole(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
+def mass_within_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
+    """Return the mass of the unit Gaussian inside a curved edge; `bend` is the edge's curvature times the sd."""
+    index = np.minimum(to_int32(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
     index += _index_of(distance)
-    return np.asarray(_bends().reshape(-1)[index])
+    return np.asarray(_bend_table().reshape(-1)[index])
 
 
 def _index_of(distance: FloatArray) -> IntArray:
-    return whole(np.clip(distance, -REACH, REACH) * _PER_SD + (REACH * _PER_SD + 0.5))
+    return to_int32(np.clip(distance, -REACH, REACH) * _PER_SD + (REACH * _PER_SD + 0.5))
 
 
 @cache
-def _corners() -> FloatArray:
+def _corner_table() -> FloatArray:
     """Tabulate the bivariate normal CDF F(h, k; r) for correlations r and distances h, k: (N_OPENINGS, n, n).
 
     Plackett's integral over t, the correlation's arc sine:
@@ -71,14 +71,14 @@ def _corners() -> FloatArray:
         at = until
         out[half + n] = total
         out[half - 1 - n] = ndtr(h) - total[:, ::-1]
-    return single(out)
+    return to_single_precision(out)
 
 
 @cache
-def _bends() -> FloatArray:
+def _bend_table() -> FloatArray:
     """Tabulate (n_bends, n): for a parabola, E[F(distance - bend t^2 / 2)], t unit Gaussian, by Gauss-Hermite."""
     node, share = np.polynomial.hermite_e.hermegauss(_NODES)
     middle = (np.arange(_N_BENDS) + 0.5) / _N_BENDS
     bend = (middle / (1.0 - middle))[:, None, None]
     distance = np.linspace(-REACH, REACH, _N)[:, None]
-    return single(ndtr(distance - bend * node**2 / 2) @ (share / share.sum()))
+    return to_single_precision(ndtr(distance - bend * node**2 / 2) @ (share / share.sum()))

@@ -64,7 +64,7 @@ class UtilityMap:
 
     @property
     def best(self) -> BoolArray:
-        """Mask of the designs with the largest utility, shape (n_designs,)."""
+        """Mask of the reachable designs with the largest utility, ties included, shape (n_designs,)."""
         return best_places(self.values, self.reachable)
 
     def choose(self, *, rng: np.random.Generator) -> tuple[float, float]:

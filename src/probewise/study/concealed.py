@@ -60,7 +60,7 @@ _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
 
 @dataclass(frozen=True)
 class Fading:
-    """A lamp that loses a share of the signal with every reading (eight seconds)."""
+    """A lamp that fades linearly: every eight seconds it loses the same share of its first signal, down to zero."""
 
     share: float
 
@@ -68,7 +68,7 @@ class Fading:
     stage: ClassVar[Stage] = "gain"
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Scale the signal."""
+        """Scale the signal by what is left at the time of each row."""
         return np.asarray(values * np.maximum(1.0 - self.share * rows.time_s / _EACH_S, 0.0))
 
 
@@ -150,13 +150,20 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
 
     Returns
     -------
-    A JSON object: `known`, `readings`, `error_mm` (largest error of a length), `held` (whether each 95 % interval
-    covers the truth), `chance_wrong`, the probability of the true effect and the credible set of names, whether the run
-    reports a fault (`noticed`), and processor time per decision (`cpu_s`: median, 95 %).
+    A JSON object: whether the target precision was reached (`known`), number of `readings`; `error_mm`, `held` and
+    `chance_wrong` as in `run_trial`. Then the probability of the true effect (`p_truth`), the names in the `credible`
+    set, whether the run reports a fault (`noticed`). And processor time per decision in seconds (`cpu_s`): median and
+    95 % quantile.
     """
     experiment = replace(experiment_of(REFERENCE), trust=trial.trust)
     cpu = []
-    steps = timed_steps(_arm(trial), experiment, seed=trial.seed, circle=trial.circle, max_readings=trial.max_readings)
+    steps = timed_steps(
+        _arm_in_concealed_world(trial),
+        experiment,
+        seed=trial.seed,
+        circle=trial.circle,
+        max_readings=trial.max_readings,
+    )
     for step, cpu_s in steps:
         last = step
         cpu.append(cpu_s)
@@ -172,8 +179,8 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     }
 
 
-def _arm(trial: ConcealedTrial) -> SimulatedArm:
-    """Return an arm in the world with the concealed effect; its noise depends only on the number of the reading."""
+def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
+    """Return an arm in the world with the concealed effect; seed, circle and reading number determine its noise."""
     concealed: tuple[Concealed, ...] = ()
     if trial.effect:
         make, sizes = CONCEALED[trial.effect]
@@ -286,7 +293,7 @@ def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[
 
 def concealed_table(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Summarise each row for a CSV file: shares with their intervals as text."""
-    return [{name: _cell(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
+    return [{name: _csv_value(getattr(row, name)) for name in _COLUMNS} for row in concealed_rows(results)]
 
 
 def _summary_row(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str, Any]]]) -> ConcealedRow:
@@ -312,7 +319,7 @@ def _summary_row(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str,
     )
 
 
-def _cell(value: object) -> object:
+def _csv_value(value: object) -> object:
     if isinstance(value, Estimate):
         return f"{value.value:.2f} ({value.low:.2f} to {value.high:.2f})"
     return "" if value is None else value

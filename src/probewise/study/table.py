@@ -103,17 +103,17 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
     return Summary(
         n_runs=len(trials),
         reached=share_within(len(sure), len(trials)),
-        mean=_mean(needed),
-        median=_median(needed),
-        to_white=_mean(met),
-        after_white=_mean(np.array(after, dtype=np.float64)),
-        bits_each=_mean(np.array([t["bits"] / t["readings"] for t in trials])),
+        mean=_mean_with_error(needed),
+        median=_median_with_interval(needed),
+        to_white=_mean_with_error(met),
+        after_white=_mean_with_error(np.array(after, dtype=np.float64)),
+        bits_each=_mean_with_error(np.array([t["bits"] / t["readings"] for t in trials])),
         error_mm=float(np.median(errors)) if len(errors) else math.nan,
         wrong=int((errors > WRONG_MM).sum()),
         wrong_expected=expected,
         wrong_limit=int(poisson.isf(_CHANCE, expected)) if expected > 0 else 0,
-        held=_mean(np.array([np.mean(t["held"]) for t in sure])),
-        arm_s=_mean(np.array([t["arm_s"] for t in trials])),
+        held=_mean_with_error(np.array([np.mean(t["held"]) for t in sure])),
+        arm_s=_mean_with_error(np.array([t["arm_s"] for t in trials])),
         cpu_s=float(np.median([t["cpu_s"] for t in trials])),
     )
 
@@ -129,14 +129,14 @@ def share_within(k: int, n: int) -> Estimate:
     return Estimate(share, centre - half if k else 0.0, centre + half if k < n else 1.0)
 
 
-def _mean(values: FloatArray) -> Estimate:
+def _mean_with_error(values: FloatArray) -> Estimate:
     if values.size < 2:
         return Estimate(math.nan, math.nan, math.nan)
     mean, error = float(values.mean()), float(values.std(ddof=1)) / math.sqrt(values.size)
     return Estimate(mean, mean - error, mean + error)
 
 
-def _median(values: FloatArray) -> Estimate:
+def _median_with_interval(values: FloatArray) -> Estimate:
     """Return the median with a distribution-free 95 % interval of order statistics.
 
     The range of fewer than six values covers the median less often, so that there is no interval.

@@ -111,11 +111,11 @@ def run_trial(trial: Trial) -> dict[str, Any]:
 
     Returns
     -------
-    A JSON object: whether the target precision was reached (`reached`), number of `readings`, number of the first one
-    on white (`first_white`, or None), total `bits` gained and those at the first white (`bits_at_white`), the largest
-    error of a length (`error_mm`) and its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 %
-    interval covers the truth (`held`), arm time in seconds (`arm_s`), median processor time per decision (`cpu_s`),
-    widest posterior sd after each reading (`widest_mm`), and the p-value of the fit (`p_value`).
+    A JSON object. Search: whether the target precision was `reached`, number of `readings`, number of the first one on
+    white (`first_white`, or None), `bits` gained in all and up to that one (`bits_at_white`). Result: largest error of
+    a length (`error_mm`), its posterior probability of exceeding 12 mm (`chance_wrong`), whether each 95 % interval
+    covers the truth (`held`), p-value of the fit (`p_value`), widest posterior sd after each reading (`widest_mm`).
+    Cost: arm time in seconds (`arm_s`), median processor time per decision in seconds (`cpu_s`).
     """
     experiment = experiment_for_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None

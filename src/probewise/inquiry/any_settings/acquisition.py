@@ -72,7 +72,9 @@ class Predictive:
         alone = self._centre[:, None, :] + self._scale[:, None, :] * node[:, None]
         log_own = self.noise.log_density(alone, self._centre[:, None, :], self._scale[:, None, :])
         given = (weight[:, None] * log_own).sum(axis=1).mean(axis=0)
-        mixed = np.concatenate([self._over_nodes(np.log(density)) for _, _, density, _ in self._blocks()])
+        mixed = np.concatenate(
+            [self._mean_over_nodes(np.log(density)) for _, _, density, _ in self._blocks_of_settings()]
+        )
         share = self.noise.outliers
         if share:
             outliers = self.noise.outlier_nodes(_N_OUTLIERS)[:, None, None]
@@ -92,10 +94,10 @@ class Predictive:
         """
         n = self._order.shape[0]
         centred = values[:n] - values[:n].mean(axis=0)
-        lines = [self._regression(value) for value in centred.T]
+        lines = [self._regression_on_reading(value) for value in centred.T]
         least = _LEAST_SHARE * (centred**2).mean(axis=0)
         out = np.zeros(self._order.shape[1])
-        for rows, at, density, each in self._blocks():
+        for rows, at, density, each in self._blocks_of_settings():
             for (level, slope, rest), sd, at_least in zip(lines, goal, least, strict=True):
                 a, b, r = level[:, rows], slope[:, rows], rest[:, rows]
                 mean, by_reading, square, both, curve = (
@@ -103,10 +105,10 @@ class Predictive:
                 )
                 variance = square + at * (both + at * curve) - (mean + at * by_reading) ** 2
                 far = 0.5 * np.log(np.maximum(variance, at_least)) - math.log(sd)
-                out[rows] += self._over_nodes(np.maximum(far, 0.0))
+                out[rows] += self._mean_over_nodes(np.maximum(far, 0.0))
         return out
 
-    def _regression(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _regression_on_reading(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Regress a value on the reading within each group: level, slope, residual variance, (n_groups, n_settings).
 
         Within a group, value and reading are assumed jointly Gaussian.
@@ -117,7 +119,7 @@ class Predictive:
         slope = together / self._width**2
         return mean - slope * self._centre, slope, own.var(axis=1) - slope * together
 
-    def _blocks(self) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
+    def _blocks_of_settings(self) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
         """Yield blocks of settings: rows, nodes (n_rows, n_nodes), density at each, and each group's part of it."""
         n_groups, n_settings = self._centre.shape
         node = self.noise.nodes[0]
@@ -134,7 +136,7 @@ class Predictive:
             each = np.exp(self.noise.log_density(at[None], centre[:, :, None], width[:, :, None])) / n_groups
             yield rows, at, each.sum(axis=0), each
 
-    def _over_nodes(self, values: FloatArray) -> FloatArray:
+    def _mean_over_nodes(self, values: FloatArray) -> FloatArray:
         """Mean over the predictive distribution, (n_rows, n_nodes) -> (n_rows,)."""
         n_groups = len(self._centre)
         weight = np.tile(self.noise.nodes[1], n_groups) / n_groups

@@ -87,7 +87,7 @@ class Inquiry(ShowsItself):
         self._settings = Settings.of(settings)
         self._model = Model.of(model, named, ReadingNoise.of(noise), self._settings)
         self._rng = rng
-        self._goal = _goal(goal, self._model.prior.names)
+        self._goal = _checked_goal(goal, self._model.prior.names)
         self._cost_s = cost_s
         self._n_samples, self._n_live = (
             require_whole("n_samples", n_samples, least=400),
@@ -98,7 +98,7 @@ class Inquiry(ShowsItself):
         self._readings: Readings | None = None
         self._utility: FloatArray | None = None
         self._next: Any = None
-        self._costs()
+        self._costs_s()
 
     @property
     def posterior(self) -> Weighted:
@@ -123,7 +123,7 @@ class Inquiry(ShowsItself):
         the expected decrease of the sum of ln(sd / goal); and once the goal is reached, information again.
         """
         if self._utility is None:
-            self._utility = self._utility_under(self._posterior.weight) / self._costs()
+            self._utility = self._utility_by_weights(self._posterior.weight) / self._costs_s()
             self._utility.flags.writeable = False
         return self._utility
 
@@ -131,7 +131,7 @@ class Inquiry(ShowsItself):
     def utility_label(self) -> str:
         """Axis label of the acquisition function, with its unit."""
         per_second = "" if self._cost_s is None else " per second"
-        return f"{_NEARER if self._near else _BITS}{per_second}"
+        return f"{_NEARER if self._is_near_goal else _BITS}{per_second}"
 
     @property
     def worth(self) -> FloatArray:
@@ -150,7 +150,7 @@ class Inquiry(ShowsItself):
         """Whether the posterior sd of every parameter in the goal is at most its goal."""
         if not self._goal:
             raise ParameterError("goal", None, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
-        return self._times_goal <= 1.0
+        return self._largest_sd_over_goal <= 1.0
 
     @property
     def doubt(self) -> str | None:
@@ -194,7 +194,7 @@ class Inquiry(ShowsItself):
         """
         value = require_finite_number("reading", reading, "a finite number; leave out a missing reading")
         at = self._settings.parsed(self.next() if setting is None else setting)
-        readings = _appended(self._readings, self._model, at, value)
+        readings = _append_reading(self._readings, self._model, at, value)
         theta = self._posterior.theta
         log_density = self._model.log_density(theta, at, np.array([value]))[:, 0]
         self._posterior = updated(self._posterior, readings, log_density, self._n_samples, self._n_live, rng=self._rng)
@@ -221,7 +221,7 @@ class Inquiry(ShowsItself):
                 imagined = noise.draw(predicted[truth], scale[truth], rng=self._rng)
                 log_density = noise.log_density(imagined, predicted, scale)[:, 0]
                 weights[k] = weight * np.exp(log_density - log_density[weight > 0].max())
-            utility = np.mean([self._utility_under(weight) for weight in weights], axis=0) / self._costs()
+            utility = np.mean([self._utility_by_weights(weight) for weight in weights], axis=0) / self._costs_s()
             rows.append(choose(utility, everywhere, rng=self._rng))
         return [self._settings[row] for row in rows]
 
@@ -241,30 +241,30 @@ class Inquiry(ShowsItself):
         return "\n".join([*lines, *([] if self.doubt is None else [f"doubtful: {self.doubt}"])])
 
     @property
-    def _times_goal(self) -> float:
+    def _largest_sd_over_goal(self) -> float:
         """Largest ratio of a posterior sd to its goal."""
         sd = dict(zip(self._posterior.names, self._posterior.sd(), strict=True))
         return float(max(sd[name] / goal for name, goal in self._goal.items()))
 
     @property
-    def _near(self) -> bool:
+    def _is_near_goal(self) -> bool:
         """Whether the goal is not reached yet, but every sd is within `_NEAR_GOAL` times its goal."""
-        return bool(self._goal) and 1.0 < self._times_goal < _NEAR_GOAL
+        return bool(self._goal) and 1.0 < self._largest_sd_over_goal < _NEAR_GOAL
 
-    def _utility_under(self, weight: FloatArray) -> FloatArray:
+    def _utility_by_weights(self, weight: FloatArray) -> FloatArray:
         """Compute the acquisition function for the posterior samples with these weights, (n_settings,)."""
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
         theta = self._posterior.theta[resampled(weight, n, self._rng)]
         theta = theta[self._rng.permutation(n)]  # copies of one sample apart
         predicted = self._model.predict(theta, self._settings)
         predictive = Predictive(predicted, self._model.scale(theta, predicted), self._model.noise)
-        if not self._near:
+        if not self._is_near_goal:
             return predictive.information()
         values, goal = theta[:, [self._posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
         now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
         return np.asarray(now - predictive.distance(values, np.array(goal)))
 
-    def _costs(self) -> FloatArray:
+    def _costs_s(self) -> FloatArray:
         """Return the seconds of a reading at each setting from here, (n_settings,) or a single number."""
         given = self._cost_s
         if given is None:
@@ -279,7 +279,7 @@ class Inquiry(ShowsItself):
         return cost_s
 
 
-def _goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
+def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
     """Check the target sds by parameter; none if no goal is given."""
     if goal is None:
         return {}
@@ -293,7 +293,7 @@ def _goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str,
     return dict(goal)
 
 
-def _appended(readings: Readings | None, model: Model, at: Settings, value: float) -> Readings:
+def _append_reading(readings: Readings | None, model: Model, at: Settings, value: float) -> Readings:
     """Append a reading; settings that were read before are not listed again."""
     if readings is None:
         return Readings(model, at, np.array([0]), np.array([value]))

@@ -98,10 +98,10 @@ class ReadingNoise:
 
     def log_density(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
         """Natural log of the density of each reading; arrays that broadcast."""
-        core = self._log_core((readings - predicted) / scale) - np.log(scale)
+        core = self._log_standard_density((readings - predicted) / scale) - np.log(scale)
         if not self.outliers:
             return np.asarray(core)
-        return np.asarray(np.logaddexp(math.log1p(-self.outliers) + core, self._log_outlier(readings)))
+        return np.asarray(np.logaddexp(math.log1p(-self.outliers) + core, self._log_outlier_density(readings)))
 
     def cdf(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
         """Probability of a smaller reading; arrays that broadcast."""
@@ -143,14 +143,14 @@ class ReadingNoise:
         assert self.between is not None
         return self.between
 
-    def _log_core(self, z: FloatArray) -> FloatArray:
+    def _log_standard_density(self, z: FloatArray) -> FloatArray:
         if math.isinf(self.dof):
             return np.asarray(-0.5 * (z * z + _LOG_2PI))
         nu = self.dof
         constant = float(gammaln((nu + 1) / 2) - gammaln(nu / 2)) - 0.5 * math.log(nu * math.pi)
         return np.asarray(constant - 0.5 * (nu + 1) * np.log1p(z * z / nu))
 
-    def _log_outlier(self, readings: FloatArray) -> FloatArray:
+    def _log_outlier_density(self, readings: FloatArray) -> FloatArray:
         low, high = self._outlier_range
         inside = (readings >= low) & (readings <= high)
         return np.where(inside, math.log(self.outliers / (high - low)), -np.inf)

@@ -40,10 +40,10 @@ class Model:
     def of(cls, function: Callable[..., Any], prior: Prior, noise: ReadingNoise, settings: Settings) -> Model:
         """Find out how a user's function can be called: with arrays, for one sample, or for one reading."""
 
-        def many(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
+        def call_with_arrays(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
             return function(dict(parameters), settings.given(columns))
 
-        def single(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
+        def call_for_one_sample(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
             rows = Settings(columns, settings.form)
             return np.array([function(dict(parameters), rows[k]) for k in range(len(rows))])
 
@@ -52,9 +52,9 @@ class Model:
         samples = {name: theta[:, [k]] for k, name in enumerate(prior.names)}
         some = settings.take(np.unique(np.linspace(0, len(settings) - 1, _N_PROBED).astype(int))).columns
         try:
-            caller = Caller.probed(many, samples, some, per_run=(), broadcasts=False, name="model")
+            caller = Caller.probed(call_with_arrays, samples, some, per_run=(), broadcasts=False, name="model")
         except Exception:
-            caller = Caller.probed(single, samples, some, per_run=(), broadcasts=False, name="model")
+            caller = Caller.probed(call_for_one_sample, samples, some, per_run=(), broadcasts=False, name="model")
         return cls(caller, prior, noise)
 
     @cached_property
@@ -171,13 +171,13 @@ def updated(
         Source of randomness.
     """
 
-    def anew() -> NestedResult:
+    def nested_run() -> NestedResult:
         return run(readings, rng=rng, n_live=n_live)
 
     reweighed = previous.log_weight + log_density
     gained = float(logsumexp(reweighed))
     if not math.isfinite(gained):
-        found = anew()
+        found = nested_run()
         return update(found, readings, rng=rng, n_draws=n, fall_back=lambda: found)
     n_eff = n_effective(reweighed)
     now = replace(
@@ -193,4 +193,4 @@ def updated(
     if n_eff >= _KEEP * n and now.pareto_k < 0.7:
         return now
 
-    return update(now, readings, rng=rng, n_draws=n, fall_back=anew)
+    return update(now, readings, rng=rng, n_draws=n, fall_back=nested_run)

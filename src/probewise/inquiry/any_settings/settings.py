@@ -36,7 +36,7 @@ class Settings:
         if isinstance(given, Settings):
             return given
         if isinstance(given, Mapping):
-            columns = {str(name): _column(f"settings[{name!r}]", values) for name, values in given.items()}
+            columns = {str(name): _checked_column(f"settings[{name!r}]", values) for name, values in given.items()}
             if not columns or len({len(column) for column in columns.values()}) != 1:
                 sizes = {name: len(column) for name, column in columns.items()}
                 raise ParameterError("settings", sizes, _ALLOWED)
@@ -46,9 +46,9 @@ class Settings:
         except ValueError as error:
             raise ParameterError("settings", given, _ALLOWED) from error
         if array.ndim == 2 and array.shape[1] >= 1 and len(array):
-            columns = {str(k): _column("settings", column) for k, column in enumerate(array.T)}
+            columns = {str(k): _checked_column("settings", column) for k, column in enumerate(array.T)}
             return cls(columns, "several")
-        return cls({"setting": _column("settings", array)}, "one")
+        return cls({"setting": _checked_column("settings", array)}, "one")
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
@@ -69,7 +69,7 @@ class Settings:
 
     def __getitem__(self, row: int) -> Any:
         """Return one setting: a number or a name, an array (n_knobs,), or a dict by name."""
-        own = {name: _plain(column[row]) for name, column in self.columns.items()}
+        own = {name: _plain_value(column[row]) for name, column in self.columns.items()}
         if self.form == "one":
             return own["setting"]
         return np.array(list(own.values())) if self.form == "several" else own
@@ -86,7 +86,7 @@ class Settings:
             if np.shape(setting) != (len(self.columns),):
                 raise ParameterError("setting", setting, f"{len(self.columns)} numbers, one for each knob")
             columns = {name: [value] for name, value in zip(self.columns, setting, strict=True)}
-        made = {name: _column("setting", values) for name, values in columns.items()}
+        made = {name: _checked_column("setting", values) for name, values in columns.items()}
         for name, column in made.items():
             if (column.dtype.kind == "U") != (self.columns[name].dtype.kind == "U"):
                 kind = "a name" if self.columns[name].dtype.kind == "U" else "a number"
@@ -94,7 +94,7 @@ class Settings:
         return Settings(made, self.form)
 
 
-def _column(name: str, values: Any) -> Column:
+def _checked_column(name: str, values: Any) -> Column:
     """Convert the values of one knob to a read-only column of finite numbers or of names, (n,)."""
     array = np.asarray(values)
     if array.ndim != 1 or not array.size or array.dtype.kind not in "biufU":
@@ -108,5 +108,5 @@ def _column(name: str, values: Any) -> Column:
     return array
 
 
-def _plain(value: Any) -> float | str:
+def _plain_value(value: Any) -> float | str:
     return str(value) if isinstance(value, str) else float(value)

@@ -29,14 +29,14 @@ class Budget:
 
     def minus(self, plan: Plan, after_s: float) -> Budget:
         """Subtract the cost of a plan that begins after a time; the budget stays at 0 or more."""
-        return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes(plan, after_s), 0.0))
+        return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes_of_plan(plan, after_s), 0.0))
 
     def affordable(self, plan: Plan, after_s: float) -> Plan | None:
         """Return the leading scans of a plan that fit the budget; None if not even the first does."""
         kept = np.zeros(0, dtype=np.int64)
         for rows in plan.rows_by_scan():
             more = np.concatenate([kept, rows])
-            if len(more) > self.readings or _minutes(plan.take(more), after_s) > self.minutes:
+            if len(more) > self.readings or _minutes_of_plan(plan.take(more), after_s) > self.minutes:
                 break
             kept = more
         if len(kept) == len(plan):
@@ -44,5 +44,5 @@ class Budget:
         return plan.take(kept) if kept.size else None
 
 
-def _minutes(plan: Plan, after_s: float) -> float:
+def _minutes_of_plan(plan: Plan, after_s: float) -> float:
     return (float(plan.time_s.max()) - after_s) / 60.0

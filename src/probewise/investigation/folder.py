@@ -60,7 +60,7 @@ class RoundsFolder:
         if resume:
             if not file.exists():
                 raise FileError(file, "no such file", "an investigation to resume; omit --resume to begin a new one")
-            _require_same(file, wanted)
+            _require_same_settings(file, wanted)
         elif file.exists():
             raise FileError(file, "an investigation is in this folder", "--resume to continue it, or another --out")
         self._settings = wanted
@@ -91,18 +91,18 @@ class RoundsFolder:
     @property
     def n_readings(self) -> int:
         """Number of readings in the folder."""
-        return sum(len(recording) for recording in self._recordings())
+        return sum(len(recording) for recording in self._recordings_of_rounds())
 
     @property
     def ended_s(self) -> float:
         """Time of the last reading; 0 if there is none."""
-        return max((float(recording.plan.time_s.max()) for recording in self._recordings()), default=0.0)
+        return max((float(recording.plan.time_s.max()) for recording in self._recordings_of_rounds()), default=0.0)
 
-    def _recordings(self) -> Iterator[Recording]:
+    def _recordings_of_rounds(self) -> Iterator[Recording]:
         return (read_recording(file) for file in self.path.glob("[0-9]*.csv") if file.stem.isdigit())
 
 
-def _require_same(file: Path, wanted: Mapping[str, Any]) -> None:
+def _require_same_settings(file: Path, wanted: Mapping[str, Any]) -> None:
     before = json_of(file, read_text(file, _ALLOWED), _ALLOWED)
     if not isinstance(before, dict):
         raise FileError(file, "no JSON object", _ALLOWED)

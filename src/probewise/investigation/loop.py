@@ -72,7 +72,7 @@ def investigate(
     if budget is not None:
         require_kind("budget", budget, Budget, "a Budget(readings=..., minutes=...), or None")
     require_whole("rounds", rounds)
-    return _rounds(
+    return _rounds_until_stop(
         record,
         plan,
         partial(diagnose, sensor=sensor, effects=effects, hands=hands, progress=progress),
@@ -82,7 +82,7 @@ def investigate(
     )
 
 
-def _rounds(
+def _rounds_until_stop(
     record: Record,
     plan: Plan,
     diagnosed: Callable[..., Diagnosis],
@@ -101,7 +101,7 @@ def _rounds(
         affordable = None if following is None else budget.affordable(following.plan, over_s)
         reason = (
             settled
-            or _nothing_to_ask(following)
+            or _reason_without_plan(following)
             or (f"the limit of {rounds} rounds is reached" if number == rounds else None)
             or ("the budget of readings is spent" if affordable is None else None)
         )
@@ -112,5 +112,6 @@ def _rounds(
         asked, wanted = following.description, affordable
 
 
-def _nothing_to_ask(following: NextMeasurement | None) -> str | None:
+def _reason_without_plan(following: NextMeasurement | None) -> str | None:
+    """Return the reason to stop where no further readings are advised; None if there are some."""
     return "no further reading would tell more" if following is None else None

@@ -41,13 +41,13 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
     ParameterError
         If the effect is unknown or takes other values.
     """
-    return () if text == NOTHING else tuple(_one(part) for part in text.split("+"))
+    return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
 
 
-def _one(text: str) -> Concealed:
+def _parse_one_effect(text: str) -> Concealed:
     """Parse one effect, NAME:VALUE,VALUE."""
     name, _, numbers = text.partition(":")
-    kinds = _kinds()
+    kinds = _effects_of_numbers()
     if name not in kinds:
         meant = did_you_mean(name, kinds)
         raise ParameterError(
@@ -66,7 +66,7 @@ def _one(text: str) -> Concealed:
     return effect  # type: ignore[no-any-return]
 
 
-def _kinds() -> dict[str, Any]:
+def _effects_of_numbers() -> dict[str, Any]:
     """Return the effects whose parameters are all numbers, by name."""
     every: list[Any] = [getattr(concealed, name) for name in concealed.__all__]
     named = [kind for kind in every if isinstance(getattr(kind, "name", None), str)]

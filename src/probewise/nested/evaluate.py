@@ -210,6 +210,7 @@ class Evaluator:
                 yield self.problem.log_likelihood(part.copy())
 
     def _require_log_likelihoods(self, answer: object, theta: FloatArray) -> FloatArray:
+        """Convert the likelihood's answer to (n,) floats; NotConvergedError for masked, complex or misshapen ones."""
         if isinstance(answer, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(answer).sum())):
             raise NotConvergedError(
                 f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: "

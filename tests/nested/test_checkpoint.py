@@ -696,7 +696,7 @@ def test_saving_takes_a_tenth_of_the_time_at_most(path: Path, monkeypatch: pytes
     settings = settings_of(("p0",), 10, 5, SliceMove(), RemainingEvidence(), "{}")
     clock = itertools.count(0.0, 3.0)
     monkeypatch.setattr("probewise.nested.checkpoint.time.monotonic", lambda: next(clock))
-    keeper = CheckpointFile(path, 1.0, settings, _last=0.0)
+    keeper = CheckpointFile(path, 1.0, settings, _last_saving=0.0)
     live = Live(_points(10, 1), Origin.of_prior(10), 0.0)
     saved = []
     for k in range(60):

@@ -140,7 +140,7 @@ class _SecondEstimate:
         log_z, error = self.log_z
         return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
-    def is_doubtful_beside(self, run: NestedResult, most: float) -> bool:
+    def disagrees_or_is_doubtful(self, run: NestedResult, most: float) -> bool:
         """Return whether a run is more than `most` errors away, or this estimate is itself doubtful."""
         return abs(self.distance(run)) > most or bool(self.runs[-1].warnings)
 
@@ -215,10 +215,10 @@ def check_and_repeat(
                 f"({int(budget.limit)} evaluations in all); use a greater limit, or max_cost=1 for no check",
             )
         else:
-            if second.is_doubtful_beside(now, _APART):
+            if second.disagrees_or_is_doubtful(now, _APART):
                 second = _with_sharper_estimate(second, now, first, budget)
             n_check = second.n_calls + missing.n_calls
-            if second.is_doubtful_beside(now, DISAGREE):
+            if second.disagrees_or_is_doubtful(now, DISAGREE):
                 again = budget.run_route(
                     _EvidenceRoute(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes)
                 )
@@ -277,7 +277,7 @@ def _agreeing_run_and_estimate(
     """
     if again is None or again.warnings:
         return now, second
-    if not second.is_doubtful_beside(again, DISAGREE):
+    if not second.disagrees_or_is_doubtful(again, DISAGREE):
         return again, second
     if second.is_too_low_on_curve(now, again):
         shorter = replace(second.route, name="the same run with shorter chains")

@@ -228,6 +228,8 @@ class LegoArm:
         ------
         LinkError
             If a joint meets no stop, or the brick does not answer.
+        ReachError
+            If the sensor cannot rise from where the links are.
         """
         stopped = []
         for joint in (ELBOW, SHOULDER, BASE):

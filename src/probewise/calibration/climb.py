@@ -353,7 +353,7 @@ def _next(rise: FloatArray, beta: float, share: float, n_particles: int) -> floa
 def _moved_along_differences(
     now: _Cloud, known: Callable[[FloatArray], _Cloud], beta: float, rng: np.random.Generator
 ) -> tuple[_Cloud, float]:
-    """Move each particle once, one half after the other; tell the share of moves accepted.
+    """Move each particle once, one half after the other; return the cloud and the share of moves accepted.
 
     Differences of two particles of one half are the directions of the other (differential evolution, ter Braak 2006).
     """

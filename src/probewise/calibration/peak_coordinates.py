@@ -35,7 +35,7 @@ class PeakCoordinates:
 
     @cached_property
     def relabelled(self) -> tuple[tuple[IntArray, FloatArray], ...]:
-        """The N! changes of labels: columns of the shapes and levels, and matrix of the contrasts."""
+        """The N! changes of labels: for each the order of columns of shapes and levels, and the contrasts' matrix."""
         n, c = self.prior.n_gaussians, self._contrasts
         found = []
         for order in itertools.permutations(range(n)):

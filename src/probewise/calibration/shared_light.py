@@ -49,7 +49,7 @@ class SharedLightDensity:
 
     @property
     def prior(self) -> SSFPrior:
-        """Of N Gaussians."""
+        """The prior of N Gaussians."""
         return self.space.prior
 
     def log_over_prior(self, theta: FloatArray) -> FloatArray:

@@ -50,7 +50,7 @@ class Stage:
 
 
 def check_out_directory(path: Path) -> Path:
-    """Return the path, before any work.
+    """Check before any work that results can be written there, and return the path.
 
     Raises ParameterError if a file is in the way, FileError if no directory can be made there.
     """
@@ -67,9 +67,10 @@ def check_out_directory(path: Path) -> Path:
 
 
 def check_out_file(path: Path, *inputs: Path) -> Path:
-    """Return the path, before any work.
+    """Check before any work that a file can be written there, and return the path.
 
-    Raises ParameterError if it is a directory or an input, FileError if it cannot be written.
+    Raises ParameterError if it is a directory, an input or below a file, FileError if its directory cannot be written
+    to.
     """
     if path.is_dir():
         raise ParameterError("--out", str(path), "a file name; this is a directory")
@@ -193,10 +194,10 @@ def _kept_names(out: Path, names: Sequence[str]) -> dict[str, str]:
     for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):
         group = [Path(name) for name in names if Path(name).with_suffix("") == stem]
         endings = itertools.chain(["_kept"], (f"_kept_{k}" for k in itertools.count(2)))
-        ending = next(e for e in endings if not any((out / _with_ending(path, e)).exists() for path in group))
-        aside |= {path.as_posix(): _with_ending(path, ending).as_posix() for path in group}
+        ending = next(e for e in endings if not any((out / _with_stem_ending(path, e)).exists() for path in group))
+        aside |= {path.as_posix(): _with_stem_ending(path, ending).as_posix() for path in group}
     return aside
 
 
-def _with_ending(path: Path, ending: str) -> Path:
+def _with_stem_ending(path: Path, ending: str) -> Path:
     return path.with_name(f"{path.stem}{ending}{path.suffix}")

@@ -137,7 +137,7 @@ def run(arguments: argparse.Namespace) -> int:
     with contextlib.ExitStack() as stack:
         stack.enter_context(reporting_what_is_kept(kept))
         if world is None:
-            take = stack.enter_context(_recorder(arguments, chosen, folder, seed=noise))
+            take = stack.enter_context(_opened_take(arguments, chosen, folder, seed=noise))
         else:
             take = SimulatedRecorder(world, noise)
         progress = stack.enter_context(progress_shown(quiet=arguments.quiet))
@@ -184,7 +184,7 @@ def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
 
 
 @contextlib.contextmanager
-def _recorder(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int) -> Iterator[Take]:
+def _opened_take(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int) -> Iterator[Take]:
     """Yield a function that carries out plans with an opened arm; a person or a simulated bench lays the sheets."""
     from probewise.arm import Request, carry_out
     from probewise.cli._bench import open_arm

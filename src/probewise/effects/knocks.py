@@ -31,7 +31,7 @@ class ArmKnock(ChangePointEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical shift to 0.5 % of the longest scan; None where all readings share one time."""
+        """Set the typical displacement to 0.5 % of the longest scan's length; None if all readings share one time."""
         times = change_point_times(extent)
         return None if times is None else cls(times, typical_mm=0.005 * extent.length_mm)
 
@@ -70,7 +70,7 @@ class GainStep(ChangePointEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search all times between readings; None where all readings share one time."""
+        """Search all times between readings; None if all readings share one time."""
         times = change_point_times(extent)
         return None if times is None else cls(times)
 

@@ -28,7 +28,7 @@ class SensorTilt(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical shift to 0.3 % of the longest scan."""
+        """Set the typical shift to 0.3 % of the length of the longest scan."""
         return cls(typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:

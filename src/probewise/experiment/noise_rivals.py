@@ -59,7 +59,7 @@ class OutlierLaw:
     sizes: FloatArray
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
+        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         narrow = _log_density_of_each(readings, predicted, self.sd, self.step)
         nodes = []
         for share, size in zip(self.shares, self.sizes, strict=True):
@@ -82,7 +82,7 @@ class LostReadingLaw:
     high: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
+        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         kept = _log_density_of_each(readings, predicted, self.sd, self.step)
         to_black = _log_density_of_each(readings, np.array([[self.black]]), self.sd, self.step)
         exactly = _log_density_of_each(readings, np.array([[self.black]]), self.sd * _EXACT, self.step)
@@ -104,7 +104,7 @@ class CorrelatedLaw:
     n_nodes: int = 6
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
+        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
         before = np.zeros_like(predicted)
         before[:, 1:] = (readings - predicted)[:, :-1]
@@ -128,7 +128,7 @@ class SignalDependentLaw:
     n_nodes: int = 6
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
+        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
         seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
         return _log_mean_over_nodes(
@@ -151,7 +151,7 @@ class FlickerLaw:
     amplitudes: tuple[float, ...]
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
+        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         sines = np.cos((np.arange(_PHASES) + 0.5) / _PHASES * np.pi)
         nodes = []
         for amplitude in self.amplitudes:
@@ -176,7 +176,7 @@ class LatticeLaw:
     step: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """See `Likelihood.log_prob`."""
+        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         least = max(_COARSE * self.sd, 1.5 * self.step)
         steps, n_free = self._possible_steps(readings)
         nodes = [

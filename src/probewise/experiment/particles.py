@@ -307,7 +307,10 @@ class _LastReading:
     problem: SensorProblem
 
     def misfit_nats(self, predicted: FloatArray) -> float:
-        """Return the loss in nats of the best prediction of the last reading against a perfect one."""
+        """Return by how many nats the best prediction of the last reading falls short of a perfect one.
+
+        It is 0 if the reading is missing.
+        """
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0

@@ -427,7 +427,7 @@ def _with_bridged_evidence(particles: Particles, problem: SensorProblem, rng: np
 
 
 def _as_independent_start(particles: Particles, found: Bridged) -> Particles:
-    """Return the samples with a new evidence as an independent start."""
+    """Give the samples a new evidence, and make them an independent start: each is its own ancestor."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
     start = Particles(weighted, np.arange(len(had.theta)), found.error**2)

@@ -39,7 +39,7 @@ def _n_early_dead_points(run: NestedResult) -> int:
 
 
 def scale_of_bulk(run: NestedResult, space: Space) -> FloatArray:
-    """Sds of the points that died where the posterior's bulk begins, (n_params,)."""
+    """Sds, in coordinates of the space, of the next points to die after the early ones, (n_params,)."""
     last = _n_early_dead_points(run)
     return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
 

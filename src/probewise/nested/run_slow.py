@@ -102,7 +102,7 @@ def run_slow(
     """Compute evidence and posterior of a problem in few evaluations, for likelihoods that take seconds.
 
     In up to ten dimensions it takes about as many evaluations for its error as the best peers, or fewer (measured on
-    six problems). In more than three it may miss a narrow part of the posterior, which is always among its doubts:
+    six problems). In more than three the draws may miss a narrow part of the posterior, which is among their doubts:
     use `run` where there may be one, and for fast likelihoods.
 
     Parameters

@@ -122,7 +122,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
         raise ParameterError(
             "scan", int(plan.scan[np.argmax(np.diff(plan.scan) < 0) + 1]), "scans in the order they were taken"
         )
-    names = _distinct_scan_names(plan)
+    names = _scan_names_made_distinct(plan)
     columns: dict[str, Sequence[str]] = {
         "scan": [names[k] for k in plan.scan],
         "pattern": [plan.pattern_names[k] for k in plan.pattern],
@@ -155,7 +155,7 @@ def _number_cells(name: str, values: FloatArray, largest: float = LARGEST) -> li
     return [number_text(value) for value in values.tolist()]
 
 
-def _distinct_scan_names(plan: Plan) -> dict[int, str]:
+def _scan_names_made_distinct(plan: Plan) -> dict[int, str]:
     """Return the scans' names, made distinct where consecutive scans share one: a file would join them."""
     names: dict[int, str] = {}
     last = ""

@@ -231,7 +231,7 @@ class Chain:
         found: Poses = self._applier(theta, plan)(Stage.POSE, told)
         return found
 
-    def _grouped_by_geometry(self, theta: FloatArray, footprint: Footprint) -> _GeometryGroups | None:
+    def _grouped_by_geometry(self, theta: FloatArray, footprint: Footprint) -> _HypothesesByGeometry | None:
         """Group hypotheses that differ only in the weights of their Gaussians; None where grouping saves nothing."""
         few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
         if few or footprint.weight.shape[1] > 1:
@@ -249,7 +249,7 @@ class Chain:
         first = np.unique(which, return_index=True)[1]
         # An effect may place a Gaussian by the weights of others, as a halo about their common centre.
         moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
-        return None if len(first) < len(theta) and any(moved) else _GeometryGroups(first, which)
+        return None if len(first) < len(theta) and any(moved) else _HypothesesByGeometry(first, which)
 
     def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
         """Place the scene under the poses; cached for the last plan where no hypothesis changes either."""
@@ -405,7 +405,7 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
 
 
 @dataclass(frozen=True, eq=False)
-class _GeometryGroups:
+class _HypothesesByGeometry:
     """Groups of hypotheses that differ only in the weights of their Gaussians, in which the response is linear.
 
     `first` is the first hypothesis of each group, (n_geometries,); `which` the group of each, (n_samples,).

@@ -224,7 +224,7 @@ class StraightCorners:
 
 @dataclass(frozen=True, eq=False)
 class _CornerViews:
-    """The distinct views of corners: the four quadrants about one corner share them.
+    """The distinct views of corners; one view serves all four quadrants about the corner.
 
     Three masses determine every quadrant: beyond the corner along both axes, along x, and along y. `turn_rad` is the
     sensor's orientation, (n_views,) or (1,); `x_mm`, `y_mm` the corner relative to the sensor, (n_views,). The masses

@@ -223,7 +223,7 @@ def states_by_step(
     columns: Mapping[str, NDArray[Any]],
     in_gap: IntArray,
 ) -> Iterator[dict[str, FloatArray]]:
-    """Integrate the motion: yield all states by name, (n_samples, n_runs) each, at the start and after every step.
+    """Integrate the motion: yield all states by name, (n_samples, n_runs) each, at the start and after each step of it.
 
     `in_gap`, (n_places - 1,), is the number of steps between one position and the next.
     """

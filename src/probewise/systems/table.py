@@ -109,7 +109,7 @@ class RunTable:
 
     @cached_property
     def time_begins_anew(self) -> bool:
-        """Whether time decreases from one row to the next, because it is counted from the start of each run."""
+        """Whether time decreases from any row to the next, as where it is counted from the start of each run."""
         return bool((np.diff(self.time_s) < 0).any())
 
     def rows_by_scan(self) -> list[IntArray]:

@@ -99,7 +99,7 @@ class NoiseModel:
                 [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
             )
             log_weights = (log_weights[:, None] + log_each).ravel()
-        level = self._noise_at(settings, seen)
+        level = self._noise_at_nodes(settings, seen)
         far = np.abs(residuals) > _FAR * sd
         laws = tuple(self._law(level, k, far) for k in range(len(settings)))
         if self.rounding:
@@ -116,7 +116,7 @@ class NoiseModel:
             return self.likely[effect.name]
         return effect.weighed_nodes(residuals, rows)
 
-    def _noise_at(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
+    def _noise_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
         """Return the noise at all nodes at once: relative sds and correlations with every noise effect applied.
 
         `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) are the predictions.

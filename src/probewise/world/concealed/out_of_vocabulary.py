@@ -122,7 +122,7 @@ class ThermalGain:
 
 @dataclass(frozen=True)
 class CrossTalk:
-    """Gain that varies with twice the orientation, as when a cable pulls at the sensor."""
+    """Gain that varies with twice the orientation: a pull of the cable gets into the signal."""
 
     name: ClassVar[str] = "cross_talk"
     stage: ClassVar[Stage] = "gain"

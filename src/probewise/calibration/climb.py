@@ -32,6 +32,8 @@ _BRIDGE_STEPS = 30
 _DRAWS, _MOST_DRAWS = 2, 16
 # Times that the posterior's samples are kept; moves of each particle once it is reached, and between two afresh.
 N_SNAPSHOTS = 4
+# Clouds of particles, whose scatter gives the error of an evidence.
+N_CLOUDS = 8
 _N_MORE, _AFRESH = 16, 2
 # A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
 _MOST_TEMPERATURES = 12

@@ -7,18 +7,20 @@ rarely lead from the one to the other. So each such part is reached, and its evi
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.calibration.climb import N_SNAPSHOTS, Climb
+from probewise.calibration.climb import N_CLOUDS, N_SNAPSHOTS, Climb
+from probewise.calibration.fields import by_mass
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.whole_coordinates import WholeCoordinates, count_bright
 from probewise.nested import NestedResult, Weighted
 
-_N_CLOUDS, _N_SAMPLES = 8, 4000
+_N_SAMPLES = 4000
 # A part of which there are fewer samples is left out.
 _LEAST_SAMPLES = 40
 # What speaks against a part speaks against the whole where the part holds this share.
@@ -64,9 +66,12 @@ class Part:
 
 def held_shares(parts: dict[int, Part]) -> dict[int, float]:
     """Share of the evidence that each part holds."""
-    log_z = np.array([part.log_z for part in parts.values()])
-    share = np.exp(log_z - logsumexp(log_z))
-    return dict(zip(parts, share.tolist(), strict=True))
+    return dict(zip(parts, _shares_of_evidence(parts.values()).tolist(), strict=True))
+
+
+def _shares_of_evidence(each: Iterable[Part | Climb]) -> FloatArray:
+    log_z = np.array([one.log_z for one in each])
+    return np.asarray(np.exp(log_z - logsumexp(log_z)))
 
 
 def split_by_bright(found: Climb | NestedResult | Weighted, rng: np.random.Generator) -> dict[int, Part]:
@@ -74,12 +79,8 @@ def split_by_bright(found: Climb | NestedResult | Weighted, rng: np.random.Gener
     if isinstance(found, Climb):
         theta, log_z, error = found.theta, found.log_z_of_clouds, found.start_error
     else:
-        theta, error = found.samples(_N_SAMPLES, rng=rng), found.log_z_error
-        log_z = np.full(_N_CLOUDS, found.log_z)
-        light = theta[:, :-2].reshape(len(theta), -1, 6)
-        mass = light[..., 0] / np.sqrt(light[..., 3] * light[..., 4] - light[..., 5] ** 2)
-        light = np.take_along_axis(light, np.argsort(-mass, axis=1)[..., None], axis=1)
-        theta = np.concatenate([light.reshape(len(theta), -1), theta[:, -2:]], axis=1)
+        theta, log_z, error = found.samples(_N_SAMPLES, rng=rng), np.full(N_CLOUDS, found.log_z), found.log_z_error
+        theta = by_mass(theta, theta.shape[1] // 6)
     bright = count_bright(theta)
     parts = {}
     for m in np.unique(bright).tolist():
@@ -94,8 +95,7 @@ def split_by_bright(found: Climb | NestedResult | Weighted, rng: np.random.Gener
 def joined(made: dict[int, Climb], rng: np.random.Generator) -> Climb:
     """Join climbs to the parts of a posterior: samples of each by its share of the evidence."""
     climbs = list(made.values())
-    log_z = np.array([climbed.log_z for climbed in climbs])
-    share = np.exp(log_z - logsumexp(log_z))
+    share = _shares_of_evidence(climbs)
     main = climbs[int(np.argmax(share))]
     lost = [climbed for climbed in climbs if climbed.temperatures[-1] < 1.0]
     if lost:

@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.climb import N_SNAPSHOTS, Climb, Rung, climb
+from probewise.calibration.climb import N_CLOUDS, N_SNAPSHOTS, Climb, Rung, climb
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.known_density import KnownDensity
 from probewise.calibration.mixed_reference import MixedReference
@@ -34,7 +34,6 @@ from probewise.calibration.whole_coordinates import count_bright
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
-_N_CLOUDS = 8
 # Quadrature nodes over curved edges where a Gaussian more is answered to first order: mostly within 0.001 of the span.
 _FEW_NODES = 8
 _N_PARTICLES = 1000
@@ -201,7 +200,7 @@ def _about_peak(
     density, n_calls = density_about_peak(problem, peak.theta, rng=rng)
     density = density.widened(_WIDENED)
     nothing = np.empty((_N_PARTICLES, 0))
-    clouds = np.zeros(_N_CLOUDS)
+    clouds = np.zeros(N_CLOUDS)
     # Once more from a density fitted to the samples: it is nearer, and proposes moves that are accepted.
     for n_more in (_FEW_MOVES, _FEW_MOVES if n == 1 else _MANY_MOVES):
         made = climb(
@@ -238,11 +237,9 @@ def _from_below(
     told: Callable[[Rung], None] | None,
 ) -> tuple[Climb, dict[int, Part]]:
     """Climb to each part of the posterior: from that below with a faint Gaussian more, or to where all are bright."""
-    about = [
-        density_about_peak(problems.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0]
-        for theta in (peak.theta, *peak.others)
-    ]
-    bright = count_bright(np.array([peak.theta, *peak.others]))
+    tops = [peak.theta, *peak.others]
+    about = [density_about_peak(problems.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in tops]
+    bright = count_bright(np.array(tops))
     held = held_shares(below)
     made: dict[int, Climb] = {}
     for m, part in below.items():
@@ -325,7 +322,7 @@ def _all_bright(
         problems.problem(n),
         reference,
         np.empty((_N_PARTICLES if n == 2 else _FEW_PARTICLES, 0)),
-        log_z_below=np.zeros(_N_CLOUDS),
+        log_z_below=np.zeros(N_CLOUDS),
         error_below=0.0,
         rng=rng,
         space=space,
@@ -344,16 +341,16 @@ def _with_bridged_evidence(made: Climb, log_z: FloatArray, added: FloatArray, ta
     if share < _LEAST_SHARE:
         return made
     # What each cloud adds to the bridge of all (jackknife): by itself a cloud that is stuck would outweigh the others.
-    own = np.repeat(np.arange(_N_CLOUDS), len(taken) // _N_CLOUDS)
-    of_added = np.repeat(np.arange(_N_CLOUDS), len(added) // _N_CLOUDS)
-    without = np.array([bridged(added[of_added != k], taken[own != k])[0] for k in range(_N_CLOUDS)])
+    own = np.repeat(np.arange(N_CLOUDS), len(taken) // N_CLOUDS)
+    of_added = np.repeat(np.arange(N_CLOUDS), len(added) // N_CLOUDS)
+    without = np.array([bridged(added[of_added != k], taken[own != k])[0] for k in range(N_CLOUDS)])
     # Samples of the posterior that still drift tell another evidence late than early.
-    by_time = taken.reshape(_N_CLOUDS, N_SNAPSHOTS, -1, taken.shape[1])
+    by_time = taken.reshape(N_CLOUDS, N_SNAPSHOTS, -1, taken.shape[1])
     early, late = (half.reshape(-1, taken.shape[1]) for half in np.split(by_time, 2, axis=1))
     drift = bridged(added, late)[0] - bridged(added, early)[0]
     found = replace(
         made,
-        log_z_of_clouds=log_z + _N_CLOUDS * ratio - (_N_CLOUDS - 1) * without,
+        log_z_of_clouds=log_z + N_CLOUDS * ratio - (N_CLOUDS - 1) * without,
         start_error=math.hypot(made.start_error, drift),
     )
     apart = abs(found.log_z - made.log_z)

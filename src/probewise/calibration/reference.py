@@ -278,7 +278,7 @@ class Reference:
 
     def split(self, rest: FloatArray, label: int, *, rng: np.random.Generator) -> FloatArray:
         """Take the last Gaussian out of a bright one, (n, 6 N - 4) -> (n, 6 N + 2); nan where that one is used up."""
-        last, _ = self._drawn_beside(rest, label, self._most(self._masses(rest), last_of_all=True), rng)
+        last = self._drawn_beside(rest, label, self._most(self._masses(rest), last_of_all=True), rng)
         return self._without_light(rest, label, last)
 
     def merged(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
@@ -305,7 +305,7 @@ class Reference:
             rest = self._with_light(others, to_bright, last)
             most = self._most(self._masses(rest), last_of_all=False)
             log_here = self._log_split(rest, others, to_bright, last, most)
-            new_last, _ = self._drawn_beside(rest, of_bright, most, rng)
+            new_last = self._drawn_beside(rest, of_bright, most, rng)
             new = self._without_light(rest, of_bright, new_last)
             log_there = self._log_split(rest, self.without_last(new), of_bright, new_last, most)
             there[rows] = new
@@ -315,18 +315,15 @@ class Reference:
                 )
         return there, log_drawn
 
-    def _drawn_beside(
-        self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray]:
-        """Draw a Gaussian near a bright one, (n, 6), of a mass up to `most`; and that mass over it."""
+    def _drawn_beside(self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draw a Gaussian near a bright one, (n, 6), of a mass up to `most`."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
         centre, width = self._places(rest)
         u[:, _SHAPE] = _drawn_near(centre[:, label], width[:, label], rng)
         last = self.prior.from_unit_cube(u)[:, :6]
-        ratio = _drawn_ratio(n, rng)
-        last[:, 0] = ratio * most * self._scale(last)
-        return last, ratio
+        last[:, 0] = _drawn_ratio(n, rng) * most * self._scale(last)
+        return last
 
     def _without_light(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
         """Take a Gaussian's moments from those of a bright one, and add it; nan where nothing would be left."""

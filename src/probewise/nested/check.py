@@ -107,7 +107,7 @@ class _Budget:
 
     def run_route(self, route: _EvidenceRoute) -> NestedResult | None:
         """Run nested sampling by a route; None if the budget or the route's limit does not suffice."""
-        left = int(min(self.limit - self.spent, route.most_calls))
+        left = int(min(self.left, route.most_calls))
         if left < route.least_calls:
             return None
         found = self.search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=self.rng)

@@ -116,11 +116,12 @@ def _hills_not_met(
     """Weigh the hills below these tops, each once and the highest first; return those that a run has not met."""
     hills, most = list[Hill](), evaluate.n_calls + max_calls
     rest = sorted(tops, key=lambda top: top.height)
+    scale = scale_of_bulk(run, evaluate.space)
     while rest and evaluate.n_calls + calls_to_weigh_hill(len(run.names)) < most:
         settled = drawn_from_hill(rest.pop(), evaluate, rng)
         if rest:
             points = Points.join(*(top.highest for top in rest))
-            apart = lie_apart(points, settled, scale_of_bulk(run, evaluate.space), 1, evaluate, rng)
+            apart = lie_apart(points, settled, scale, 1, evaluate, rng)
             rest = [top for top, is_apart in zip(rest, apart, strict=True) if is_apart]
         hill = weigh_hill(settled, evaluate, rng)
         hills += [] if hill is None or hill.is_met_by(run) else [hill]

@@ -133,6 +133,11 @@ def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES,
     return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
 
 
+def wave_number_prior(waves: FloatArray) -> LogUniform:
+    """Return the prior of a wave number: the trial ones, and a little beyond."""
+    return LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02))
+
+
 def wave_joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
     """Convert the amounts of sine and cosine to amplitude, first, and phase, last; the rest of the entry stays."""
     setting = entry[0].copy()
@@ -158,7 +163,7 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
         over=over,
         marginals=lambda a: {
             "a": replace(a, positive=True),
-            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+            "hz": wave_number_prior(waves),
             "phase": _PHASE,
         },
         entries=entries,

@@ -7,7 +7,7 @@ out of vocabulary and is reported as a formula.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,9 +121,7 @@ def _of_reading(about: About) -> Iterator[Form]:
 
         shape = act(about.predicted[None, :], np.ones((1, 1)), about.table)[0] - about.predicted
         if _is_new(shape, known):
-            yield from _proposal(
-                about, "reading", own.reading, Stage.OFFSET, act, term, {c: True for c in term_names(term)}
-            )
+            yield from _proposal(about, "reading", own.reading, Stage.OFFSET, act, term)
 
 
 def _switch(about: About, name: str) -> Iterator[Form]:
@@ -210,12 +208,7 @@ def _of_rate(about: About, state: str) -> Iterator[Form]:
 
         shape = np.asarray(term.of(lambda name: states.get(name, about.table.covariates.get(name))))
         if _is_new(shape, known):
-            yield from _proposal(about, "rate", state, Stage.RATE, act, term, {c: True for c in term_names(term)})
-
-
-def term_names(term: _Term) -> tuple[str, ...]:
-    """Return the names in a term."""
-    return tuple(dict.fromkeys(atom.name for atom in term.atoms))
+            yield from _proposal(about, "rate", state, Stage.RATE, act, term)
 
 
 def _is_new(shape: FloatArray, known: list[FloatArray]) -> bool:
@@ -231,15 +224,14 @@ def _is_new(shape: FloatArray, known: list[FloatArray]) -> bool:
     return True
 
 
-def _proposal(
-    about: About, side: str, target: str, stage: Stage, act: Act, term: _Term, columns: Mapping[str, bool]
-) -> Iterator[Form]:
+def _proposal(about: About, side: str, target: str, stage: Stage, act: Act, term: _Term) -> Iterator[Form]:
     guess = about.sd if stage is Stage.OFFSET else 1e-6
     typical = about.typical(stage, act, np.full((1, 1, 1), guess), guess)
     if typical is None or not np.isfinite(typical):
         return
     where = tuple(
-        f"state:{c}" if c in about.states else "level" if c == about.system.simulator.reading else c for c in columns
+        f"state:{c}" if c in about.states else "level" if c == about.system.simulator.reading else c
+        for c in dict.fromkeys(atom.name for atom in term.atoms)
     )
     text = f"a {term.text}"
     what = target if side == "reading" else f"the rate of {target}"

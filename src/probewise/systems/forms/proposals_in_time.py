@@ -11,7 +11,7 @@ from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Form, with_unit
-from probewise.systems.forms.modulations import wave_joined, wave_numbers
+from probewise.systems.forms.modulations import wave_joined, wave_number_prior, wave_numbers
 from probewise.systems.forms.readings import settling_times, since_start_of_run
 from probewise.systems.table import RunTable
 
@@ -53,7 +53,7 @@ def _square_wave(about: About) -> Iterator[Form]:
         Stage.OFFSET,
         {
             "a": about.amplitude(typical),
-            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+            "hz": wave_number_prior(waves),
             "phase": Uniform(-1.0, 1.0),
             "share": Uniform(0.03, 0.97),
             "edge": LogUniform(0.03, 1.0),
@@ -99,7 +99,7 @@ def _swept_wave(about: About) -> Iterator[Form]:
         Stage.OFFSET,
         {
             "a": about.amplitude(typical, positive=True),
-            "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+            "hz": wave_number_prior(waves),
             "sweep": Uniform(-1.2, 1.2),
             "phase": Uniform(-2 * np.pi, 2 * np.pi),
         },

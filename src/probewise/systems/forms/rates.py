@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.priors import LogUniform, Uniform
+from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, with_unit
-from probewise.systems.forms.modulations import wave_joined, wave_numbers
+from probewise.systems.forms.modulations import wave_joined, wave_number_prior, wave_numbers
 from probewise.systems.motion import Limit, Motion
 
 _MOST_WAVES = 64
@@ -131,7 +131,7 @@ def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
         return
     marginals = {
         "a": about.amplitude(typical, positive=True),
-        "hz": LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02)),
+        "hz": wave_number_prior(waves),
         "phase": Uniform(-2 * np.pi, 2 * np.pi),
     }
     yield Form(

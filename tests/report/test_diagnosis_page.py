@@ -11,7 +11,7 @@ from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page
-from probewise.report.covariate import category_names, covariate_label, covariate_values
+from probewise.report.covariate import category_names, covariate_values, label_of
 from probewise.report.covariate_view import is_line
 from probewise.report.diagnosis_figures import scan_changed_most
 from probewise.report.plots import gain_by_scan, one_scan
@@ -103,9 +103,11 @@ def test_numbers_are_written_as_people_write_them():
 
 
 def test_labels_carry_units():
-    assert covariate_label("level", "LEGO") == "predicted reading (LEGO units)"
-    assert covariate_label("place", "V", "edge_0") == "place along the scans, scan edge_0 (mm)"
-    assert covariate_label("battery_mv", "V") == "battery (mV)"
+    recording = SimpleNamespace(plan=paper_plan())
+    found = SimpleNamespace(recording=recording, apparatus=SimpleNamespace(words=SimpleNamespace(run="scan")))
+    assert label_of(found, "level") == "predicted reading (LEGO units)"
+    assert label_of(found, "place", "edge_0") == "place along the scans, scan edge_0 (mm)"
+    assert label_of(found, "battery_mv") == "battery (mV)"
 
 
 def test_residuals_are_averaged_in_even_steps_with_their_chance():

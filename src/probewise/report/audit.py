@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 from probewise.diagnosis import PlanAudit
 from probewise.diagnosis.audit.detectability import ALIAS, LAMBDA, LEAST_NATS
@@ -120,7 +120,3 @@ def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
             f"the plan is in cure_plan.csv. Still aliased or invisible: {', '.join(left) or 'nothing'}."
         ),
     )
-
-
-def _names_in_words(effects: Sequence[str]) -> str:
-    return ", ".join(map(spoken_name, effects)) or "–"

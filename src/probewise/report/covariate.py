@@ -22,14 +22,6 @@ WORDS = {
 }
 
 
-def covariate_label(name: str, unit: str, scan: str | None = None) -> str:
-    """Return a covariate's name in words with its unit; `unit` is the readings' unit."""
-    said, own = covariate_words(name), covariate_unit(name, unit)
-    if scan is not None and name != "scan":
-        said += f", scan {scan}"
-    return said + (f" ({own})" if own else "")
-
-
 def covariate_words(name: str) -> str:
     """Name a covariate in words."""
     stem, _, suffix = name.rpartition("_")

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
@@ -16,19 +17,35 @@ from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
-# Two full turns: every phase has an equivalent far from both ends.
-_PHASE = Uniform(-2 * np.pi, 2 * np.pi)
+PHASE = Uniform(-2 * np.pi, 2 * np.pi)
+"""Prior of a phase, two full turns: every phase has an equivalent far from both ends."""
+
 _MOST_FREQUENCIES = 1024
 _ORDERS = np.arange(1, 7)  # harmonics of a sawtooth; the slip takes a sixth of the period
 _SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, damped against Gibbs overshoot
+
+
+def sine_and_cosine(*parameters: ArrayLike) -> FloatArray:
+    """Return bank entries of waves, a sine and a cosine each, (n_bank, 2, n_params).
+
+    `parameters` are those before the phase, which is the last, as in `entries`; the first is the amplitude.
+    """
+    return np.concatenate([entries(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
+
+
+def amplitude_and_phase(entry: FloatArray, amounts: FloatArray) -> FloatArray:
+    """Convert the amounts of sine and cosine to amplitude, first, and phase, last; the rest of the entry stays."""
+    setting = entry[0].copy()
+    sine, cosine = amounts * setting[0]
+    setting[0], setting[-1] = np.hypot(sine, cosine), np.arctan2(cosine, sine)
+    return np.asarray(setting)
 
 
 class _WaveEffect(NamedEffect[V]):
     """Base of effects with an amplitude, a frequency or period, and a phase; a bank entry holds sine and cosine."""
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        sine, cosine = amounts * entry[:, 0]
-        return np.array([np.hypot(sine, cosine), entry[0, 1], np.arctan2(cosine, sine)])
+        return amplitude_and_phase(entry, amounts)
 
 
 @dataclass(frozen=True)
@@ -63,7 +80,7 @@ class Flicker(_WaveEffect[FloatArray]):
     @cached_property
     def prior(self) -> Product:
         frequency = Uniform(self.lowest_hz, self.highest_hz)
-        return Product({"amp": HeavyTailedPrior(self.typical, positive=True), "alias_hz": frequency, "phase": _PHASE})
+        return Product({"amp": HeavyTailedPrior(self.typical, positive=True), "alias_hz": frequency, "phase": PHASE})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         wave = np.sin(2 * np.pi * theta[:, 1:2] * plan.time_s + theta[:, 2:3])
@@ -71,7 +88,7 @@ class Flicker(_WaveEffect[FloatArray]):
 
     def bank(self) -> FloatArray:
         frequencies = np.linspace(self.lowest_hz, self.highest_hz, self.n_frequencies + 2)[1:-1]
-        return _sine_and_cosine(self.typical, frequencies)
+        return sine_and_cosine(self.typical, frequencies)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -105,7 +122,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
     @cached_property
     def prior(self) -> Product:
         amp = HeavyTailedPrior(self.typical_mm, positive=True)
-        return Product({"amp_mm": amp, "period_mm": LogUniform(self.shortest_mm, self.longest_mm), "phase": _PHASE})
+        return Product({"amp_mm": amp, "period_mm": LogUniform(self.shortest_mm, self.longest_mm), "phase": PHASE})
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         wave = np.sin(2 * np.pi / theta[:, 1:2] * value.x_mm + theta[:, 2:3])
@@ -116,7 +133,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
         n_even = self.n_periods - 8
         waves = np.linspace(1.0, self.longest_mm / 2 / self.shortest_mm, n_even + 1)[1:]
         periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))
-        return _sine_and_cosine(self.typical_mm, np.maximum(periods, self.shortest_mm * 1.001))
+        return sine_and_cosine(self.typical_mm, np.maximum(periods, self.shortest_mm * 1.001))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -174,10 +191,3 @@ def _steps_and_range(plan: Plan) -> tuple[float, float]:
     """Return three times the median step of X and the range of X, mm; 0 and 0 for fewer than eight positions."""
     x_mm = np.unique(plan.x_mm)
     return (3 * float(np.median(np.diff(x_mm))), float(np.ptp(x_mm))) if len(x_mm) >= 8 else (0.0, 0.0)
-
-
-def _sine_and_cosine(amplitude: float, rates: FloatArray) -> FloatArray:
-    """Return entries with phases 0 and pi/2 at each frequency or period, (n_rates, 2, 3)."""
-    bank = np.empty((len(rates), 2, 3))
-    bank[..., 0], bank[..., 1], bank[..., 2] = amplitude, rates[:, None], (0.0, np.pi / 2)
-    return bank

@@ -8,12 +8,13 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.priors import LogUniform, Uniform
+from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
+from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, Form, Say, with_unit
-from probewise.systems.forms.modulations import wave_joined, wave_numbers
+from probewise.systems.forms.modulations import wave_numbers
 from probewise.systems.forms.readings import earlier
 from probewise.systems.table import RunTable
 
@@ -167,19 +168,14 @@ def _wave_forms(about: About, name: str) -> Iterator[Form]:
     act = _on_column(name, change)
     most = _MOST_WAVES if about.system.caller is not None and about.system.in_bulk else _MOST_WAVES_OF_A_LAW
     waves = wave_numbers(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE)
-    guess, n = 1e-4 * float(np.nanstd(values)), len(waves)
-
-    def entries(size: float) -> FloatArray:
-        sine = np.stack([np.full(n, size), 1 / waves, np.zeros(n)], axis=-1)
-        return np.stack([sine, sine + np.array([0.0, 0.0, 0.5 * np.pi])], axis=1)
-
-    typical = about.typical(Stage.INPUT, act, entries(guess), guess)
+    guess = 1e-4 * float(np.nanstd(values))
+    typical = about.typical(Stage.INPUT, act, sine_and_cosine(guess, 1 / waves), guess)
     if typical is None:
         return
     marginals = {
         "a": about.amplitude(typical, positive=True),
         "period": LogUniform(float(1 / waves[-1]) * 0.98, float(2 / waves[0])),
-        "phase": Uniform(-2 * np.pi, 2 * np.pi),
+        "phase": PHASE,
     }
     yield Form(
         f"periodic_error:{name}",
@@ -188,13 +184,13 @@ def _wave_forms(about: About, name: str) -> Iterator[Form]:
         (name, name, "rad"),
         (name,),
         act,
-        entries(typical),
+        sine_and_cosine(typical, 1 / waves),
         (0,),
         lambda m, s: (
             f"{name} has a periodic error with an amplitude of {with_unit(m[0], s[0], '')} "
             f"and a period of {with_unit(m[1], s[1], '')}, both in units of {name}"
         ),
-        joined=wave_joined,
+        joined=amplitude_and_phase,
     )
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailedPrior
+from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
 from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import ChangePoints, with_unit
 from probewise.systems.table import RunTable
 
 _MOST_MOMENTS = 512
 _MOST_WAVES = 1024
-_PHASE = Uniform(-2 * np.pi, 2 * np.pi)  # two turns, so that one of a phase's equivalent values is far from both ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +138,6 @@ def wave_number_prior(waves: FloatArray) -> LogUniform:
     return LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02))
 
 
-def wave_joined(entry: FloatArray, amounts: FloatArray) -> FloatArray:
-    """Convert the amounts of sine and cosine to amplitude, first, and phase, last; the rest of the entry stays."""
-    setting = entry[0].copy()
-    sine, cosine = amounts[0] * setting[0], amounts[1] * setting[0]
-    setting[0], setting[-1] = np.hypot(sine, cosine), np.arctan2(cosine, sine)
-    return np.asarray(setting)
-
-
 def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation:
     """One sinusoid in time: a sin(2 pi hz t + phase)."""
     waves = wave_numbers(table.time_s, table.rows_by_scan(), most)
@@ -153,25 +145,19 @@ def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation
     def over(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * rows.time_s + theta[:, 2:3]))
 
-    def entries(size: float) -> FloatArray:
-        n = len(waves)
-        sine = np.stack([np.full(n, size), waves, np.zeros(n)], axis=-1)
-        cosine = np.stack([np.full(n, size), waves, np.full(n, 0.5 * np.pi)], axis=-1)
-        return np.stack([sine, cosine], axis=1)
-
     return Modulation(
         over=over,
         marginals=lambda a: {
             "a": replace(a, positive=True),
             "hz": wave_number_prior(waves),
-            "phase": _PHASE,
+            "phase": PHASE,
         },
-        entries=entries,
+        entries=lambda size: sine_and_cosine(size, waves),
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
             f"{what} oscillates with an amplitude of {with_unit(mean[0], sd[0], unit)} and a period of "
             f"{1 / mean[1]:.4g} {time_unit}"
         ),
         covariates=("time",),
-        joined=wave_joined,
+        joined=amplitude_and_phase,
     )

@@ -7,11 +7,12 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Form, with_unit
-from probewise.systems.forms.modulations import wave_joined, wave_number_prior, wave_numbers
+from probewise.systems.forms.modulations import wave_number_prior, wave_numbers
 from probewise.systems.forms.readings import settling_times, since_start_of_run
 from probewise.systems.table import RunTable
 
@@ -86,9 +87,8 @@ def _swept_wave(about: About) -> Iterator[Form]:
     settings = []
     for hz in waves:
         n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
-        settings += [(about.sd, hz, sweep, 0.0) for sweep in np.linspace(-1, 1, n)]
-    sine = np.array(settings)
-    entries = np.stack([sine, sine + np.array([0.0, 0.0, 0.0, 0.5 * np.pi])], axis=1)
+        settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
+    entries = sine_and_cosine(about.sd, *np.transpose(settings))
     typical = about.typical(Stage.OFFSET, act, entries, about.sd)
     if typical is None:
         return
@@ -101,7 +101,7 @@ def _swept_wave(about: About) -> Iterator[Form]:
             "a": about.amplitude(typical, positive=True),
             "hz": wave_number_prior(waves),
             "sweep": Uniform(-1.2, 1.2),
-            "phase": Uniform(-2 * np.pi, 2 * np.pi),
+            "phase": PHASE,
         },
         (own.unit, f"1/{about.time_unit}", "1", "rad"),
         ("time",),
@@ -113,7 +113,7 @@ def _swept_wave(about: About) -> Iterator[Form]:
             f"goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
             "proposal, not a known effect"
         ),
-        joined=wave_joined,
+        joined=amplitude_and_phase,
         expression=f"a {text}",
     )
 

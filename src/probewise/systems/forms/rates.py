@@ -9,12 +9,13 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
 from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, with_unit
-from probewise.systems.forms.modulations import wave_joined, wave_number_prior, wave_numbers
+from probewise.systems.forms.modulations import wave_number_prior, wave_numbers
 from probewise.systems.motion import Limit, Motion
 
 _MOST_WAVES = 64
@@ -119,20 +120,14 @@ def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * u[str(time)] + phase))
 
-    n = len(waves)
-
-    def entries(size: float) -> FloatArray:
-        sine = np.stack([np.full(n, size), waves, np.zeros(n)], axis=-1)
-        return np.stack([sine, sine + np.array([0.0, 0.0, 0.5 * np.pi])], axis=1)
-
     guess = 1e-5 * _rate_scale(about, state)
-    typical = about.typical(Stage.RATE, act, entries(guess), guess)
+    typical = about.typical(Stage.RATE, act, sine_and_cosine(guess, waves), guess)
     if typical is None:
         return
     marginals = {
         "a": about.amplitude(typical, positive=True),
         "hz": wave_number_prior(waves),
-        "phase": Uniform(-2 * np.pi, 2 * np.pi),
+        "phase": PHASE,
     }
     yield Form(
         f"periodic_forcing:{state}",
@@ -141,13 +136,13 @@ def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
         (unit, f"1/{about.time_unit}", "rad"),
         ("time",),
         act,
-        entries(typical),
+        sine_and_cosine(typical, waves),
         (0,),
         lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {with_unit(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
         ),
-        joined=wave_joined,
+        joined=amplitude_and_phase,
     )
 
 

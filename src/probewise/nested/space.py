@@ -82,21 +82,9 @@ class _UnitCube:
 
 @dataclass(frozen=True)
 class _NormalScores:
-    """Normal scores of the unit cube: unbounded coordinates with a standard normal prior."""
+    """Normal scores of the unit cube: coordinates with a standard normal prior."""
 
     prior: Prior
-
-    @property
-    def periodic(self) -> tuple[int, ...]:
-        return ()
-
-    @property
-    def low(self) -> FloatArray:
-        return np.full(len(self.prior.names), -np.inf)
-
-    @property
-    def high(self) -> FloatArray:
-        return np.full(len(self.prior.names), np.inf)
 
     def enter(self, theta: FloatArray) -> FloatArray:
         return np.asarray(ndtri(np.clip(self.prior.to_unit_cube(theta), _EDGE, 1.0 - _EDGE)))
@@ -110,8 +98,8 @@ class _NormalScores:
 
 
 @dataclass(frozen=True)
-class _PriorCoordinates:
-    """The prior's own coordinates."""
+class _Unbounded:
+    """Coordinates without bounds: the prior's own, or normal scores."""
 
     prior: Prior
     coordinates: Coordinates
@@ -166,7 +154,7 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
         allowed = "none: the prior has coordinates of its own" if own else f"names among {prior.names}"
         raise ParameterError("periodic", tuple(periodic), allowed)
     if isinstance(prior, _HasCoordinates):
-        return _PriorCoordinates(prior, prior.coordinates)
+        return _Unbounded(prior, prior.coordinates)
     return _UnitCube(prior, tuple(prior.names.index(name) for name in periodic))
 
 
@@ -179,6 +167,6 @@ def unbounded_space_of(prior: Prior) -> Space:
         If the prior has neither coordinates of its own nor `to_unit_cube`.
     """
     if isinstance(prior, _HasCoordinates):
-        return _PriorCoordinates(prior, prior.coordinates)
+        return _Unbounded(prior, prior.coordinates)
     require_prior("problem.prior", prior, "to_unit_cube")
-    return _NormalScores(prior)
+    return _Unbounded(prior, _NormalScores(prior))

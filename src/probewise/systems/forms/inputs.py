@@ -15,7 +15,7 @@ from probewise.systems.forms.about import About
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, Form, Say, with_unit
 from probewise.systems.forms.modulations import wave_numbers
-from probewise.systems.forms.readings import earlier
+from probewise.systems.forms.readings import delayed, earlier
 from probewise.systems.table import RunTable
 
 _N_SIZES = 9
@@ -196,15 +196,6 @@ def _wave_forms(about: About, name: str) -> Iterator[Form]:
 
 def _dead_zone(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
     return np.asarray(np.sign(c) * np.maximum(np.abs(c) - theta[:, :1], 0.0))
-
-
-def delayed(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Delay a column by a dead time, within runs."""
-    values = np.atleast_2d(c)
-    out = np.empty((max(len(values), len(theta)), values.shape[1]))
-    for rows in table.rows_by_scan():
-        out[:, rows] = earlier(table.time_s[rows], values[:, rows], theta[:, 0])
-    return out
 
 
 def delayed_while_held(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:

@@ -169,13 +169,7 @@ def _lag(about: About) -> Iterator[Form]:
 
 
 def _delay(about: About) -> Iterator[Form]:
-    def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
-        for rows in table.rows_by_scan():
-            out[:, rows] = earlier(table.time_s[rows], value[:, rows], theta[:, 0])
-        return out
-
-    prior = about.log_uniform(Stage.LAG, act, about.gap * np.geomspace(1e-3, 100.0, 41))
+    prior = about.log_uniform(Stage.LAG, delayed, about.gap * np.geomspace(1e-3, 100.0, 41))
     if prior is not None:
         time_unit = about.time_unit
         yield Form(
@@ -184,12 +178,21 @@ def _delay(about: About) -> Iterator[Form]:
             {"tau_s": prior},
             (time_unit,),
             ("previous",),
-            act,
+            delayed,
             _sizes_between(prior),
             (),
             lambda mean, sd: f"{about.system.simulator.reading} is delayed by {with_unit(mean[0], sd[0], time_unit)}",
             absent={0: 0.0},
         )
+
+
+def delayed(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Delay readings or a column, (n_points,) or (n_samples, n_points), by a dead time, within runs."""
+    values = np.atleast_2d(values)
+    out = np.empty((max(len(values), len(theta)), values.shape[1]))
+    for rows in table.rows_by_scan():
+        out[:, rows] = earlier(table.time_s[rows], values[:, rows], theta[:, 0])
+    return out
 
 
 def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:

@@ -40,6 +40,10 @@ class Task:
         """The case's key in the campaign's file."""
         return f"{self.seed} / {self.number}"
 
+    def generators(self, n: int) -> list[np.random.Generator]:
+        """Return `n` generators for running the case, independent of those that draw it."""
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(self.number, _OWN))).spawn(n)
+
 
 @dataclass(frozen=True)
 class Investigated:
@@ -128,10 +132,7 @@ def _effect_result(hidden: Hidden, sizer: EffectSizer, refit: NullRefit) -> dict
 
 
 def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
-    blind, later, files = (
-        np.random.default_rng(child)
-        for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(3)
-    )
+    blind, later, files = task.generators(3)
     begun_s = time.process_time()
     diagnosis = diagnose(case.recording, rng=blind)
     cpu_s = time.process_time() - begun_s
@@ -151,10 +152,7 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
 
 
 def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, Any]:
-    thinking, reading = (
-        np.random.default_rng(child)
-        for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(2)
-    )
+    thinking, reading = task.generators(2)
 
     def record(number: int, plan: Plan, _: str) -> Recording:
         return case.recording if number == 1 else case.world.simulate(plan, rng=reading)

@@ -9,8 +9,6 @@ import warnings
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
 from probewise.challenge.case import Task, scored_statements
 from probewise.challenge.coverage import truths_and_intervals
 from probewise.challenge.systems.held_out import log_densities_of_runs
@@ -19,8 +17,6 @@ from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.systems import read_run_table, read_simulator
 from probewise.world.systems import SystemCase, SystemEffect, draw_system_case, system_stratum_of, write_system_case
-
-_OWN = 1_000  # child of the case's seed sequence that drawing the case does not use
 
 
 def run_system_case(task: Task) -> dict[str, Any]:
@@ -88,10 +84,7 @@ def _effect_json(effect: SystemEffect) -> dict[str, Any]:
 
 
 def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
-    blind, later = (
-        np.random.default_rng(child)
-        for child in np.random.SeedSequence(task.seed, spawn_key=(task.number, _OWN)).spawn(2)
-    )
+    blind, later = task.generators(2)
     with tempfile.TemporaryDirectory() as directory:
         file, table, test, _ = write_system_case(case, directory)
         simulator = read_simulator(file)

@@ -210,9 +210,7 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         If no drawn effect can have the requested size.
     """
     stratum, n_earlier = system_stratum_of(number)
-    drawing, noise = (
-        np.random.default_rng(child) for child in np.random.SeedSequence(seed, spawn_key=(number,)).spawn(2)
-    )
+    drawing, noise = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(number,))).spawn(2)
     shuffled = np.random.default_rng(np.random.SeedSequence(seed)).permutation(FAMILIES)
     failure = NotConvergedError("nothing was tried")
     for attempt in range(_ATTEMPTS):

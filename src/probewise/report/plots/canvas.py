@@ -146,14 +146,15 @@ def svg(drawing: Axes | AxesGrid) -> bytes:
     return text[text.index(b"<svg") :]
 
 
-def legend_above(ax: Axes, *, title: str = "") -> None:
+def legend_above(ax: Axes, *, title: str = "") -> int:
     """Place the legend above the axes, in as many columns as fit, so that it never covers data.
 
     A label that is wider than the axes is broken into lines: otherwise the layout would leave no room for the axes.
+    Returns the number of lines of the longest column.
     """
     handles, labels = ax.get_legend_handles_labels()
     if not labels:
-        return
+        return 0
     room = _LETTERS_PER_IN * ax.get_position().width * cast(Figure, ax.figure).get_figwidth()
     labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
     n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width(labels, n) < room), 1)
@@ -171,12 +172,18 @@ def legend_above(ax: Axes, *, title: str = "") -> None:
         borderaxespad=0.1,
         columnspacing=1.2,
     )
+    return max(map(len, _legend_columns(labels, n_columns)))
 
 
 def _legend_width(labels: Sequence[str], n_columns: int) -> int:
-    """Estimate a legend's width in letters: matplotlib fills its first columns first."""
+    """Estimate a legend's width in letters."""
+    return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _legend_columns(labels, n_columns))
+
+
+def _legend_columns(labels: Sequence[str], n_columns: int) -> list[list[str]]:
+    """Return the lines of each column of a legend: matplotlib fills its first columns first."""
     columns = np.array_split(np.array(labels, dtype=np.object_), n_columns)
-    return sum(max(map(len, "\n".join(column).split("\n"))) + _LINE_SAMPLE for column in columns)
+    return ["\n".join(column).split("\n") for column in columns]
 
 
 def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:

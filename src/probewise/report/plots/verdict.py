@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from probewise.report.plots.canvas import BLUE, CYCLE, GREY, SMALL_PT, axes_or_new, label_axes, legend_above
 
 _SHOWN = 6  # hypotheses with a colour of their own
 _VISIBLE = 0.02  # probability from which a hypothesis has one
-_LETTERS_A_LINE = 70  # of the legend above the bars, about
 
 
 def hypothesis_probabilities(
@@ -68,9 +67,8 @@ def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | N
             highest[name] = max(p, highest.get(name, 0.0))
     likely = [name for name in sorted(highest, key=lambda name: -highest[name]) if highest[name] >= _VISIBLE]
     shown = likely[:_SHOWN]
-    # Long names take a line or more of the legend each, above the bars.
-    lines = sum(math.ceil(len(name) / _LETTERS_A_LINE) for name in shown) + 1
-    ax = axes_or_new(ax, size_in=(6.6, 1.1 + 0.5 * len(beliefs) + 0.2 * lines))
+    alone = ax is None
+    ax = axes_or_new(ax, size_in=(6.6, 1.1 + 0.5 * len(beliefs)))
     at = -np.arange(len(beliefs), dtype=np.float64)
     left = np.zeros(len(beliefs))
     for name, colour in zip(shown, CYCLE, strict=False):
@@ -81,5 +79,8 @@ def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | N
         ax.barh(at, 1.0 - left, left=left, height=0.6, color=GREY, edgecolor="white", linewidth=0.5, label="all others")
     ax.set_yticks(at, list(beliefs))
     ax.set_xlim(0.0, 1.0)
-    legend_above(ax)
+    n_lines = legend_above(ax)
+    if alone:
+        sheet = cast(Figure, ax.figure)
+        sheet.set_figheight(sheet.get_figheight() + 0.2 * n_lines)
     return label_axes(ax, x="probability", y="")

@@ -20,12 +20,12 @@ _FULL_TURN_RAD = math.tau * (1 + 1e-9)
 _MOST_LISTED = 250  # characters of names, so that what was perhaps meant is not cut off
 
 
-def require_rng(rng: object, name: str = "rng") -> None:
+def require_rng(rng: object) -> None:
     """Raise ParameterError unless `rng` is a NumPy generator; a seed is the usual mistake."""
     if isinstance(rng, np.random.Generator):
         return
     seed = int(rng) if isinstance(rng, Integral) and not isinstance(rng, bool) and int(rng) >= 0 else 0
-    raise ParameterError(name, rng, f"a NumPy random generator: np.random.default_rng({seed})")
+    raise ParameterError("rng", rng, f"a NumPy random generator: np.random.default_rng({seed})")
 
 
 def require_number(name: str, value: object, allowed: str = "a number") -> float:
@@ -59,15 +59,13 @@ def require_pair(name: str, value: object, allowed: str = "two finite numbers (x
     raise ParameterError(name, value, allowed)
 
 
-def require_one_or_several(
-    name: str, value: object, allowed: str = "a number, or several in a list"
-) -> tuple[float, ...]:
+def require_one_or_several(name: str, value: object) -> tuple[float, ...]:
     """Return a number, or each of a list of finite numbers, as a tuple; raise ParameterError for a text or None."""
     if isinstance(value, Real):
         value = (value,)
     array_like = isinstance(value, Sequence | np.ndarray | range) and not isinstance(value, str | bytes)
     if not array_like or not all(isinstance(v, Real) and math.isfinite(v) for v in value):  # type: ignore[attr-defined]
-        raise ParameterError(name, value, allowed)
+        raise ParameterError(name, value, "a number, or several in a list")
     return tuple(v.item() if isinstance(v, np.generic) else v for v in value)  # type: ignore[attr-defined]
 
 

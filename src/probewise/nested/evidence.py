@@ -13,6 +13,7 @@ from probewise._arrays import FloatArray, IntArray
 DOUBTFUL_P_VALUE = 1e-4
 """p value of the insertion ranks below which a result is doubtful: one false alarm in 10,000 runs."""
 
+_N_SIMULATIONS = 200
 _SIMULATED_AT_A_TIME = 100_000
 
 
@@ -47,7 +48,6 @@ def integrate(
     rng: np.random.Generator,
     log_start: float = 0.0,
     log_start_error: float = 0.0,
-    n_simulations: int = 200,
 ) -> Evidence:
     """Estimate the evidence: sum the likelihood over the shells of prior volume between successive deaths.
 
@@ -58,7 +58,7 @@ def integrate(
     n_at_death
         Number of points alive when each died, itself included, (n_dead,).
     rng
-        Source of randomness for the error: the sd of log Z over `n_simulations` draws of the shrinkages
+        Source of randomness for the error: the sd of log Z over 200 draws of the shrinkages
         t ~ Beta(n, 1), which makes no assumption about the posterior.
     log_start, log_start_error
         Log of the prior's share with a likelihood above zero, and its standard error.
@@ -74,11 +74,11 @@ def integrate(
     weight = np.exp(log_weight)
     information = float(weight @ np.where(weight > 0, log_likelihood - log_z, 0.0))
     n_dead = len(n_at_death)
-    simulated = np.empty(n_simulations)
+    simulated = np.empty(_N_SIMULATIONS)
     # In blocks, to bound the memory of long runs.
     size = max(1, _SIMULATED_AT_A_TIME // n_dead)
-    for first in range(0, n_simulations, size):
-        n = min(size, n_simulations - first)
+    for first in range(0, _N_SIMULATIONS, size):
+        n = min(size, _N_SIMULATIONS - first)
         shrink = -rng.standard_exponential((n, n_dead)) / n_at_death
         edges = np.concatenate([np.full((n, 1), log_start), log_start + np.cumsum(shrink, axis=1)], axis=1)
         simulated[first : first + n] = logsumexp(_log_shells(edges) + log_likelihood, axis=1)

@@ -21,6 +21,7 @@ from probewise.priors import require_prior
 
 _BLOCK = 4096  # proposals evaluated at a time: their predictions stay in the cache
 _DENSITY_BLOCK = 1024
+_MOST_KERNELS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,15 +39,15 @@ class Kernels:
     width: float
 
     @classmethod
-    def about(cls, points: FloatArray, *, rng: np.random.Generator, n_kernels: int = 100) -> Kernels:
-        """Place kernels at up to `n_kernels` of the points, (n_points, n_params), whitened by the covariance of all."""
+    def about(cls, points: FloatArray, *, rng: np.random.Generator) -> Kernels:
+        """Place kernels at up to a hundred of the points, (n_points, n_params), whitened by the covariance of all."""
         n_points, n_params = points.shape
         mean = points.mean(axis=0)
         covariance = np.atleast_2d(np.cov(points, rowvar=False))
         scale = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         correlation = covariance / np.outer(scale, scale)
         root = scale[:, None] * np.linalg.cholesky(correlation + 1e-9 * np.eye(n_params))
-        rows = rng.permutation(n_points)[:n_kernels]
+        rows = rng.permutation(n_points)[:_MOST_KERNELS]
         centre_rows = np.linalg.solve(root, (points[rows] - mean).T).T
         # Silverman's rule: the optimal width for Gaussian points.
         return cls(mean, root, centre_rows, (4 / (n_params + 2) / len(rows)) ** (1 / (n_params + 4)))

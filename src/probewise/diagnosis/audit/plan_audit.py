@@ -38,6 +38,7 @@ from probewise.sensor import Stage, is_free_form
 Detectability: TypeAlias = Literal["invisible", "aliased", "fine"]
 
 _MOST_READINGS = 4000  # readings of a recording that are used; of a longer one every second, third, ...
+_LINE = 100  # characters of a line of the summary
 _SETTINGS = 48  # bank entries per effect, in the audit within a diagnosis
 _LEVELS = (0.1, 0.9)  # black and white as shares of the range of readings, without a calibrated sensor
 _READING_GUIDE = (
@@ -202,12 +203,12 @@ def _with_aliases(effect: EffectAudit) -> str:
     return f"{effect.name} ({effect.alike[0][0]} {effect.alike[0][1]:.2f})"
 
 
-def _wrapped_list(label: str, names: Sequence[str], width: int = 100) -> list[str]:
+def _wrapped_list(label: str, names: Sequence[str]) -> list[str]:
     """Wrap names after a label."""
     lines, line = [], f"{label:<10} "
     for k, name in enumerate(names):
         piece = name + (", " if k + 1 < len(names) else "")
-        if len(line) + len(piece) > width:
+        if len(line) + len(piece) > _LINE:
             lines.append(line.rstrip())
             line = " " * 11
         line += piece

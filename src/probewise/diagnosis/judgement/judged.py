@@ -16,6 +16,7 @@ from probewise.effects import public_name
 
 Verdict: TypeAlias = Literal["clean", "named", "cannot_tell", "unknown", "noise"]
 
+_CREDIBLE = 0.95
 _OUT_OF_THE_QUESTION = 0.2  # of the leader's probability: rivals below it are not credible; priors differ by less
 
 
@@ -176,13 +177,13 @@ def verdict_on(
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
 
 
-def credible_set(hypotheses: tuple[Hypothesis, ...], mass: float = 0.95) -> tuple[str, ...]:
-    """Return the labels of the smallest set of hypotheses with probability `mass`."""
+def credible_set(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
+    """Return the labels of the smallest set of hypotheses with a probability of 95 %."""
     out, held = [], 0.0
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
         out.append(hypothesis.label)
         held += hypothesis.probability
-        if held >= mass:
+        if held >= _CREDIBLE:
             break
     return tuple(out)
 

@@ -19,6 +19,7 @@ from probewise.diagnosis.residuals.covariate import Covariate
 
 _LIKE = 0.9  # cosine from which a basis duplicates a named effect
 _MOST_GROUPS = 24
+_N_STEPS = 15  # change points of a covariate
 _FEW_SCANS = 6
 _MEMORIES = (3.0, 10.0, 30.0)  # readings
 
@@ -187,13 +188,13 @@ def _cosine_bases(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatA
     return _on_all_rows(waves * way[covariate.rows, None], covariate, len(way))
 
 
-def _step_bases(covariate: Covariate, way: FloatArray, n_steps: int = 15) -> Iterator[FloatArray]:
+def _step_bases(covariate: Covariate, way: FloatArray) -> Iterator[FloatArray]:
     """Yield steps at change points with equal shares of the sum of `way` squared."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     order = np.argsort(values, kind="stable")
     share = np.cumsum(weight[order])
-    for k in range(1, n_steps + 1):
-        at = values[order][min(int(np.searchsorted(share, share[-1] * k / (n_steps + 1))), len(values) - 1)]
+    for k in range(1, _N_STEPS + 1):
+        at = values[order][min(int(np.searchsorted(share, share[-1] * k / (_N_STEPS + 1))), len(values) - 1)]
         yield _on_all_rows(((values > at) * way[covariate.rows])[:, None], covariate, len(way))
 
 

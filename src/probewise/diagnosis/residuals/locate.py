@@ -24,6 +24,7 @@ from probewise.recordings.plan import Plan
 ALARM = 0.01
 """p-value below which the model is incomplete."""
 
+_LARGEST_P = 0.05
 _LEAST_ROWS = 3
 _RUNS = ("scan", "run")  # covariates that number parts of the recording
 _SIGNIFICANT = 0.05  # of the maximum of an effect: below it, it is negligible
@@ -150,10 +151,8 @@ def places(
     scan_names: Sequence[str],
     residuals: FloatArray,
     draws: FloatArray,
-    *,
-    largest_p: float = 0.05,
 ) -> list[Place]:
-    """Find the most significant window of each covariate, strongest first.
+    """Find the most significant window of each covariate, strongest first; none of a p-value above 0.05.
 
     Parameters
     ----------
@@ -167,8 +166,6 @@ def places(
         Reading minus prediction, (n_points,), for the mean curves.
     draws
         Residuals under the null, (n_rows, n_draws).
-    largest_p
-        Windows with a larger p-value are not reported.
     """
     out: list[Place] = []
     norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_points)
@@ -187,7 +184,7 @@ def places(
         null = np.max(np.abs(units.T @ draws) / norms, axis=0)
         best = int(np.argmax(scores))
         p_value = (1 + int(np.sum(null >= scores[best]))) / (1 + draws.shape[1])
-        if p_value > largest_p:
+        if p_value > _LARGEST_P:
             continue
         start: float | None
         end: float | None

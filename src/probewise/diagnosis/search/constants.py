@@ -22,6 +22,7 @@ STEERING = 3.0
 # Nats behind the best so far: about a fit that one effect has bent screening is so far off. It was `STEERING` before,
 # and singles that screening did not favour were lost; no figure was kept.
 REFITTED_WITHIN = 6.0
+BEAM = 8  # combinations that are refitted at each size above one
 SINGLES = 6  # effects that are refitted alone; the width of the beam, three, before: no figure was kept
 # Effects that lead under plain noise, refitted about the null as it is fitted then, where noise with memory leads. Two
 # tanks of which one overflows: about the fit beside a walk the overflow lacked 68 nats, about the plain fit it led.

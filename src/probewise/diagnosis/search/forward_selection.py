@@ -10,6 +10,7 @@ from probewise.diagnosis.evidence.screening import log_mean, score_pairs
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import (
     ABSORBED,
+    BEAM,
     EXTENDED_WITHIN,
     FAINT,
     LEADING_PLAINLY,
@@ -36,7 +37,7 @@ class Proposal:
     added: str
 
 
-def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
+def select_forward(state: SearchState, *, depth: int) -> None:
     """Refit the best combinations of each size, each extended from the best of the size before."""
     null = state.null
     state.progress("screening effects")
@@ -46,7 +47,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
     within = {c: ORDERS_WITHIN if c.degrees_of_freedom <= freedom else STEERING for c in state.nulls}
     parents = [c for c in state.nulls if c.log_z > null.log_z - within[c]]
     for size in range(1, min(depth, len(state.effects)) + 1):
-        asked = _proposals_to_refit(state, null, parents, size, beam)
+        asked = _proposals_to_refit(state, null, parents, size)
         state.share = SHARES[size - 1] if size <= len(SHARES) else 1.0
         refitted = []
         for k, proposal in enumerate(asked):
@@ -63,7 +64,7 @@ def select_forward(state: SearchState, *, beam: int, depth: int) -> None:
 
 
 def _proposals_to_refit(
-    state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int, beam: int
+    state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int
 ) -> list[Proposal]:
     """Return the combinations of one size to refit, each extended from one of the parents."""
     proposals: dict[Names, Proposal] = {}
@@ -74,7 +75,7 @@ def _proposals_to_refit(
         return [*alone[:1], *_proposals_under_plain_noise(state, null), *alone[1:]]
     if size == 2:
         proposals = _with_scores_about_null(state, proposals)
-    chosen = promising(state, proposals, width=beam, behind=STEERING)
+    chosen = promising(state, proposals, width=BEAM, behind=STEERING)
     chosen += [names for names in _both_copies(state, null) if names in proposals and names not in chosen]
     return [proposals[names] for names in chosen]
 

@@ -50,7 +50,6 @@ def search(
     *,
     prior: PriorOdds | None = None,
     max_order: int | None = None,
-    beam: int = 8,
     depth: int = 3,
     after: Searched | None = None,
     progress: Progress = silent,
@@ -66,8 +65,8 @@ def search(
     max_order
         Largest number of Gaussians tried without a given null, plus one if it is not far behind. Default: three, or one
         for few readings.
-    beam, depth
-        Number of combinations refitted at each size above one, and the largest size.
+    depth
+        Largest size of a combination.
     after
         An earlier search of the same recording with a given null, with fewer effects: its fits are not made again.
     progress
@@ -103,7 +102,7 @@ def search(
     def posterior() -> Posterior:
         return posterior_of(evidences(), prior, certain=noises.certain, n_forms=len(state.sensors))
 
-    select_forward(state, beam=beam, depth=depth)
+    select_forward(state, depth=depth)
     if prepared.null is not None:
         _refit_null(state)
     eliminate_backward(state)

@@ -138,9 +138,9 @@ def wave_number_prior(waves: FloatArray) -> LogUniform:
     return LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02))
 
 
-def wave(table: RunTable, time_unit: str, most: int = _MOST_WAVES) -> Modulation:
+def wave(table: RunTable, time_unit: str) -> Modulation:
     """One sinusoid in time: a sin(2 pi hz t + phase)."""
-    waves = wave_numbers(table.time_s, table.rows_by_scan(), most)
+    waves = wave_numbers(table.time_s, table.rows_by_scan())
 
     def over(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * rows.time_s + theta[:, 2:3]))

@@ -62,7 +62,6 @@ def term_in_rate(
     size: float,
     covariates: tuple[str, ...],
     uses: tuple[str, ...] = (),
-    draw: Callable[[np.random.Generator], dict[str, float]] = lambda rng: {},
     shape: str = "",
     signed: bool = True,
 ) -> Form:
@@ -72,8 +71,8 @@ def term_in_rate(
         name,
         "rate",
         lambda s, now, v: v["a"] * push(s, now, v),
-        lambda a, drawn: {"a": a, **drawn},
-        draw,
+        lambda a, drawn: {"a": a},
+        lambda rng: {},
         [[{"a": 0.1 * first}]],
         one_by_one,
         {"a": first},

@@ -168,7 +168,8 @@ class Reference:
         label = rng.integers(self.n_bright, n, size=m)
         others = g[np.arange(n) != label[:, None]].reshape(m, 6 * (n - 1))
         rest = np.concatenate([others, here[:, -2:]], axis=1)
-        before, log_here = self._uncompensated(rest, g[np.arange(m), label], False)
+        old = g[np.arange(m), label]
+        before, log_here = self._uncompensated(rest, old, self.compensation.linear.answer(old), False)
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         rows = np.flatnonzero(np.isfinite(log_here))
         if rows.size:
@@ -176,7 +177,7 @@ class Reference:
             real = np.isfinite(after).all(axis=1)
             rows, after, last, answer = rows[real], after[real], last[real], answer.take(np.flatnonzero(real))
             there[rows] = _insert_gaussian(after, last)
-            log_there = self._log_compensated(before[rows], after, last, answer, False)
+            log_there = self._uncompensated(after, last, answer, False)[1]
             log_drawn[rows] = np.where(np.isfinite(log_there), log_here[rows] - log_there, -np.inf)
         return there, log_drawn
 
@@ -208,7 +209,8 @@ class Reference:
 
     def uncompensated(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Undo `with_compensated`; also the log density as `JumpProposal.back` has it."""
-        return self._uncompensated(self.without_last(theta), theta[:, -8:-2], True)
+        last = theta[:, -8:-2]
+        return self._uncompensated(self.without_last(theta), last, self.compensation.linear.answer(last), True)
 
     def _compensated(
         self, rest: FloatArray, last_of_all: bool, rng: np.random.Generator
@@ -229,29 +231,17 @@ class Reference:
         after, log_prior = coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)
         return np.where(np.isfinite(log_prior)[:, None], after, np.nan), last, answer
 
-    def _uncompensated(self, after: FloatArray, last: FloatArray, last_of_all: bool) -> tuple[FloatArray, FloatArray]:
+    def _uncompensated(
+        self, after: FloatArray, last: FloatArray, answer: Answer, last_of_all: bool
+    ) -> tuple[FloatArray, FloatArray]:
         """Undo `_compensated`; also the log of its density over the prior's, but for likelihood and N."""
-        answer = self.compensation.linear.answer(last)
-        mass = last[:, 0] / self._scale(last)
-        share = mass / (self._masses(after).sum(axis=1) + mass)
-        coordinates = self.compensation.coordinates
-        before = coordinates.leave(coordinates.enter(after) - share[:, None] * answer.shift)[0]
-        return before, self._log_compensated(before, after, last, answer, last_of_all)
-
-    def _log_compensated(
-        self,
-        before: FloatArray,
-        after: FloatArray,
-        last: FloatArray,
-        answer: Answer,
-        last_of_all: bool,
-    ) -> FloatArray:
-        """Log density of `_compensated` over the prior's, but for likelihood and N, (n,)."""
         coordinates = self.compensation.coordinates
         masses, mass = self._masses(after), last[:, 0] / self._scale(last)
         whole, most = masses.sum(axis=1), self._most(masses, last_of_all=last_of_all)
         share, ratio = mass / (whole + mass), mass / most
-        log_before, log_after = (coordinates.leave(coordinates.enter(rest))[1] for rest in (before, after))
+        x = coordinates.enter(after)
+        log_after = coordinates.leave(x)[1]
+        before, log_before = coordinates.leave(x - share[:, None] * answer.shift)
         log_share = answer.log_share_density(share, most / (whole + most))
         log_share += np.log(most * whole) - 2.0 * np.log(whole + mass)  # d share / d ratio
         log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_ratio_density(ratio), math.log(_TOLD) + log_share)
@@ -259,7 +249,7 @@ class Reference:
         log_shape = np.logaddexp(math.log(1.0 - _NEAR) + self.compensation.log_tilt(answer), math.log(_NEAR) + near)
         with np.errstate(invalid="ignore"):  # where both are impossible
             found = log_shape + log_ratio - np.log(most) + log_before - log_after
-        return np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
+        return before, np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
 
     def _drawn_near_one(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draw Gaussians of no certain mass near one of the others, (n, 6 N - 4) -> (n, 6)."""

@@ -10,7 +10,7 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
-from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth, wilson_interval
+from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth
 from probewise.calibration.distinct_rows import DistinctRows
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
@@ -139,20 +139,13 @@ def test_recordings_without_contrast_and_orders_without_gaussians_are_refused(re
         problem_for(recording, default_prior(recording, 1), data_sets=np.zeros(3, dtype=int))
 
 
-def test_wilson_intervals_are_the_textbook_ones() -> None:
-    """Brown, Cai and DasGupta (2001): 95 of 100 gives 0.888 to 0.978."""
-    low, high = wilson_interval(95, 100)
-    assert low == pytest.approx(0.8882, abs=5e-4)
-    assert high == pytest.approx(0.9785, abs=5e-4)
-    with pytest.raises(ParameterError, match="n above 0"):
-        wilson_interval(3, 2)
-
-
 def test_coverage_counts_survive_as_json() -> None:
+    """Wilson's interval of 95 of 100 is 0.888 to 0.978 (Brown, Cai and DasGupta 2001)."""
     document = json.loads(Coverage(100, {"I_min": 95, "I_max": 93}, 300).to_json(seed=3))
     assert document["seed"] == 3
     assert document["all"] == {"held": 188, "of": 200}
     assert document["intervals"]["I_min"]["held"] == 95
+    assert document["intervals"]["I_min"]["wilson95"] == pytest.approx([0.8882, 0.9785], abs=5e-4)
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import binomtest
 from tqdm import tqdm
 
 from probewise._arrays import FloatArray
@@ -36,7 +37,6 @@ __all__ = [
     "intervals_that_hold",
     "order_lead",
     "simulate_truth",
-    "wilson_interval",
 ]
 
 _MASS = 0.95
@@ -64,10 +64,10 @@ class Coverage:
 
     def to_json(self, **about: object) -> str:
         """Return the counts with their Wilson intervals as JSON; `about` is added to it, such as the command."""
-        rows = {
-            name: {"held": k, "of": self.n_recordings, "wilson95": list(wilson_interval(k, self.n_recordings))}
-            for name, k in self.held.items()
-        }
+        rows = {}
+        for name, k in self.held.items():
+            within = binomtest(k, self.n_recordings).proportion_ci(method="wilson")
+            rows[name] = {"held": k, "of": self.n_recordings, "wilson95": [float(within.low), float(within.high)]}
         total = sum(self.held.values())
         share = {"held": total, "of": self.n_recordings * len(self.held)}
         document = {"mass": _MASS, "n_live": self.n_live, "version": __version__, "all": share, "intervals": rows}
@@ -219,14 +219,6 @@ def main() -> None:
         "leads_nats": leads,
     }
     write_text_atomically(asked.out, json.dumps({**about, **rows}, indent=1) + "\n")
-
-
-def wilson_interval(k: int, n: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's interval for a probability, from k successes in n trials."""
-    if not 0 <= k <= n or n == 0:
-        raise ParameterError("(k, n)", (k, n), "0 <= k <= n, n above 0")
-    middle, half = (k + z * z / 2) / (n + z * z), z * math.sqrt(k * (n - k) / n + z * z / 4) / (n + z * z)
-    return max(0.0, middle - half), min(1.0, middle + half)
 
 
 def _quantities(truth: Truth) -> dict[str, float]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import binom, poisson
+from scipy.stats import binom, binomtest, poisson
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
@@ -123,10 +123,8 @@ def share_within(k: int, n: int) -> Estimate:
 
     Wilson's interval has its nominal coverage also near 0 and 1 (Wilson 1927).
     """
-    z = 1.959963984540054
-    share, centre = k / n, (k + z * z / 2) / (n + z * z)
-    half = z / (n + z * z) * math.sqrt(n * share * (1 - share) + z * z / 4)
-    return Estimate(share, centre - half if k else 0.0, centre + half if k < n else 1.0)
+    found = binomtest(k, n).proportion_ci(method="wilson")
+    return Estimate(k / n, float(found.low), float(found.high))
 
 
 def _mean_with_error(values: FloatArray) -> Estimate:

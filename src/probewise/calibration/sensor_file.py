@@ -14,9 +14,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._display import ShowsItself
 from probewise._kinds import require_kind, require_path
-from probewise._posterior_samples import require_absent, require_samples
+from probewise._posterior_samples import NamedSamples, interval_table, require_absent, require_samples
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -74,7 +73,7 @@ class OrderEvidence:
 
 
 @dataclass(frozen=True, eq=False)
-class FittedSensor(ShowsItself):
+class FittedSensor(NamedSamples):
     """A calibrated sensor: posterior samples, noise, and mean SSF field.
 
     Attributes
@@ -213,28 +212,9 @@ class FittedSensor(ShowsItself):
             absent={},
         )
 
-    def mean(self) -> dict[str, float]:
-        """Posterior mean by parameter."""
-        return dict(zip(self.names, self.samples.mean(axis=0).tolist(), strict=True))
-
-    def sd(self) -> dict[str, float]:
-        """Posterior standard deviation by parameter."""
-        return dict(zip(self.names, self.samples.std(axis=0).tolist(), strict=True))
-
-    def median(self) -> dict[str, float]:
-        """Posterior median by parameter, robust against single outlying samples."""
-        return dict(zip(self.names, np.median(self.samples, axis=0).tolist(), strict=True))
-
     def ssf(self) -> tuple[Quantity, ...]:
         """Summarise the SSF by centre, widths and angle; also each Gaussian, unless it is a free form."""
         return ssf_quantities(self.samples, self.n_gaussians, each=not self.free_form)
-
-    def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Central interval of each parameter that holds `mass`."""
-        if not 0 < mass < 1:
-            raise ParameterError("mass", mass, "greater than 0, less than 1")
-        low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
-        return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
 
     def summary(self) -> str:
         """Describe the sensor in plain text."""
@@ -255,14 +235,10 @@ class FittedSensor(ShowsItself):
                 for o in self.orders
             ]
         told = [name for name in self.names if name not in bending]
-        quantities = self.ssf()
-        width = max(9, *(len(name) for name in (*told, *(q.name for q in quantities))))
-        lines.append(f"{'parameter':<{width}}  {'median':>11}  95 % interval")
         median, interval = self.median(), self.interval()
-        rows = [(q.name, q.median, q.interval95) for q in quantities]
+        rows = [(q.name, q.median, q.interval95) for q in self.ssf()]
         rows += [(name, median[name], interval[name]) for name in told]
-        lines += [f"{name:<{width}}  {value:>11.5g}  {low:.5g} to {high:.5g}" for name, value, (low, high) in rows]
-        return "\n".join([*lines, *(f"note: {note}" for note in self.notes)])
+        return "\n".join([*lines, *interval_table(rows), *(f"note: {note}" for note in self.notes)])
 
     def _how_often(self, effect: str) -> str:
         share = 1.0 - self.absent[effect].mean() if effect in self.absent else 1.0

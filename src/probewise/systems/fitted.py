@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._display import ShowsItself
 from probewise._kinds import require_kind
-from probewise._posterior_samples import require_absent, require_samples
+from probewise._posterior_samples import NamedSamples, interval_table, require_absent, require_samples
 from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError
@@ -32,7 +31,7 @@ _WHAT = "a repaired.json or calibrated.json as `probewise diagnose --simulator` 
 
 
 @dataclass(frozen=True, eq=False)
-class FittedSystem(ShowsItself):
+class FittedSystem(NamedSamples):
     """Posterior of a simulator's parameters and of the effects that it leaves out.
 
     Parameters
@@ -92,11 +91,6 @@ class FittedSystem(ShowsItself):
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "noise_sd", noise_sd)
 
-    def interval(self, mass: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Return the central interval of each parameter with probability `mass`."""
-        low, high = np.quantile(self.samples, [0.5 - mass / 2, 0.5 + mass / 2], axis=0)
-        return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
-
     def summary(self) -> str:
         """Return a plain-text summary with each parameter's interval."""
         own, unit = self.simulator, self.simulator.unit
@@ -107,19 +101,12 @@ class FittedSystem(ShowsItself):
 
     def parameter_table(self) -> str:
         """Return a text table of each parameter's median and 95 % interval."""
-        width = max(9, *(len(name) for name in self.names))
-        median, interval = np.median(self.samples, axis=0), self.interval()
-        lines = [f"{'parameter':<{width}}  {'median':>11}  95 % interval"]
-        lines += [
-            f"{name:<{width}}  {median[k]:>11.5g}  {interval[name][0]:.5g} to {interval[name][1]:.5g}"
-            for k, name in enumerate(self.names)
-        ]
-        return "\n".join(lines)
+        median, interval = self.median(), self.interval()
+        return "\n".join(interval_table([(name, median[name], interval[name]) for name in self.names]))
 
     def to_json(self) -> str:
         """Serialise as strict JSON, format "system/1"."""
-        interval = self.interval()
-        mean, median, sd = (of(self.samples, axis=0).tolist() for of in (np.mean, np.median, np.std))
+        mean, sd, median, interval = self.mean(), self.sd(), self.median(), self.interval()
         document = {
             "format": FORMAT,
             "version": self.version,
@@ -132,8 +119,8 @@ class FittedSystem(ShowsItself):
             },
             "recording": {"fingerprint": self.recording, "source": self.source},
             "parameters": [
-                {"name": n, "mean": mean[k], "median": median[k], "sd": sd[k], "interval95": list(interval[n])}
-                for k, n in enumerate(self.names)
+                {"name": n, "mean": mean[n], "median": median[n], "sd": sd[n], "interval95": list(interval[n])}
+                for n in self.names
             ],
             "effects": list(self.effects),
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},

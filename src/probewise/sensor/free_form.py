@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.sensor.ssf import footprint_of
 
 
 def _rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
@@ -75,9 +76,7 @@ def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
 
 def bends_of(theta: FloatArray) -> FloatArray:
     """Return the coefficients `bends` of free forms, (n_samples, 6 N_FREE_FORM) -> (n_samples, N_BENDS)."""
-    blocks = theta.reshape(len(theta), N_FREE_FORM, 6)
-    mass = blocks[..., 0] / np.sqrt(blocks[..., 3] * blocks[..., 4] - blocks[..., 5] ** 2)
-    return np.asarray(mass[:, 1:] / mass.sum(axis=1, keepdims=True) @ _DIRECTIONS)
+    return np.asarray(footprint_of(theta, N_FREE_FORM).weight[:, 0, 1:] @ _DIRECTIONS)
 
 
 def is_free_form(theta: FloatArray) -> bool:

@@ -16,7 +16,7 @@ from probewise.diagnosis.fitting.null import Null, Predictor
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
-from probewise.sensor import FAST_NODES
+from probewise.sensor import FAST_NODES, footprint_of
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
@@ -296,8 +296,7 @@ def start_with_more_gaussians(found: Null, z: FloatArray, wanted: SensorCoordina
     theta = found.theta(z[None, : found.n_params])[0]
     n = found.n_gaussians
     blocks = theta[: 6 * n].reshape(n, 6)
-    mass = blocks[:, 0] / np.sqrt(blocks[:, 3] * blocks[:, 4] - blocks[:, 5] ** 2)
-    at = int(np.argmax(mass))
+    at = int(np.argmax(footprint_of(theta[None, : 6 * n], n).weight))
     sd_u, sd_v = 1 / np.sqrt(2 * blocks[at, 3:5])
     splits: Sequence[tuple[float, float, float, float]] = (
         (0.0, 0.0, 0.65, 1.6),  # a core and a halo

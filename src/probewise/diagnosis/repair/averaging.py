@@ -17,7 +17,7 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan
-from probewise.sensor import ACCURATE_NODES
+from probewise.sensor import ACCURATE_NODES, footprint_of
 
 
 def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
@@ -113,10 +113,10 @@ def _with_more_gaussians(theta: FloatArray, n_gaussians: int, wanted: int) -> Fl
     """Convert each sample's mixture to more Gaussians, by halving the heaviest."""
     blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
     rows = np.arange(len(theta))
-    for _ in range(wanted - n_gaussians):
-        mass = blocks[..., 0] / np.sqrt(blocks[..., 3] * blocks[..., 4] - blocks[..., 5] ** 2)
-        half = blocks[rows, np.argmax(mass, axis=1)].copy()
+    for n in range(n_gaussians, wanted):
+        heaviest = np.argmax(footprint_of(blocks.reshape(len(theta), 6 * n), n).weight[:, 0], axis=1)
+        half = blocks[rows, heaviest].copy()
         half[:, 0] /= 2
         blocks = np.concatenate([blocks, half[:, None, :]], axis=1)
-        blocks[rows, np.argmax(mass, axis=1), 0] /= 2
+        blocks[rows, heaviest, 0] /= 2
     return np.concatenate([blocks.reshape(len(theta), 6 * wanted), theta[:, 6 * n_gaussians :]], axis=1)

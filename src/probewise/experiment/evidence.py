@@ -9,6 +9,7 @@ own points.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,7 +84,7 @@ def bridged_evidence(posterior: Weighted, problem: SensorProblem, *, rng: np.ran
 
 
 def importance_resampled(
-    points: FloatArray, names: tuple[str, ...], problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
+    points: FloatArray, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
 ) -> Weighted:
     """Sample the posterior by importance sampling from kernels about points.
 
@@ -91,8 +92,6 @@ def importance_resampled(
     ----------
     points
         Points near the posterior, (n_points, n_params), of any origin and weight.
-    names
-        Names of the parameters.
     problem, rng, n_draws
         As for `bridged_evidence`.
 
@@ -102,18 +101,29 @@ def importance_resampled(
         If no draw could have given the readings.
     """
     density = _KernelDensity.about(points, rng=rng)
-    theta = density.draw(n_draws, rng=rng)
-    theta = theta[np.isfinite(problem.prior.log_prob(theta))]
+    found = weighted_draws(density.draw(n_draws, rng=rng), density.log_density, problem)
+    if found is None:
+        raise NotConvergedError("no hypothesis near the samples could have given the readings")
+    return found
+
+
+def weighted_draws(
+    draws: FloatArray, log_density: Callable[[FloatArray], FloatArray], problem: SensorProblem, *, least: int = 1
+) -> Weighted | None:
+    """Weigh draws from a density, (n_draws, n_params), by prior and likelihood; None if fewer than `least` are left."""
+    theta = draws[np.isfinite(problem.prior.log_prob(draws))]
     log_likelihood = problem.log_likelihood(theta) if len(theta) else np.empty(0)
     alive = np.isfinite(log_likelihood)
-    if not alive.any():
-        raise NotConvergedError("no hypothesis near the samples could have given the readings")
-    theta, log_likelihood = theta[alive], log_likelihood[alive]
-    log_ratio = problem.prior.log_prob(theta) + log_likelihood - density.log_density(theta)
-    log_weight = log_ratio - float(logsumexp(log_ratio))
-    log_z, n_eff = float(logsumexp(log_ratio)) - math.log(n_draws), n_effective(log_weight)
-    error = math.sqrt(max(1.0 / n_eff - 1.0 / n_draws, 0.0))
-    return Weighted(names, theta, log_likelihood, log_weight, log_z, error, n_eff, n_draws, pareto_k(log_ratio))
+    if np.count_nonzero(alive) < least:
+        return None
+    theta, log_likelihood, n = theta[alive], log_likelihood[alive], len(draws)
+    log_ratio = problem.prior.log_prob(theta) + log_likelihood - log_density(theta)
+    log_sum = float(logsumexp(log_ratio))
+    log_weight, log_z = log_ratio - log_sum, log_sum - math.log(n)
+    n_eff = n_effective(log_weight)
+    error = math.sqrt(max(1.0 / n_eff - 1.0 / n, 0.0))
+    names = problem.prior.names
+    return Weighted(names, theta, log_likelihood, log_weight, log_z, error, n_eff, n, pareto_k(log_ratio))
 
 
 @dataclass(frozen=True, eq=False)

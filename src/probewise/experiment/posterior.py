@@ -323,9 +323,7 @@ def _sample_from_others(
     if own.log_z > hopeless:
         points.append(own.samples(n // 2, rng=rng))
     try:
-        return _SamplesFromOthers(
-            importance_resampled(np.concatenate(points), kind.prior.names, problem, rng=rng, n_draws=n)
-        )
+        return _SamplesFromOthers(importance_resampled(np.concatenate(points), problem, rng=rng, n_draws=n))
     except NotConvergedError:
         return _SamplesFromOthers(None)
 
@@ -408,7 +406,7 @@ def _reestimate_kind(
     points = run.samples(n // 2, rng=rng)
     if particles.log_z > -math.inf:
         points = np.concatenate([points, had.samples(n // 2, rng=rng)])
-    drawn = importance_resampled(points, problem.prior.names, problem, rng=rng, n_draws=2 * n)
+    drawn = importance_resampled(points, problem, rng=rng, n_draws=2 * n)
     fresh = particles_from_posterior(
         replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng
     )

@@ -10,19 +10,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
+from probewise.experiment.evidence import weighted_draws
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.pace import EACH_S, run_time_s
 from probewise.inference.problem import SensorProblem
-from probewise.nested.importance import Weighted, pareto_k
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.importance import Weighted
+from probewise.nested.weights import resampled
 
 _STARTS = 90
 _STEPS = 8
@@ -233,18 +234,10 @@ def _importance_sampled(
 ) -> Weighted | None:
     """Sample by importance sampling from an even mixture of densities; None where hardly a draw is possible."""
     shares = np.bincount(rng.permutation(n) % len(densities), minlength=len(densities))
-    points = np.concatenate([d.draw(int(k), rng=rng) for d, k in zip(densities, shares, strict=True)])
-    points = points[np.isfinite(problem.prior.log_prob(points))]
-    if not len(points):
-        return None
-    likely = problem.log_likelihood(points)
-    points, likely = points[np.isfinite(likely)], likely[np.isfinite(likely)]
-    if len(points) < _LEAST:
-        return None
-    density = logsumexp([d.log_density(points) for d in densities], axis=0) - math.log(len(densities))
-    log_ratio = problem.prior.log_prob(points) + likely - np.asarray(density)
-    log_z = float(logsumexp(log_ratio)) - math.log(n)
-    log_weight = log_ratio - float(logsumexp(log_ratio))
-    n_eff = n_effective(log_weight)
-    error = math.sqrt(max(1.0 / n_eff - 1.0 / n, 0.0))
-    return Weighted(own.names, points, likely, log_weight, log_z, error, n_eff, own.n_calls + n, pareto_k(log_ratio))
+    draws = np.concatenate([d.draw(int(k), rng=rng) for d, k in zip(densities, shares, strict=True)])
+
+    def log_density(points: FloatArray) -> FloatArray:
+        return np.asarray(logsumexp([d.log_density(points) for d in densities], axis=0) - math.log(len(densities)))
+
+    found = weighted_draws(draws, log_density, problem, least=_LEAST)
+    return None if found is None else replace(found, n_calls=own.n_calls + n)

@@ -13,6 +13,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Plan, Recording, require_recording
 from probewise.sensor import COMMANDED
+from probewise.systems.joining import unused_name
 
 
 def join(recordings: Sequence[Recording]) -> Recording:
@@ -77,7 +78,7 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
             renamed.append(names.index(own))
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
-        scan_names += [_unused_name(s, scan_names) for s in plan.scan_names]
+        scan_names += [unused_name(s, scan_names) for s in plan.scan_names]
     return Plan(
         x_mm=np.concatenate([p.x_mm for p in plans]),
         y_mm=np.concatenate([p.y_mm for p in plans]),
@@ -140,9 +141,3 @@ def _same_readings(one: Recording, other: Recording) -> bool:
 
 def _name(recording: Recording, index: int) -> str:
     return recording.source or f"recording {index + 1}"
-
-
-def _unused_name(name: str, taken: Sequence[str]) -> str:
-    """Return an unused name, by appending a number."""
-    numbered = (f"{name} ({k})" for k in itertools.count(2))
-    return next(n for n in itertools.chain([name], numbered) if n not in taken)

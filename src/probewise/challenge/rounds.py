@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from probewise.challenge.estimates import Estimate, mean, share
-from probewise.challenge.scoring import (
-    NOISE,
-    acts_on_mean,
-    count_extras,
-    effects_to_name,
-    leading,
-    leading_name_right,
-    names_match,
-    names_of,
-)
-from probewise.challenge.table import Row, rejection_rate, singles_of
-
-Result = Mapping[str, Any]
+from probewise.challenge.scoring import Result, acts_on_mean, credible_set_covers, has_false_extra, leading_name_right
+from probewise.challenge.table import Row, names_physics, rejection_rate, singles_of
 
 _BOOTSTRAPS = 2000
 
@@ -75,12 +64,7 @@ def _set_size(results: list[Result], size: float) -> Estimate:
 
 
 def _share_covered(results: list[Result]) -> Estimate:
-    return share(
-        [
-            any(names_match(names_of(label), effects_to_name(r, merged=False)) for label in r["credible_set"])
-            for r in results
-        ]
-    )
+    return share([credible_set_covers(r, merged=False) for r in results])
 
 
 def _share_detected(results: list[Result]) -> Estimate:
@@ -96,17 +80,11 @@ def _pairs_named(results: list[Result]) -> Estimate:
 
 
 def _pairs_extra(results: list[Result]) -> Estimate:
-    def named(r: Result) -> list[str]:
-        return [name for name in leading(r, clean=True)[0] if name not in NOISE]
-
-    return share(
-        [bool(count_extras(named(r), effects_to_name(r, merged=True, noise=False))) for r in _pair_results(results)]
-    )
+    return share([has_false_extra(r) for r in _pair_results(results)])
 
 
 def _physics_on_clean(results: list[Result]) -> Estimate:
-    clean = [r for r in results if r["kind"] == "clean"]
-    return share([bool(set(r["combination"]) - NOISE - {"unknown"}) for r in clean])
+    return share([names_physics(r) for r in results if r["kind"] == "clean"])
 
 
 def _median_further_readings(results: list[Result]) -> Estimate:

@@ -61,6 +61,18 @@ def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
     )
 
 
+def credible_set_covers(result: Result, *, merged: bool) -> bool:
+    """Return whether the credible set holds the truth; `merged`: whether an alias of an effect will do."""
+    wanted = effects_to_name(result, merged=merged)
+    return any(names_match(names_of(label), wanted) for label in result["credible_set"])
+
+
+def has_false_extra(result: Result) -> bool:
+    """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
+    named = [name for name in leading(result, clean=True)[0] if name not in NOISE]
+    return count_extras(named, effects_to_name(result, merged=True, noise=False)) > 0
+
+
 def count_extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
     """Count the names that match no wanted effect."""
     most = max(

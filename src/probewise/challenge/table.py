@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -21,9 +21,11 @@ from probewise.challenge.oracle_baseline import (
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     NOISE,
+    Result,
     acts_on_mean,
-    count_extras,
+    credible_set_covers,
     effects_to_name,
+    has_false_extra,
     is_out_of_vocabulary,
     is_physics,
     leading,
@@ -34,7 +36,6 @@ from probewise.challenge.scoring import (
 )
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
-Result: TypeAlias = Mapping[str, Any]
 
 _GAUSSIAN = ("gaussian", "two_lobes")  # SSFs that are mixtures of Gaussians
 _BESIDE = 0.8  # least share of an effect's size given the other: sqrt(1 - 0.5^2), less some tolerance
@@ -155,9 +156,6 @@ def _difference(before: Estimate, after: Estimate) -> Estimate:
 
 
 def _probability_rows(done: list[Result]) -> list[Row]:
-    covered = [
-        any(names_match(names_of(label), effects_to_name(r, merged=False)) for label in r["credible_set"]) for r in done
-    ]
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
         singles = singles_of(done, size)
@@ -172,7 +170,7 @@ def _probability_rows(done: list[Result]) -> list[Row]:
             Row(f"  oracle, aliases as one, lambda {size:g}", mean(like)),
         ]
     return [
-        Row("95 % credible set holds the truth", share(covered), 0.95),
+        Row("95 % credible set holds the truth", share([credible_set_covers(r, merged=False) for r in done]), 0.95),
         *rows,
         Row("expected calibration error", calibration_error(done), most=0.02),
         Row("wrong name stated above .9", share([confidently_wrong(r) for r in done]), most=0.005),
@@ -256,11 +254,10 @@ def _pair_rows(done: list[Result]) -> list[Row]:
     pairs = [r for r in done if r["kind"] == "pair"]
     both = [leading_name_right(r) for r in pairs]
     shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_its_size(r)]
-    more = [bool(count_extras(_mean_names(r), effects_to_name(r, merged=True, noise=False))) for r in pairs]
     return [
         Row("two effects: both named", share(both), 0.95),
         Row("  where neither hides the other", share(shown)),
-        Row("two effects: a false extra", share(more), most=0.03),
+        Row("two effects: a false extra", share([has_false_extra(r) for r in pairs]), most=0.03),
     ]
 
 
@@ -336,10 +333,6 @@ def rejection_rate(results: Sequence[Result], alpha: float) -> Estimate:
 def names_physics(result: Result) -> bool:
     """Return whether an effect on the mean is named."""
     return bool(set(result["combination"]) - NOISE - {"unknown"})
-
-
-def _mean_names(result: Result) -> list[str]:
-    return [name for name in leading(result, clean=True)[0] if name not in NOISE]
 
 
 def confidently_wrong(result: Result) -> bool:

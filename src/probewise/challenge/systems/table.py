@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,12 +11,13 @@ from probewise._arrays import FloatArray
 from probewise.challenge.estimates import bootstrapped, mean, share
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
+    Result,
+    credible_set_covers,
     effects_to_name,
     is_out_of_vocabulary,
     leading,
     leading_name_right,
     names_match,
-    names_of,
 )
 from probewise.challenge.table import (
     Row,
@@ -28,8 +28,6 @@ from probewise.challenge.table import (
     share_covered,
     singles_of,
 )
-
-Result = Mapping[str, Any]
 
 _MOST_NATS = 100.0  # cap on a recording's held-out gain
 _LEAST_NATS = 3.0  # least gain of the right model for a share of it to be meaningful
@@ -95,13 +93,10 @@ def _naming_rows(done: list[Result]) -> list[Row]:
 
 def _probability_rows(done: list[Result]) -> list[Row]:
     own = singles_of(done, 12.0)
-
-    def covers_truth(r: Result) -> bool:
-        return any(names_match(names_of(label), effects_to_name(r, merged=True)) for label in r["credible_set"])
-
+    covered, covered_of_all = (share([credible_set_covers(r, merged=True) for r in rs]) for rs in (own, done))
     return [
-        Row("95 % credible set holds the truth or its alias, lambda 12", share([covers_truth(r) for r in own]), 0.95),
-        Row("  the same, all cases", share([covers_truth(r) for r in done])),
+        Row("95 % credible set holds the truth or its alias, lambda 12", covered, 0.95),
+        Row("  the same, all cases", covered_of_all),
         Row(
             "size of the credible set, the truth and its aliases as one, lambda 12",
             mean([merged_size(r) for r in own]),

@@ -19,6 +19,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
 from probewise.calibration.gaussian_responses import LoneResponses, light_of
 from probewise.calibration.whole_coordinates import WholeCoordinates
+from probewise.effects.density import log_mass_between
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled
 
@@ -66,7 +67,7 @@ class Answer:
         """Log of the mean likelihood over shares from 0 to `most`, over that without the Gaussian, (n,)."""
         true_sd = self.sd / _WIDENED
         low, high, _ = Answer(self.shift, self.mean, true_sd)._bounds(np.full(len(self.mean), most))
-        log_mass = _log_between(low, high)
+        log_mass = log_mass_between(low, high)
         return np.asarray(0.5 * (self.mean / true_sd) ** 2 + log_mass + np.log(true_sd / most) + _LOG_ROOT_2PI)
 
     def draw_share(self, most: FloatArray, *, rng: np.random.Generator) -> FloatArray:
@@ -80,7 +81,7 @@ class Answer:
     def log_share_density(self, share: FloatArray, most: FloatArray) -> FloatArray:
         """Natural log of the density of `draw_share`, (n,)."""
         low, high, _ = self._bounds(most)
-        log_mass = _log_between(low, high)
+        log_mass = log_mass_between(low, high)
         z = (share - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - _LOG_ROOT_2PI - np.log(self.sd) - log_mass)
 
@@ -88,12 +89,6 @@ class Answer:
         low, high = -self.mean / self.sd, (most - self.mean) / self.sd
         mirrored = low > 0
         return np.where(mirrored, -high, low), np.where(mirrored, -low, high), mirrored
-
-
-def _log_between(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Log of the normal mass between bounds of which the greater is not far in the upper tail, (n,)."""
-    at_low, at_high = log_ndtr(low), log_ndtr(high)
-    return np.asarray(at_high + np.log(-np.expm1(np.minimum(at_low - at_high, -1e-15))))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,7 @@ from probewise._arrays import FloatArray
 from probewise.calibration import FittedSensor, predict
 from probewise.diagnosis import Diagnosis, model_with
 from probewise.effects import VOCABULARY, Extent
+from probewise.effects.density import log_gaussian_density
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
 from probewise.world.challenge import NO_PHYSICS, Case, held_out
@@ -55,5 +56,4 @@ def _total_log_density(sensor: FittedSensor, recording: Recording) -> float:
 
 
 def _true_log_density(expected: FloatArray, sd: float, recording: Recording) -> float:
-    z = (recording.readings - expected)[recording.usable] / sd
-    return float(-0.5 * z @ z - len(z) * (np.log(sd) + 0.5 * np.log(2 * np.pi)))
+    return float(log_gaussian_density(recording.readings, expected, sd)[recording.usable].sum())

@@ -10,7 +10,7 @@ from scipy.special import log_ndtr
 from probewise._arrays import FloatArray
 
 
-def log_gaussian_density(readings: FloatArray, mean: FloatArray, sd: FloatArray) -> FloatArray:
+def log_gaussian_density(readings: FloatArray, mean: FloatArray | float, sd: FloatArray | float) -> FloatArray:
     """Return the natural log of the normal density, per unit of the reading; the arrays broadcast."""
     z = (readings - mean) / sd
     return np.asarray(-0.5 * z * z - np.log(sd) - 0.5 * math.log(2 * math.pi))
@@ -27,5 +27,10 @@ def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, ste
     # Mirror cells above the mean: log_ndtr keeps its precision in the lower tail only.
     above = low + high > 0
     near, far = np.where(above, -low, high), np.where(above, -high, low)
-    log_near, log_far = log_ndtr(near), log_ndtr(far)
-    return np.asarray(log_near + np.log(-np.expm1(np.minimum(log_far - log_near, -1e-300))) - np.log(step))
+    return log_mass_between(far, near) - np.log(step)
+
+
+def log_mass_between(low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return the log of a standard normal's mass between bounds of which the greater is not far in the upper tail."""
+    log_low, log_high = log_ndtr(low), log_ndtr(high)
+    return np.asarray(log_high + np.log(-np.expm1(np.minimum(log_low - log_high, -1e-15))))

@@ -237,7 +237,7 @@ def _log_density_of_each(
 ) -> FloatArray:
     """Return the log density of each reading, or log probability of its cell, (n_samples, n_points)."""
     if not step:
-        return log_gaussian_density(readings, predicted, np.asarray(sd))
+        return log_gaussian_density(readings, predicted, sd)
     level = NoiseLevel(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
     return np.asarray(log_density(level, readings, predicted) + math.log(step))
 
@@ -250,4 +250,4 @@ def _log_density_if_wide(readings: FloatArray, predicted: FloatArray, sd: float,
     if sd < step:
         return _log_density_of_each(readings, predicted, sd, step)
     wide = math.hypot(sd, step / math.sqrt(12.0))
-    return log_gaussian_density(readings, predicted, np.asarray(wide)) + (math.log(step) if step else 0.0)
+    return log_gaussian_density(readings, predicted, wide) + (math.log(step) if step else 0.0)

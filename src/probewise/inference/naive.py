@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, floats
 from probewise._kinds import require_number
+from probewise.effects.density import log_gaussian_density
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 
@@ -65,11 +66,7 @@ class Naive:
         readings, predicted = floats(readings, "readings"), floats(predicted, "predicted")
         residuals(readings, predicted)
         middle, sign = 0.5 * (self.mu_black + self.mu_white), 1.0 if self.mu_white > self.mu_black else -1.0
-        black = _log_normal(readings, self.mu_black, self.sd_black)
-        white = _log_normal(readings, self.mu_white, self.sd_white)
+        black = log_gaussian_density(readings, self.mu_black, self.sd_black)
+        white = log_gaussian_density(readings, self.mu_white, self.sd_white)
         over_white = (predicted - middle) * sign > 0
         return np.asarray(over_white @ (white - black) + black.sum())
-
-
-def _log_normal(readings: FloatArray, mean: float, sd: float) -> FloatArray:
-    return np.asarray(-0.5 * ((readings - mean) / sd) ** 2 - math.log(sd) - 0.5 * math.log(2 * math.pi))

@@ -11,6 +11,7 @@ from scipy.special import log_ndtr
 
 from probewise._arrays import FloatArray, floats
 from probewise._kinds import require_number
+from probewise.effects.density import log_mass_between
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
 
@@ -67,7 +68,7 @@ class Rounded:
         out = below + (position - entry) * (self._table[entry + 1] - below)
         far = away > _FAR - 1.0
         if far.any():
-            out[far] = _log_between(away[far], 0.5 * self.step / self.sd)
+            out[far] = self._log_cell_exactly(away[far])
         return np.asarray(out)
 
     def _log_end(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
@@ -77,10 +78,8 @@ class Rounded:
 
     @cached_property
     def _table(self) -> FloatArray:
-        return _log_between(np.arange(0.0, _FAR + 1.0 / _PER_SD, 1.0 / _PER_SD), 0.5 * self.step / self.sd)
+        return self._log_cell_exactly(np.arange(0.0, _FAR + 1.0 / _PER_SD, 1.0 / _PER_SD))
 
-
-def _log_between(away: FloatArray, half: float) -> FloatArray:
-    """Return the log probability that a standard normal lies within `half` of `away` >= 0, from upper tails."""
-    upper, lower = log_ndtr(half - away), log_ndtr(-half - away)
-    return np.asarray(upper + np.log1p(-np.exp(lower - upper)))
+    def _log_cell_exactly(self, away: FloatArray) -> FloatArray:
+        half = 0.5 * self.step / self.sd
+        return log_mass_between(-half - away, half - away)

@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray
 from probewise.diagnosis import Diagnosis, ModelSamples
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
+from probewise.effects.density import log_gaussian_density
 from probewise.errors import NotConvergedError
 from probewise.systems import RunTable
 from probewise.systems.forms import About
@@ -22,7 +23,6 @@ from probewise.world.systems import SystemCase, right_predictions
 
 _N_SAMPLES = 200
 _N_OF_A_RUN = 4000  # for parameters per run: their prior is wide, and the density must not depend on a few draws
-_LOG_ROOT = 0.5 * math.log(2 * math.pi)
 
 
 def log_densities_of_runs(
@@ -109,6 +109,5 @@ def predicted_runs(
 
 def _log_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
     """Return the log of the mean density over samples, (n_points,)."""
-    z = (readings - predicted) / sd[:, None]
-    each = -0.5 * z**2 - np.log(sd)[:, None] - _LOG_ROOT
+    each = log_gaussian_density(readings, predicted, sd[:, None])
     return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from probewise._arrays import FloatArray
+from probewise.effects.density import log_mass_between
 
 _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 
@@ -59,9 +59,8 @@ class Flat:
         return np.full(sigma.shape, 2 * math.pi)
 
     def _log_density(self, x: FloatArray) -> FloatArray:
-        half = np.asarray(self.half)
-        upper, lower = log_ndtr(half - np.abs(x)), log_ndtr(-half - np.abs(x))
-        return np.asarray(upper + np.log1p(-np.exp(lower - upper)) - np.log(2 * half))
+        half, away = np.asarray(self.half), np.abs(x)
+        return np.asarray(log_mass_between(-half - away, half - away) - np.log(2 * half))
 
     def _score(self, x: FloatArray) -> FloatArray:
         """Return minus the derivative of the log density."""

@@ -79,6 +79,7 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         codes.append(np.array(renamed, dtype=np.int64)[plan.pattern])
         scans.append(plan.scan + len(scan_names))
         scan_names += [unused_name(s, scan_names) for s in plan.scan_names]
+    commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
     return Plan(
         x_mm=np.concatenate([p.x_mm for p in plans]),
         y_mm=np.concatenate([p.y_mm for p in plans]),
@@ -89,15 +90,9 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         pattern=np.concatenate(codes),
         pattern_names=tuple(names),
         patterns=patterns,
-        covariates=covariates_joined(plans),
+        covariates={name: _column(plans, name) for name in sorted({*first.covariates, *commanded})},
         instrumentation=first.instrumentation,
     )
-
-
-def covariates_joined(plans: Sequence[Plan]) -> dict[str, FloatArray]:
-    """Concatenate the covariates of the first plan and the commanded columns of any; see `join_plans`."""
-    commanded = {name for plan in plans for name in plan.covariates if name in COMMANDED}
-    return {name: _column(plans, name) for name in sorted({*plans[0].covariates, *commanded})}
 
 
 def last_known(values: FloatArray, otherwise: float = math.nan) -> float:

@@ -10,8 +10,8 @@ from probewise.diagnosis import audit_plan, join
 from probewise.diagnosis.audit.detectability import Expected, PlanTemplates, ProjectedTemplates
 from probewise.diagnosis.audit.plan_audit import _steps_that_cure
 from probewise.diagnosis.fitting.coordinates import default_sensor
+from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.light_sensor.commands import commands
-from probewise.diagnosis.light_sensor.scheduling import append_plans
 from probewise.effects import Backlash, EdgeMisplacement, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan
@@ -163,13 +163,13 @@ def test_readings_that_are_set_behind_a_plan_keep_its_battery_and_say_what_was_c
     plan = paper_plan()
     able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led",)))
     dark = next(command.plan for command in commands(able) if command.kind == "relight")
-    both = append_plans(able, [dark])
+    both = join_plans([able, dark])
     assert both.covariates["battery_mv"][-1] == plan.covariates["battery_mv"][-1]
     assert np.isnan(both.covariates["led"][: len(plan)]).all()
     assert (both.covariates["led"][len(plan) :] == 0).all()
     assert both.scan_names[-1] == dark.scan_names[0]
     gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
-    both = append_plans(replace(able, covariates={"battery_mv": gone}), [dark])
+    both = join_plans([replace(able, covariates={"battery_mv": gone}), dark])
     assert (both.covariates["battery_mv"][len(plan) :] == gone[-2]).all()
 
 
@@ -177,7 +177,7 @@ def test_a_plan_over_other_patterns_keeps_them_behind_another():
     plan = paper_plan()
     quadrants, edge = plan.take(np.arange(404, 408)), plan.take(np.arange(101))
     other = replace(edge, pattern_names=("tile",), pattern=np.zeros(101, dtype=int), patterns={"tile": Uniform(0.3)})
-    both = append_plans(quadrants, [other])
+    both = join_plans([quadrants, other])
     assert [name for name, _ in both.rows_by_pattern()] == [*(f"quadrant_{k}" for k in "abcd"), "tile"]
     assert both.patterns["tile"] == Uniform(0.3)
     assert {both.pattern_names[k] for k in both.pattern[4:]} == {"tile"}

@@ -17,8 +17,9 @@ from probewise.diagnosis.audit.detectability import (
     ProjectedTemplates,
     nats_between,
 )
+from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.light_sensor.commands import commands
-from probewise.diagnosis.light_sensor.scheduling import Scan, append_plans, postponed
+from probewise.diagnosis.light_sensor.scheduling import Scan, postponed
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.effects import NamedEffect
 from probewise.progress import Progress, silent
@@ -63,7 +64,7 @@ def cures_of(
         options = [postponed(command, current) for command in offered]
         if not options:
             break
-        together = append_plans(current, [option.plan for option in options])
+        together = join_plans([current, *(option.plan for option in options)])
         laid = PlanTemplates.of(expected, together, effects, most=_MOST_SETTINGS)
         now = np.arange(len(current))
         trouble = _total_deficit(laid, now, ailing)
@@ -76,7 +77,7 @@ def cures_of(
         if worth[best] == 0.0:
             break
         chosen.append(options[best])
-        current = append_plans(current, [options[best].plan])
+        current = join_plans([current, options[best].plan])
     return chosen
 
 

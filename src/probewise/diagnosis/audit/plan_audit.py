@@ -25,7 +25,7 @@ from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.fitting.earlier import SensorPrior, require_sensor_prior, sensor_of
 from probewise.diagnosis.fitting.free_form import FreeForm
-from probewise.diagnosis.light_sensor.scheduling import append_plans
+from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.diagnosis.verdict_report.words import unit_in_words
@@ -161,8 +161,7 @@ class PlanAudit(ShowsItself):
         """All cures as one plan; None if there are none."""
         if not self.cures:
             return None
-        first, *more = (cure.plan for cure in self.cures)
-        return append_plans(first, more)
+        return join_plans([cure.plan for cure in self.cures])
 
     @property
     def extra_readings(self) -> int:
@@ -263,7 +262,7 @@ def audit_plan(
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
-        current = append_plans(current, [command.plan])
+        current = join_plans([current, command.plan])
         steps.append(audits_and_cosines(PlanTemplates.of(expected, current, effects), effects, unit)[0])
     cured = _steps_that_cure(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from probewise.diagnosis.joining import covariates_joined, join_plans, last_known
+from probewise.diagnosis.joining import join_plans, last_known
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
@@ -33,31 +33,6 @@ class Scan:
     def lay_s(self) -> float:
         """Additional break before it for laying a sheet, in seconds."""
         return LAY_S if self.kind == "lay" else 0.0
-
-
-def append_plans(plan: Plan, more: Sequence[Plan]) -> Plan:
-    """Append plans to a plan; patterns of one name are one pattern.
-
-    A covariate that the others lack, such as battery voltage, keeps its last known value; commanded columns (LED,
-    height) that a plan lacks are as at calibration.
-    """
-    plans = [plan, *more]
-    starts = np.cumsum([0, *(len(p.scan_names) for p in plans)])
-    names = tuple(dict.fromkeys(name for p in plans for name in p.pattern_names))
-    numbers = [np.array([names.index(name) for name in p.pattern_names], dtype=np.int64) for p in plans]
-    return replace(
-        plan,
-        x_mm=np.concatenate([p.x_mm for p in plans]),
-        y_mm=np.concatenate([p.y_mm for p in plans]),
-        orientation_rad=np.concatenate([p.orientation_rad for p in plans]),
-        time_s=np.concatenate([p.time_s for p in plans]),
-        scan=np.concatenate([p.scan + start for p, start in zip(plans, starts, strict=False)]),
-        scan_names=tuple(name for p in plans for name in p.scan_names),
-        pattern=np.concatenate([own[p.pattern] for own, p in zip(numbers, plans, strict=True)]),
-        pattern_names=names,
-        patterns={name: pattern for p in reversed(plans) for name, pattern in p.patterns.items()},
-        covariates=covariates_joined(plans),
-    )
 
 
 def start_after(plan: Plan) -> float:

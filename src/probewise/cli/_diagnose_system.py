@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from probewise.cli._common import say
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._output import Stage, check_out_directory, staged
 from probewise.cli._simulator import read_tables, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -49,28 +48,26 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
         drawn = report.figures(diagnosis)
         page = report.write_page(diagnosis, drawn, source=diagnosis.recording.source, seed=arguments.seed)
     with staged(out, inputs=_files_to_keep(arguments, out, simulator.reading), outdated=_OF_ONE_RUN) as stage:
-        write_results(diagnosis, stage.folder)
-        for name, image in drawn.items():
-            (stage / name).write_bytes(image)
-        (stage / "report.html").write_text(page, encoding="utf-8")
+        write_results(diagnosis, drawn, stage)
+        stage.write("report.html", page)
     for note in (*notes, *notes_on_calls(diagnosis), *stage.notes):
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 
-def write_results(diagnosis: Diagnosis, folder: Path) -> None:
-    """Write diagnosis.json, the calibrated and the repaired simulator, and the next rows to take."""
+def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: Stage) -> None:
+    """Write diagnosis.json, the calibrated and the repaired simulator, the next rows to take and the figures."""
     from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
     from probewise.systems import write_fitted_system, write_run_table
 
-    text = json.dumps(diagnosis_json(diagnosis), allow_nan=False, indent=1)
-    (folder / "diagnosis.json").write_text(text + "\n", encoding="utf-8")
-    write_fitted_system(repaired_of(diagnosis), folder / "repaired.json")
-    write_fitted_system(calibrated_of(diagnosis), folder / "calibrated.json")
+    stage.write_json("diagnosis.json", diagnosis_json(diagnosis))
+    write_fitted_system(repaired_of(diagnosis), stage / "repaired.json")
+    write_fitted_system(calibrated_of(diagnosis), stage / "calibrated.json")
     if diagnosis.next_measurement is not None:
         asked = cast("RunTable", diagnosis.next_measurement.plan)
-        (folder / diagnosis.apparatus.words.next_plan).write_text(write_run_table(asked), encoding="utf-8")
+        stage.write(diagnosis.apparatus.words.next_plan, write_run_table(asked))
+    stage.write_figures(drawn)
 
 
 def _files_to_keep(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:

@@ -78,12 +78,12 @@ class Pictures:
             beside=beside,
             unit=self.inputs.sensor.instrumentation.unit,
         )
-        write_text_atomically(stage / "report.html", page)
-        write_bytes_atomically(stage / "run.gif", gif(self.frames))
-        write_text_atomically(stage / "result.json", posing.result_json(result))
-        write_text_atomically(stage / "samples.csv", posing.samples_csv(result))
+        stage.write("report.html", page)
+        stage.write("run.gif", gif(self.frames))
+        stage.write("result.json", posing.result_json(result))
+        stage.write("samples.csv", posing.samples_csv(result))
         learnt = posing.repaired(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
-        write_text_atomically(stage / "sensor.json", learnt.to_json())
+        stage.write("sensor.json", learnt.to_json())
 
 
 def _remove_pictures(out: Path) -> None:

@@ -43,6 +43,21 @@ class Stage:
     def __truediv__(self, name: str) -> Path:
         return self.folder / name
 
+    def write(self, name: str, content: str | bytes) -> None:
+        """Write a file, a text in UTF-8."""
+        from probewise.recordings import write_bytes_atomically  # imported here, since the help does not need it
+
+        write_bytes_atomically(self / name, content.encode() if isinstance(content, str) else content)
+
+    def write_json(self, name: str, document: object) -> None:
+        """Write a document as strict JSON."""
+        self.write(name, json.dumps(document, allow_nan=False, indent=1) + "\n")
+
+    def write_figures(self, drawn: Mapping[str, bytes]) -> None:
+        """Write figures by the name of their file."""
+        for name, content in drawn.items():
+            self.write(name, content)
+
     @property
     def notes(self) -> list[str]:
         """One text for each renamed file."""

@@ -68,20 +68,16 @@ def _audit_simulator(arguments: argparse.Namespace, progress: Progress) -> PlanA
 
 
 def _write_results(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
-    import json
-
     from probewise.diagnosis import CURE_PLAN, audit_json
-    from probewise.recordings import write_bytes_atomically, write_plan, write_text_atomically
+    from probewise.recordings import write_plan
     from probewise.report import audit as report
 
     drawn = report.figures(audit)
     cures = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
     with staged(out, inputs=(plan, plan.with_suffix(".json")), outdated=cures) as stage:
-        text = json.dumps(audit_json(audit), allow_nan=False, indent=1)
-        write_text_atomically(stage / "audit.json", text + "\n")
-        for name, png in drawn.items():
-            write_bytes_atomically(stage / name, png)
-        write_text_atomically(stage / "report.html", report.write_page(audit, drawn, source=plan.name))
+        stage.write_json("audit.json", audit_json(audit))
+        stage.write_figures(drawn)
+        stage.write("report.html", report.write_page(audit, drawn, source=plan.name))
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
     return stage.notes

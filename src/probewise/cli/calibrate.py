@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise import verbs
     from probewise._progress import progress_shown
     from probewise.calibration import predict, write_sensor
-    from probewise.recordings import read_recording, write_bytes_atomically, write_text_atomically
+    from probewise.recordings import read_recording
     from probewise.report import calibration as report
 
     if arguments.nested_stop is not None and arguments.method != "paper":
@@ -93,10 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
         drawn = report.figures(result, recording, prediction)
         with staged(out) as stage:
             write_sensor(result.sensor, stage / "sensor.json")
-            for name, png in drawn.items():
-                write_bytes_atomically(stage / name, png)
-            page = report.write_page(result, recording, prediction, drawn, seed=arguments.seed)
-            write_text_atomically(stage / "report.html", page)
+            stage.write_figures(drawn)
+            stage.write("report.html", report.write_page(result, recording, prediction, drawn, seed=arguments.seed))
     for note in recording.notes:
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

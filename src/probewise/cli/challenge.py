@@ -42,7 +42,6 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise._progress import progress_shown
     from probewise.challenge import Investigated, run_case, run_challenge, score, score_rounds
     from probewise.challenge.systems import run_system_case, score_systems
-    from probewise.recordings import write_text_atomically
     from probewise.report import challenge as report
 
     if arguments.systems and arguments.rounds > 1:
@@ -75,10 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     drawing = progress_shown(quiet=arguments.quiet)
     with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
-        write_text_atomically(stage / "table.csv", report.table_csv(rows))
-        write_text_atomically(
-            stage / "report.html", report.write_page(results, rows, command=command, systems=arguments.systems)
-        )
+        stage.write("table.csv", report.table_csv(rows))
+        stage.write("report.html", report.write_page(results, rows, command=command, systems=arguments.systems))
     say(report.answer(rows, len(results)), quiet=arguments.quiet)
     say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from probewise.cli._common import Verb, add_common, add_out_directory, say
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._output import Stage, check_out_directory, staged
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -58,7 +58,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
     from probewise.cli._workers import workers
-    from probewise.recordings import read_recording, shipped, write_bytes_atomically, write_text_atomically
+    from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
     from probewise.report import doubt as doubt_report
@@ -104,12 +104,11 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     seconds = time.monotonic() - started
     with staged(out) as stage:
         write_sensor(sensor, stage / "sensor.json")
-        for name, png in drawn.items():
-            write_bytes_atomically(stage / name, png)
+        stage.write_figures(drawn)
         (stage / "diagnosis").mkdir()
         *_, rng = diagnose_verb.generators(seed)
-        diagnose_verb.write_results(diagnosis, witnesses, stage / "diagnosis", rng=rng)
-        write_text_atomically(stage / "diagnosis" / "report.html", diagnosis_page)
+        diagnose_verb.write_results(diagnosis, witnesses, Stage(stage / "diagnosis"), rng=rng)
+        stage.write("diagnosis/report.html", diagnosis_page)
         page = report.write_page(
             calibration,
             recording,
@@ -124,9 +123,9 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
             seed=seed,
             seconds=seconds,
         )
-        write_text_atomically(stage / "report.html", page)
+        stage.write("report.html", page)
         answers = report.main_findings(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
-        write_text_atomically(stage / "answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
+        stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
     return (
         *report.comparison_lines(searches),
         report.answer(started_alike),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from probewise.cli._common import Verb, add_common, add_out_directory, add_path, parse_path, say
 from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import is_journal, journal_recording, journal_sensor
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._output import Stage, check_out_directory, staged
 from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
 
@@ -61,7 +61,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise._progress import progress_shown
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
-    from probewise.recordings import write_text_atomically
     from probewise.report import diagnosis as report
 
     out = check_out_directory(arguments.out)
@@ -90,9 +89,9 @@ def run(arguments: argparse.Namespace) -> int:
         drawn = report.figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
         with staged(out, inputs=_files_to_keep(arguments, out), outdated=OF_ONE_RUN) as stage:
-            write_results(diagnosis, drawn, stage.folder, rng=files_rng)
+            write_results(diagnosis, drawn, stage, rng=files_rng)
             page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
-            write_text_atomically(stage / "report.html", page)
+            stage.write("report.html", page)
     for note in (*joined.notes, *stage.notes):
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
@@ -142,22 +141,18 @@ def _files_to_keep(arguments: argparse.Namespace, out: Path) -> list[Path]:
     return [path for csv in read for path in (csv, csv.with_suffix(".json"))]
 
 
-def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], folder: Path, *, rng: np.random.Generator) -> None:
+def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: Stage, *, rng: np.random.Generator) -> None:
     """Write diagnosis.json, both sensor models, the next plan and the figures, but not the report."""
-    import json
-
     from probewise.calibration import write_sensor
     from probewise.diagnosis import NEXT_PLAN, diagnosis_json
-    from probewise.recordings import write_bytes_atomically, write_plan, write_text_atomically
+    from probewise.recordings import write_plan
 
-    text = json.dumps(diagnosis_json(diagnosis), allow_nan=False, indent=1)
-    write_text_atomically(folder / "diagnosis.json", text + "\n")
-    write_sensor(diagnosis.repaired.fitted_sensor(diagnosis.recording, rng=rng), folder / "sensor.json")
-    write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), folder / "calibrated.json")
+    stage.write_json("diagnosis.json", diagnosis_json(diagnosis))
+    write_sensor(diagnosis.repaired.fitted_sensor(diagnosis.recording, rng=rng), stage / "sensor.json")
+    write_sensor(diagnosis.null.fitted_sensor(diagnosis.recording, rng=rng), stage / "calibrated.json")
     if diagnosis.next_measurement is not None:
-        write_plan(diagnosis.next_measurement.plan, folder / NEXT_PLAN)
-    for name, png in drawn.items():
-        write_bytes_atomically(folder / name, png)
+        write_plan(diagnosis.next_measurement.plan, stage / NEXT_PLAN)
+    stage.write_figures(drawn)
 
 
 VERB = Verb(

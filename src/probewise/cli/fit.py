@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, parse_path, say
 from probewise.cli._output import check_out_directory, staged
@@ -41,13 +40,11 @@ def run(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         drawn = report.figures(fitted)
     with staged(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
-        text = json.dumps(fit_json(fitted), allow_nan=False, indent=1)
-        (stage / "fit.json").write_text(text + "\n", encoding="utf-8")
+        stage.write_json("fit.json", fit_json(fitted))
         write_fitted_system(fitted.fitted, stage / "fitted.json")
-        (stage / "samples.csv").write_text(samples_csv(fitted.fitted), encoding="utf-8")
-        for name, png in drawn.items():
-            (stage / name).write_bytes(png)
-        (stage / "report.html").write_text(report.write_page(fitted, drawn, seed=arguments.seed), encoding="utf-8")
+        stage.write("samples.csv", samples_csv(fitted.fitted))
+        stage.write_figures(drawn)
+        stage.write("report.html", report.write_page(fitted, drawn, seed=arguments.seed))
     for note in (*notes, *stage.notes):
         say(f"note: {note}", quiet=arguments.quiet)
     say(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

@@ -95,13 +95,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.cli.diagnose import OF_ONE_RUN, write_results
     from probewise.diagnosis import join
     from probewise.investigation import Budget, Investigation, RoundsFolder, SimulatedRecorder, investigate
-    from probewise.recordings import (
-        Recording,
-        fingerprint,
-        write_bytes_atomically,
-        write_recording,
-        write_text_atomically,
-    )
+    from probewise.recordings import Recording, fingerprint, write_recording
     from probewise.report import diagnosis as of_a_diagnosis
     from probewise.report import investigation as report
 
@@ -158,12 +152,12 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out, outdated=OF_ONE_RUN) as stage:
         progress("drawing the report")
         drawn = of_a_diagnosis.figures(diagnosis)
-        write_results(diagnosis, drawn, stage.folder, rng=np.random.default_rng(files_seed))
+        write_results(diagnosis, drawn, stage, rng=np.random.default_rng(files_seed))
         write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
-        write_bytes_atomically(stage / "by_round.png", report.probabilities_png(found))
+        stage.write("by_round.png", report.probabilities_png(found))
         concealed = None if world is None else tuple(effect.name for effect in world.concealed)
         page = report.write_page(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
-        write_text_atomically(stage / "report.html", page)
+        stage.write("report.html", page)
     say(found.summary(), quiet=arguments.quiet)
     if concealed is not None:
         say(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)

@@ -68,7 +68,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the study's remaining tasks and write its table."""
     from probewise._progress import progress_shown
-    from probewise.recordings import write_text_atomically
     from probewise.report import study as report
     from probewise.study import run_study
 
@@ -93,9 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
     drawing = progress_shown(quiet=arguments.quiet)
     with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
         progress("drawing the report")
-        write_text_atomically(stage / "table.csv", report.table_csv(study))
-        page = report.write_page(study, command=_command_line(arguments))
-        write_text_atomically(stage / "report.html", page)
+        stage.write("table.csv", report.table_csv(study))
+        stage.write("report.html", report.write_page(study, command=_command_line(arguments)))
     say(report.answer(study), quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0
@@ -103,7 +101,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run the remaining tasks of the study of concealed effects and write its table."""
-    from probewise.recordings import write_text_atomically
     from probewise.report import concealed as report
     from probewise.study import concealed_rows, concealed_table, run_concealed
 
@@ -130,8 +127,8 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     writer.writerows(table)
     rows = concealed_rows(found)
     with staged(out) as stage:
-        write_text_atomically(stage / "concealed.csv", text.getvalue())
-        write_text_atomically(stage / "report.html", report.write_page(rows, command=_concealed_command(arguments)))
+        stage.write("concealed.csv", text.getvalue())
+        stage.write("report.html", report.write_page(rows, command=_concealed_command(arguments)))
     say(report.answer(rows), quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)
     return 0

@@ -63,7 +63,7 @@ class OneScan:
     def __post_init__(self) -> None:
         if not 0 < self.sd_floor < self.sd_ceiling < math.inf:
             raise ParameterError(
-                "sd_floor, sd_ceiling", (self.sd_floor, self.sd_ceiling), "0 < floor < log_z_limit, finite"
+                "sd_floor, sd_ceiling", (self.sd_floor, self.sd_ceiling), "0 < floor < ceiling, finite"
             )
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:

@@ -342,9 +342,7 @@ def _thinned_rows(n: int) -> IntArray:
 def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
     """Return limits that hold 99 % of the posterior with a margin, within the range of the dead points."""
     values = result.theta[:, column]
-    order = np.argsort(values)
-    ladder = np.cumsum(result.weight[order])
-    low, high = values[order][np.minimum(np.searchsorted(ladder, [0.005, 0.995]), len(values) - 1)]
+    low, high = result.interval(0.99)[:, column]
     margin = 0.15 * (high - low)
     low, high = max(low - margin, values.min()), min(high + margin, values.max())
     if not high > low:

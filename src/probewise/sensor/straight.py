@@ -48,19 +48,16 @@ class StraightEdges:
     def of(cls, parts: list[tuple[IntArray, HalfPlaneRegion]], poses: Poses) -> StraightEdges:
         """Batch regions of one hypothesis each, for orientations that are the same for all hypotheses."""
         rows = np.concatenate([r for r, _ in parts])
-
-        def each(values: list[float]) -> FloatArray:
-            return np.concatenate([np.full(len(r), value) for (r, _), value in zip(parts, values, strict=True)])
-
-        normal = each([float(region.normal_rad[0]) for _, region in parts])
-        offset = each([float(region.offset_mm[0]) for _, region in parts])
+        of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
+        normal = np.array([region.normal_rad[0] for _, region in parts])[of]
+        offset = np.array([region.offset_mm[0] for _, region in parts])[of]
         x, y, orientation = (columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
         return cls(
             rows,
             np.broadcast_to(normal - orientation[0], rows.shape),
             np.cos(normal) * x + np.sin(normal) * y - offset,
-            each([region.inside for _, region in parts]),
-            each([region.outside for _, region in parts]),
+            np.array([region.inside for _, region in parts])[of],
+            np.array([region.outside for _, region in parts])[of],
         )
 
     @cached_property

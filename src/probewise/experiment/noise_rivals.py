@@ -26,6 +26,7 @@ from probewise.sensor import NoiseLevel
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
+_NODES = (np.arange(6)[:, None] + 0.5) / 6  # of a prior of one parameter
 _EXACT = 1e-3  # of the noise sd: within which a value counts as the same, lost to black or rounded
 _PHASES = 7
 _PER_PHASE = 0.16  # of the amplitude: width of each phase's component, about the spacing of neighbouring phases
@@ -101,16 +102,14 @@ class CorrelatedLaw:
 
     sd: float
     step: float
-    n_nodes: int = 6
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
-        u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
         before = np.zeros_like(predicted)
         before[:, 1:] = (readings - predicted)[:, :-1]
         first = _log_density_of_each(readings[:1], predicted[:, :1], self.sd, self.step)[:, 0]
         nodes = []
-        for rho in CorrelatedNoise().prior.from_unit_cube(u)[:, 0].tolist():
+        for rho in CorrelatedNoise().prior.from_unit_cube(_NODES)[:, 0].tolist():
             sd = self.sd * math.sqrt(1.0 - rho**2)
             later = _log_density_of_each(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
             nodes.append(first + later.sum(axis=1))
@@ -125,16 +124,14 @@ class SignalDependentLaw:
     step: float
     dark: float
     bright: float
-    n_nodes: int = 6
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
-        u = (np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes
         seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
         return _log_mean_over_nodes(
             [
                 _log_density_of_each(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(axis=1)
-                for ratio in SignalDependentNoise().prior.from_unit_cube(u)[:, 0].tolist()
+                for ratio in SignalDependentNoise().prior.from_unit_cube(_NODES)[:, 0].tolist()
             ]
         )
 

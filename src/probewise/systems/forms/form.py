@@ -17,6 +17,8 @@ from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable
 
+_FEW = 48  # positions of a change point that are enough to detect one
+
 Act = Callable[[Any, FloatArray, RunTable], Any]
 """Function of the stage's value, parameters (n_samples, n_params) and the table; returns the value with the effect."""
 
@@ -35,7 +37,6 @@ class ChangePoints:
     at: tuple[float, ...]
     by_row: bool
     gated: bool
-    few: int = 48
     column: str = ""
 
     def along(self, table: RunTable) -> FloatArray:
@@ -46,7 +47,7 @@ class ChangePoints:
 
     def thinned(self) -> ChangePoints:
         """Keep a subset of positions that is dense enough to detect a change."""
-        stride = -(-(len(self.at) - 1) // self.few)
+        stride = -(-(len(self.at) - 1) // _FEW)
         return replace(self, at=(*self.at[:-1:stride], self.at[-1]))
 
 

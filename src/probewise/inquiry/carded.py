@@ -9,7 +9,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.forecast import Forecast, PredictiveDistributions, resampled_hypotheses, weight_by_level
+from probewise.inquiry.forecast import (
+    Forecast,
+    PredictiveDistributions,
+    nearest_level,
+    resampled_hypotheses,
+    weight_by_level,
+)
 from probewise.recordings.plan import Plan
 from probewise.scene.cards import Card, CardedScene, seen_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -148,7 +154,7 @@ class _CardedPredictive:
         """See `PredictiveDistributions.maps`."""
         own, n = weight[self.asked] * self.stands_for, len(self.near)
         levels = self.levels
-        index = np.rint((self.answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
+        index = nearest_level(self.answers, levels)
         mass_there = weight_by_level(np.clip(index, 0, len(levels) - 1), own, len(levels))
         number = np.full(self.n_rows, -1)
         number[self.near] = np.arange(n)

@@ -117,6 +117,11 @@ class _DirectPredictive:
             yield at, weight_by_level(self.index[:, at], own, n_levels)
 
 
+def nearest_level(answers: FloatArray, levels: FloatArray) -> IntArray:
+    """Return the index of the nearest of evenly spaced levels to each prediction, of the same shape."""
+    return np.asarray(np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64))
+
+
 def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> FloatArray:
     """Sum the weights, (n,), of hypotheses that predict each level, index (n, n_designs) -> (n_designs, n_levels)."""
     n_designs = index.shape[1]

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise.errors import ParameterError, ShapeError
-from probewise.inquiry.forecast import MOST_LEVELS, predict_where_visible, spread_levels
+from probewise.inquiry.forecast import MOST_LEVELS, nearest_level, predict_where_visible, spread_levels, weight_by_level
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
@@ -71,18 +71,10 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
         block = slice(start, start + _BLOCK)
         mixed = np.zeros((len(bits[block]), chance.shape[1]))
         for rival, answer in zip(rivals, answers, strict=True):
-            own = _level_distribution(answer[:, block], levels) @ chance
+            even = np.full(len(answer), 1.0 / len(answer))
+            own = weight_by_level(nearest_level(answer[:, block], levels), even, len(levels)) @ chance
             share = rival.probability / total
             mixed += share * own
             bits[block] -= share * entropy_bits(own)
         bits[block] += entropy_bits(mixed)
     return np.maximum(bits, 0.0)
-
-
-def _level_distribution(answers: FloatArray, levels: FloatArray) -> FloatArray:
-    """Return the share of samples whose prediction is nearest to each level: (n_points, n_levels)."""
-    n_samples, n_points = answers.shape
-    index = np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64)
-    key = index + np.arange(n_points) * len(levels)
-    count = np.bincount(key.ravel(), minlength=n_points * len(levels))
-    return np.asarray(count.reshape(n_points, -1) / n_samples)

@@ -19,6 +19,7 @@ from typing import Any, Self, TypeVar
 from probewise.errors import FileError, NotConvergedError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import json_of, locked, read_bytes, write_text_atomically
+from probewise.recordings.atomic import write_to_disk
 
 __all__ = ["FORMAT", "Finished", "read_campaign", "run_campaign"]
 
@@ -148,15 +149,7 @@ class _ResultLog:
             raise ParameterError(
                 f"the result of {key}", result, f"a JSON object of finite numbers ({error})"
             ) from error
-        left = memoryview(line.encode() + b"\n")
-        try:
-            while left:
-                left = left[self._file.write(left) :]
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            raise FileError(
-                self._path, f"cannot be written ({error.strerror})", "a file on a disk with room"
-            ) from error
+        write_to_disk(self._file, self._path, line.encode() + b"\n")
         return line
 
 

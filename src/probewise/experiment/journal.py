@@ -29,7 +29,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, shown
-from probewise.recordings.atomic import write_text_atomically
+from probewise.recordings.atomic import write_text_atomically, write_to_disk
 from probewise.recordings.locking import locked
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
@@ -350,7 +350,7 @@ class JournalWriter:
             "reading": _or_null(reading.value),
             "covariates": {name: _or_null(value) for name, value in reading.covariates.items()},
         }
-        self._write_to_disk(json.dumps(line, allow_nan=False)[:-1])
+        write_to_disk(self._file, self.path, json.dumps(line, allow_nan=False)[:-1].encode())
 
     def summary(self, summary: PosteriorSummary) -> None:
         """Write the summary after that reading, the rest of its line."""
@@ -360,7 +360,7 @@ class JournalWriter:
             "bits": summary.bits,
             "next": _pose_as_json(summary.next_pose),
         }
-        self._write_to_disk(_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n")
+        write_to_disk(self._file, self.path, (_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n").encode())
 
     def close(self) -> None:
         """Close the file and let other processes write to it."""
@@ -373,15 +373,6 @@ class JournalWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-    def _write_to_disk(self, text: str) -> None:
-        left = memoryview(text.encode())
-        try:
-            while left:
-                left = left[self._file.write(left) :]
-            os.fsync(self._file.fileno())
-        except OSError as error:
-            raise FileError(self.path, f"cannot be written ({error.strerror})", "a file on a disk with room") from error
 
 
 def _error_of_existing_file(path: Path) -> FileError:

@@ -6,6 +6,7 @@ import contextlib
 import glob
 import os
 import tempfile
+from io import FileIO
 from pathlib import Path
 
 from probewise._signals import deferred
@@ -42,10 +43,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
             with os.fdopen(handle, "wb", buffering=0) as file:
                 with contextlib.suppress(OSError):  # a file system without locks: others may remove the file
                     try_lock(handle)
-                left_over = memoryview(content)
-                while left_over:
-                    left_over = left_over[file.write(left_over) :]
-                os.fsync(handle)
+                write_to_disk(file, path, content)
             # mkstemp makes the file private; give it the permissions of an ordinary new file.
             mask = os.umask(0)
             os.umask(mask)
@@ -67,3 +65,20 @@ def write_text_atomically(path: str | os.PathLike[str], text: str) -> None:
         If the folder does not exist or cannot be written to.
     """
     write_bytes_atomically(path, text.encode("utf-8"))
+
+
+def write_to_disk(file: FileIO, path: Path, content: bytes) -> None:
+    """Write to the end of an open, unbuffered file, whose name for messages is `path`, and sync it to the disk.
+
+    Raises
+    ------
+    FileError
+        If there is no room.
+    """
+    left_over = memoryview(content)
+    try:
+        while left_over:
+            left_over = left_over[file.write(left_over) :]
+        os.fsync(file.fileno())
+    except OSError as error:
+        raise FileError(path, f"cannot be written ({error.strerror})", "a file on a disk with room") from error

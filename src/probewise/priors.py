@@ -72,6 +72,7 @@ class Coordinates(Protocol):
         ...
 
 
+@runtime_checkable
 class Marginal(Protocol):
     """A distribution of one parameter."""
 

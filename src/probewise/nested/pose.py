@@ -193,8 +193,8 @@ def _as_marginal(name: str, one: Any) -> Marginal:
     """Convert a distribution in any of its forms to a marginal; `name` is its name in error messages."""
     if isinstance(one, tuple | list) and len(one) == 2 and all(isinstance(end, Real) for end in one):
         return Uniform(float(one[0]), float(one[1]))
-    if all(hasattr(one, method) for method in ("from_unit", "to_unit", "log_prob")):
-        return one  # type: ignore[no-any-return]
+    if isinstance(one, Marginal):
+        return one
     if _is_scipy(one):
         if hasattr(one, "freeze"):
             raise ParameterError(name, one, "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)")

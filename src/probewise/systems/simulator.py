@@ -246,8 +246,8 @@ def marginal_of(name: str, given: object) -> Marginal:
         If it is none of these, or has no mass.
     """
     allowed = '(low, high), ("log", low, high), ("normal", mean, sd), or a prior of probewise.priors'
-    if all(hasattr(given, each) for each in ("from_unit", "to_unit", "log_prob")):
-        return given  # type: ignore[return-value]
+    if isinstance(given, Marginal):
+        return given
     if not isinstance(given, Sequence) or isinstance(given, str) or not given:
         raise ParameterError(f"parameters[{name!r}]", given, allowed)
     kinds: dict[object, Callable[[float, float], Marginal]] = {"log": LogUniform, "normal": Normal, "uniform": Uniform}

@@ -75,7 +75,7 @@ class ReadingNoise:
     @property
     def inferred(self) -> bool:
         """Whether the sd is unknown: a parameter with a prior."""
-        return all(hasattr(self.sd, method) for method in ("from_unit", "to_unit", "log_prob"))
+        return isinstance(self.sd, Marginal)
 
     def scale(self, predicted: FloatArray, sd: FloatArray | None) -> FloatArray:
         """Sd for each prediction, (n_samples, n_points); `sd` (n_samples,) holds that of each sample if inferred."""

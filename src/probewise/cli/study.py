@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import csv
-import io
 import shlex
 from functools import partial
 from typing import TYPE_CHECKING
@@ -101,6 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     """Run the remaining tasks of the study of concealed effects and write its table."""
+    from probewise.recordings.table import csv_text_of_rows
     from probewise.report import concealed as report
     from probewise.study import concealed_rows, concealed_table, run_concealed
 
@@ -121,13 +120,9 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
             progress=progress,
         )
     table = concealed_table(found)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(table[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(table)
     rows = concealed_rows(found)
     with staged(out) as stage:
-        stage.write("concealed.csv", text.getvalue())
+        stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
         stage.write("report.html", report.write_page(rows, command=_concealed_command(arguments)))
     say(report.answer(rows), quiet=arguments.quiet)
     say(f"written to {out}", quiet=arguments.quiet)

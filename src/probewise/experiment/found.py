@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from dataclasses import asdict, dataclass
 
@@ -13,6 +11,7 @@ from probewise.experiment.left_out import left_out_of
 from probewise.experiment.state import Exploration, require_exploration
 from probewise.experiment.stopping_rule import chance_off
 from probewise.nested.weights import weighted_quantiles
+from probewise.recordings.table import csv_text_of_rows
 from probewise.scene.albedo import Shape
 from probewise.scene.shapes import AnyOf, RegularPolygon
 
@@ -95,11 +94,9 @@ def samples_csv(run: Exploration) -> str:
     require_exploration(run)
     shape, names = run.experiment.shape, run.last.names
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     several = isinstance(shape, AnyOf)
     columns = [k for k, name in enumerate(names) if name != "shape"]
-    writer.writerow(["weight", *(["shape"] if several else []), *(names[k] for k in columns)])
+    rows = []
     which = shape.which(theta) if isinstance(shape, AnyOf) else np.zeros(len(theta), dtype=np.int64)
     for row in np.flatnonzero(weight > 0).tolist():
         label, held = [], set(columns)
@@ -107,8 +104,8 @@ def samples_csv(run: Exploration) -> str:
             label = [shape.labels[which[row]]]
             held = set(shape.prior.columns[which[row]])
         values = (f"{theta[row, k]:.7g}" if k in held else "" for k in columns)
-        writer.writerow([f"{weight[row]:.7g}", *label, *values])
-    return text.getvalue()
+        rows.append([f"{weight[row]:.7g}", *label, *values])
+    return csv_text_of_rows(["weight", *(["shape"] if several else []), *(names[k] for k in columns)], rows)
 
 
 def _shape_name(shape: Shape) -> str:

@@ -8,7 +8,7 @@ import itertools
 import math
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -207,8 +207,13 @@ def number_text(value: float) -> str:
 
 def csv_text(columns: dict[str, Sequence[str]]) -> str:
     """Format columns of cells of equal length as CSV with a header row and LF line ends."""
+    return csv_text_of_rows(columns, zip(*columns.values(), strict=True))
+
+
+def csv_text_of_rows(header: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Format rows as CSV with a header row and LF line ends."""
     out = io.StringIO(newline="")
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
+    writer.writerow(header)
+    writer.writerows(rows)
     return out.getvalue()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +10,7 @@ from probewise.challenge import Estimate, Row, by_effect, confusion, reliability
 from probewise.challenge.scoring import effects_to_name, leading, leading_name_right, names_match
 from probewise.challenge.systems import family_of
 from probewise.challenge.systems.table import gains_of
+from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
 from probewise.report.terms import explain_new_terms, with_explanations
@@ -58,16 +57,13 @@ def _keep_indentation(name: str) -> str:
 
 def table_csv(rows: Sequence[Row]) -> str:
     """Write the table as CSV; missing values are empty."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"])
+    cells = []
     for row in rows:
-        numbers = (row.found.value, row.found.low, row.found.high)
-        bounds = (row.least, row.most)
-        writer.writerow(
+        numbers, bounds = (row.found.value, row.found.low, row.found.high), (row.least, row.most)
+        cells.append(
             [row.name.strip(), *map(_to_csv, numbers), row.found.n, *map(_to_csv, bounds), _DECISIONS[row.decision]]
         )
-    return text.getvalue()
+    return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
 def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: bool = False) -> str:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import replace
 
 import numpy as np
 
 from probewise.experiment import least_readings
+from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import png, readings_needed, widths_of_runs
 from probewise.report.words import count, number, with_error
@@ -94,16 +93,14 @@ def table_of_bounds(study: Study) -> Markup | None:
 
 def table_csv(study: Study) -> str:
     """Write the table as CSV: every estimate with its bounds; processor times, which vary, are left out."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     bounds = [f"{name}{end}" for name, _ in _COLUMNS for end in ("", "_low", "_high")]
-    writer.writerow(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"])
+    rows = []
     for row, found in study.table().items():
         estimates = [getattr(found, name) for name, _ in _COLUMNS]
         values = [value for e in estimates for value in (e.value, e.low, e.high)]
         values += [found.error_mm, found.wrong, found.wrong_expected, found.wrong_limit]
-        writer.writerow([row.name, found.n_runs, *(f"{v:.6g}" if math.isfinite(v) else "" for v in values)])
-    return text.getvalue()
+        rows.append([row.name, found.n_runs, *(f"{v:.6g}" if math.isfinite(v) else "" for v in values)])
+    return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
 
 
 def write_page(study: Study, *, command: str) -> str:

@@ -12,6 +12,7 @@ from probewise.calibration import Calibration, FittedSensor
 from probewise.recordings import Prediction, Recording
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
+    AxesGrid,
     calibration_check,
     png,
     predicted_against_recorded,
@@ -58,20 +59,22 @@ def ssf_centre_and_sds(sensor: FittedSensor) -> tuple[float, float, tuple[float,
 
 def figures(calibration: Calibration, recording: Recording, prediction: Prediction) -> dict[str, bytes]:
     """Draw the figures of a calibration: PNG by file name."""
-    drawn = {
+    return {
         "readings.png": png(readings_by_orientation(recording)),
         "predicted.png": png(predicted_against_recorded(recording, prediction.mean, prediction.sd)),
         "residuals.png": png(calibration_check(recording, prediction.mean, prediction.sd)),
         "ssf.png": png(spatial_sensitivity(calibration.sensor.field)),
+        "ssf_by_order.png": png(ssf_of_each_order(calibration)),
     }
-    drawn["ssf_by_order.png"] = png(
-        ssf_by_order(
-            calibration.fields,
-            {o.n_gaussians: o.log_z for o in calibration.orders},
-            {o.n_gaussians: o.log_z_error for o in calibration.orders},
-        )
+
+
+def ssf_of_each_order(calibration: Calibration) -> AxesGrid:
+    """Draw the mean SSF of each number of Gaussians, with its evidence."""
+    return ssf_by_order(
+        calibration.fields,
+        {o.n_gaussians: o.log_z for o in calibration.orders},
+        {o.n_gaussians: o.log_z_error for o in calibration.orders},
     )
-    return drawn
 
 
 def sections(

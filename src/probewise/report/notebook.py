@@ -30,7 +30,6 @@ from probewise.report.plots import (
     predicted_and_recorded,
     readings_by_orientation,
     spatial_sensitivity,
-    ssf_by_order,
 )
 from probewise.report.words import count, unit_name, unit_of, with_error, without_unit
 from probewise.sensor import SSFField
@@ -83,11 +82,7 @@ def _(value: FittedSensor) -> str:
 
 @render_html.register
 def _(value: Calibration) -> str:
-    drawn = ssf_by_order(
-        value.fields,
-        {o.n_gaussians: o.log_z for o in value.orders},
-        {o.n_gaussians: o.log_z_error for o in value.orders},
-    )
+    drawn = calibration_report.ssf_of_each_order(value)
     return _div(
         paragraph(calibration_report.answer(value.sensor)),
         figure(png(drawn, dpi=DPI), "Mean SSF by number of Gaussians"),

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
 from probewise.calibration.known_density import KnownDensity
 from probewise.inference import SensorProblem
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled
 from probewise.priors import Coordinates
 
 # A change of temperature leaves at least this share of the particles effective.
@@ -345,11 +345,7 @@ def _next(rise: FloatArray, beta: float, share: float, n_particles: int) -> floa
     least = share * float(min(n_particles, np.isfinite(rise).sum()))
     if n_effective((1.0 - beta) * rise) >= least:
         return 1.0
-    low, high = beta, 1.0
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if n_effective((middle - beta) * rise) >= least else (low, middle)
-    return high
+    return power_bracket(lambda power: (power - beta) * rise, beta, 1.0, wanted=least, n_steps=_BISECTIONS)[1]
 
 
 def _moved_along_differences(

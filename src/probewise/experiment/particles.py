@@ -22,7 +22,7 @@ from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
 from probewise.inference.problem import SensorProblem, scores
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled
 from probewise.priors import Prior
 
 _KEEP = 0.5  # least effective share of the samples without resampling
@@ -420,14 +420,9 @@ def _partition_rows(rows: IntArray) -> list[IntArray]:
 
 def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, share: float, enough: float) -> float:
     """Return the largest power of the last reading's likelihood with enough effective samples, by bisection."""
-    low, high = share, 1.0
-    for _ in range(30):
-        middle = 0.5 * (low + high)
-        low, high = (
-            (middle, high)
-            if n_effective(_updated_log_weights(log_weight, now.at(middle), base)) >= enough
-            else (low, middle)
-        )
+    low, _ = power_bracket(
+        lambda power: _updated_log_weights(log_weight, now.at(power), base), share, 1.0, wanted=enough, n_steps=30
+    )
     return max(low, share + 1e-6)
 
 

@@ -43,7 +43,7 @@ from probewise.nested.repartition import repartitioned
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import least_live, run_once
 from probewise.nested.space import Space, unbounded_space_of
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled
 
 _LEAST_CALLS = 5000
 # In more dimensions draws fill the space too thinly. On a curved ridge in five (Rosenbrock's) they missed up to a fifth
@@ -308,10 +308,7 @@ class _Draws:
 
         if n_effective(at(0.0)) >= wanted:
             return 1.0, at(0.0)
-        low, high = _LEAST_LOG_POWER, 0.0
-        for _ in range(_BISECTIONS):
-            middle = (low + high) / 2
-            low, high = (middle, high) if n_effective(at(middle)) >= wanted else (low, middle)
+        low, _ = power_bracket(at, _LEAST_LOG_POWER, 0.0, wanted=wanted, n_steps=_BISECTIONS)
         return math.exp(low), at(low)
 
 

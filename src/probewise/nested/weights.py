@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -17,6 +18,19 @@ def n_effective(log_weight: FloatArray) -> float:
         return 0.0
     weight = np.exp(log_weight - most)
     return float(weight.sum() ** 2 / (weight @ weight))
+
+
+def power_bracket(
+    log_weight_at: Callable[[float], FloatArray], low: float, high: float, *, wanted: float, n_steps: int
+) -> tuple[float, float]:
+    """Bracket by bisection the largest power whose log weights have an effective sample size of `wanted` or more.
+
+    Returns the ends of the bracket: the weights of the lower one have enough, those of the upper one too few.
+    """
+    for _ in range(n_steps):
+        middle = (low + high) / 2
+        low, high = (middle, high) if n_effective(log_weight_at(middle)) >= wanted else (low, middle)
+    return low, high
 
 
 def resampled(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled
 from probewise.progress import Progress, silent
 
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
@@ -136,10 +136,7 @@ def _next_beta(gain: FloatArray, beta: float) -> float:
     enough = _EFFECTIVE * np.count_nonzero(np.isfinite(gain))
     if n_effective((1.0 - beta) * gain) >= enough:
         return 1.0
-    low, high = beta, 1.0
-    for _ in range(30):
-        middle = (low + high) / 2
-        low, high = (middle, high) if n_effective((middle - beta) * gain) >= enough else (low, middle)
+    low, _ = power_bracket(lambda power: (power - beta) * gain, beta, 1.0, wanted=enough, n_steps=30)
     return min(max(low, beta + _LEAST_STEP), 1.0)
 
 

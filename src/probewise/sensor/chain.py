@@ -28,6 +28,8 @@ from probewise.sensor.stages import (
     SceneView,
     Stage,
     View,
+    columns_of_effects,
+    names_of_effects,
     require_columns,
 )
 from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
@@ -134,8 +136,7 @@ class Chain:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, one per column of theta."""
-        own = (f"{effect.name}.{name}" for effect in self.effects for name in effect.prior.names)
-        return (*self.ssf.names, *self.levels.names, *self.scene.names, *own)
+        return (*self.ssf.names, *self.levels.names, *self.scene.names, *names_of_effects(self.effects))
 
     def with_effects(self, *effects: AnyEffect) -> Chain:
         """Add effects to the chain."""
@@ -298,12 +299,8 @@ class Chain:
     @cached_property
     def _columns(self) -> list[tuple[AnyEffect, slice]]:
         """Columns of theta that belong to each effect."""
-        end = len(self.ssf.names) + len(self.levels.names) + len(self.scene.names)
-        pairs = []
-        for effect in self.effects:
-            start, end = end, end + len(effect.prior.names)
-            pairs.append((effect, slice(start, end)))
-        return pairs
+        first = len(self.ssf.names) + len(self.levels.names) + len(self.scene.names)
+        return columns_of_effects(self.effects, first)
 
 
 @dataclass(frozen=True, eq=False)

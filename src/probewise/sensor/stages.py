@@ -7,9 +7,10 @@ function at one stage; effects are applied in the order of their stages.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from itertools import accumulate, pairwise
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -151,6 +152,18 @@ class Effect(Protocol[V]):
 
 
 AnyEffect = Effect[Any]
+E = TypeVar("E", bound=AnyEffect)
+
+
+def names_of_effects(effects: Iterable[AnyEffect]) -> Iterator[str]:
+    """Name the parameters of effects as "effect.parameter", one per column of theta."""
+    return (f"{effect.name}.{name}" for effect in effects for name in effect.prior.names)
+
+
+def columns_of_effects(effects: Sequence[E], first: int = 0) -> list[tuple[E, slice]]:
+    """Return each effect with its columns of theta, which follow one another from column `first` on."""
+    ends = accumulate((len(effect.prior.names) for effect in effects), initial=first)
+    return [(effect, slice(*both)) for effect, both in zip(effects, pairwise(ends), strict=True)]
 
 
 class SensorModel(Protocol):

@@ -16,6 +16,7 @@ from probewise.effects import NamedEffect
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
+from probewise.sensor.stages import columns_of_effects, names_of_effects
 from probewise.systems.all_steps import Trajectories, integrate_near, steps_of
 from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.mistakes import mistake_in
@@ -303,8 +304,7 @@ class SystemChain:
     @property
     def names(self) -> tuple[str, ...]:
         """The system's parameters, then each effect's as "effect.parameter"."""
-        own = (f"{effect.name}.{name}" for effect in self.effects for name in effect.prior.names)
-        return (*self.system.prior.names, *own)
+        return (*self.system.prior.names, *names_of_effects(self.effects))
 
     def predict(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
@@ -390,8 +390,4 @@ class SystemChain:
 
     @cached_property
     def _columns(self) -> list[tuple[AnyEffect, slice]]:
-        end, pairs = self.system.n_params, []
-        for effect in self.effects:
-            start, end = end, end + len(effect.prior.names)
-            pairs.append((effect, slice(start, end)))
-        return pairs
+        return columns_of_effects(self.effects, self.system.n_params)

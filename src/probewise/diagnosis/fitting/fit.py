@@ -17,6 +17,7 @@ from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES, footprint_of
+from probewise.sensor.stages import columns_of_effects
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
@@ -64,13 +65,7 @@ class Model:
 
     def columns_of(self, name: str) -> slice:
         """Coordinates of one effect."""
-        at = self.sensor.n_params
-        for effect in self.effects:
-            n_params = len(effect.prior.names)
-            if effect.name == name:
-                return slice(at, at + n_params)
-            at += n_params
-        raise KeyError(name)
+        return {effect.name: own for effect, own in columns_of_effects(self.effects, self.sensor.n_params)}[name]
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to the chain's parameters."""

@@ -15,7 +15,7 @@ from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
 from probewise.effects import NoiseEffect, NoiseRows, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
-from probewise.sensor.stages import NoiseLevel
+from probewise.sensor.stages import NoiseLevel, columns_of_effects
 
 _FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
 _MANY = 12  # nodes of one effect above which they are thinned before combination with another's
@@ -67,13 +67,7 @@ class NoiseModel:
 
     def columns_of(self, name: str) -> slice:
         """Return the columns of one effect's settings."""
-        at = 0
-        for effect in self.effects:
-            n_params = len(effect.prior.names)
-            if effect.name == name:
-                return slice(at, at + n_params)
-            at += n_params
-        raise KeyError(name)
+        return {effect.name: own for effect, own in columns_of_effects(self.effects)}[name]
 
     def every_third(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Thin the nodes of each effect with more than twelve to every third, for `likely`."""
@@ -125,11 +119,8 @@ class NoiseModel:
         everywhere = np.zeros((1, len(plan)))
         everywhere[0, usable] = seen
         level = NoiseLevel(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
-        at = 0
-        for effect in self.effects:
-            n_params = len(effect.prior.names)
-            level = effect.apply(level, settings[:, at : at + n_params], plan)
-            at += n_params
+        for effect, own in columns_of_effects(self.effects):
+            level = effect.apply(level, settings[:, own], plan)
         return level
 
     def _law(self, level: NoiseLevel, node: int, far: BoolArray) -> NoiseLaw:

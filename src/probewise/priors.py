@@ -235,17 +235,17 @@ class Product:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each coordinate by its own marginal, both (n_samples, n_params)."""
-        u = _checked_columns(u, self.names)
+        u = checked_columns(u, self.names)
         return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each parameter by its own marginal, both (n_samples, n_params)."""
-        theta = _checked_columns(theta, self.names)
+        theta = checked_columns(theta, self.names)
         return np.stack([m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the sum of the marginals' log densities, (n_samples, n_params) -> (n_samples,)."""
-        theta = _checked_columns(theta, self.names)
+        theta = checked_columns(theta, self.names)
         total = np.zeros(len(theta))
         for i, marginal in enumerate(self.marginals.values()):
             total = total + marginal.log_prob(theta[:, i])
@@ -272,17 +272,17 @@ class Joint:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each part's coordinates by that part, both (n_samples, n_params)."""
-        u = _checked_columns(u, self.names)
+        u = checked_columns(u, self.names)
         return np.concatenate([p.from_unit_cube(c) for p, c in self._columns_of_parts(u)], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each part's parameters by that part, both (n_samples, n_params)."""
-        theta = _checked_columns(theta, self.names)
+        theta = checked_columns(theta, self.names)
         return np.concatenate([p.to_unit_cube(c) for p, c in self._columns_of_parts(theta)], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""
-        theta = _checked_columns(theta, self.names)
+        theta = checked_columns(theta, self.names)
         total = np.zeros(len(theta))
         for part, columns in self._columns_of_parts(theta):
             total = total + part.log_prob(columns)
@@ -325,7 +325,7 @@ def require_prior(name: str, prior: object, *more: str) -> None:
         raise ParameterError(name, prior, f"a prior with {' and '.join(missing)}; see probewise.priors.Prior")
 
 
-def _checked_columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:
+def checked_columns(values: FloatArray, names: tuple[str, ...]) -> FloatArray:
     """Convert parameters to floats; raise ShapeError unless they are (n_samples, n_params)."""
     array = floats(values, "parameters")
     if array.ndim != 2 or array.shape[1] != len(names):

@@ -19,8 +19,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.calibration.coordinates import MomentCoordinates, kinds_of
-from probewise.errors import ParameterError, ShapeError
-from probewise.priors import LogUniform, Marginal, Uniform
+from probewise.errors import ParameterError
+from probewise.priors import LogUniform, Marginal, Uniform, checked_columns
 from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
 from probewise.recordings import Uniform as UniformPattern
 from probewise.scene import KnownScene
@@ -97,7 +97,7 @@ class SSFPrior:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map the unit cube to parameters, both (n_samples, 6 N + 2)."""
-        self._require_columns(u)
+        u = checked_columns(u, self.names)
         out = np.empty(u.shape)
         for n in range(self.n_gaussians):
             g, x = out[:, 6 * n : 6 * n + 6], u[:, 6 * n : 6 * n + 6]
@@ -114,7 +114,7 @@ class SSFPrior:
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map parameters to the unit cube, both (n_samples, 6 N + 2)."""
-        self._require_columns(theta)
+        theta = checked_columns(theta, self.names)
         out = np.empty(theta.shape)
         for n in range(self.n_gaussians):
             g, x = theta[:, 6 * n : 6 * n + 6], out[:, 6 * n : 6 * n + 6]
@@ -131,7 +131,7 @@ class SSFPrior:
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
-        self._require_columns(theta)
+        theta = checked_columns(theta, self.names)
         # One contiguous row per kind of parameter, for speed.
         return self.log_prob_by_kind(np.ascontiguousarray(kinds_of(theta)), theta[:, -2], theta[:, -1])
 
@@ -185,10 +185,6 @@ class SSFPrior:
         if self.unit_mass_mm2 is None:
             return np.ones_like(determinant)
         return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, _TINY))
-
-    def _require_columns(self, values: FloatArray) -> None:
-        if values.ndim != 2 or values.shape[1] != len(self.names):
-            raise ShapeError(f"parameters have shape {values.shape}; allowed: (n_samples, {len(self.names)})")
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_kind, require_number, require_pair, require_whole
-from probewise.errors import ParameterError, ShapeError
-from probewise.priors import Prior, Product, Uniform
+from probewise.errors import ParameterError
+from probewise.priors import Prior, Product, Uniform, checked_columns
 from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.regions import EllipseRegion, MixtureOfRegions, PolygonRegion, UniformRegion, disc_region
 
@@ -56,8 +56,7 @@ class PlacedPrior:
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map the unit cube to parameters, both (n_samples, n_params)."""
-        if u.ndim != 2 or u.shape[1] != len(self.names):
-            raise ShapeError(f"parameters have shape {u.shape}; allowed: (n_samples, {len(self.names)})")
+        u = checked_columns(u, self.names)
         own = self.own.from_unit_cube(u[:, 2:])
         low, high = self._bounds_of_centre(own)
         return np.concatenate([low + (high - low) * u[:, :2], own], axis=1)
@@ -298,8 +297,7 @@ class _AnyOfPrior:
         ]
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        if u.ndim != 2 or u.shape[1] != len(self.names):
-            raise ShapeError(f"parameters have shape {u.shape}; allowed: (n_samples, {len(self.names)})")
+        u = checked_columns(u, self.names)
         ends = np.concatenate([[0.0], np.cumsum(self.weights)])
         theta = np.empty_like(u)
         theta[:, 0] = np.interp(u[:, 0], ends, np.arange(len(ends)))

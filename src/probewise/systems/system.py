@@ -285,7 +285,7 @@ class System:
                 )
 
     def _is_within_reach(self, places: RowsInRuns) -> bool:
-        return bool(places.n_steps(self.max_step).sum() <= _MOST_STEPS + len(places.row_at_place))
+        return bool(places.stepping(self.max_step).in_gap.sum() <= _MOST_STEPS + len(places.row_at_place))
 
 
 def given_columns(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:

@@ -87,11 +87,11 @@ class Refits:
             evidence = self.noises.weigh(found)
         return WeighedFit.of(found, law, evidence, log_detectable(found, law, self.templates.usable))
 
-    def is_better_at(self, z: FloatArray, candidate: WeighedFit) -> bool:
-        """Return whether a candidate's model is better at coordinates z (n_params,) than at its fit."""
+    def is_better_at(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
+        """Return whether a candidate's model, its effects in any order, is better at z (n_params,) than at its fit."""
         found, law = candidate.found, candidate.law
         readings = found.predicted + found.residuals
-        whitened = law(readings - found.model.predict(z[None, :])[0, self.templates.usable])[:, None]
+        whitened = law(readings - model.predict(z[None, :])[0, self.templates.usable])[:, None]
         there = float(law.minus_log_likelihood(whitened, law.scale(whitened))[0]) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
 from probewise.calibration.known_density import KnownDensity
 from probewise.inference import SensorProblem
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 from probewise.priors import Coordinates
 
 # A change of temperature leaves at least this share of the particles effective.
@@ -129,7 +129,7 @@ class Climb(ShowsItself):
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order."""
-        return np.asarray(self.theta[rng.permutation(resampled(self.weight, n, rng))])
+        return np.asarray(self.theta[rng.permutation(resampled_rows(self.weight, n, rng))])
 
     def summary(self) -> str:
         """Describe evidence and cost in plain text."""
@@ -264,7 +264,7 @@ def climb(
         # Cut off (truncated importance sampling, Ionides 2008): a single particle must not take over its cloud.
         mean = logsumexp(log_weight, axis=1, keepdims=True) - math.log(here)
         weight = np.exp(np.minimum(log_weight - mean, 0.5 * math.log(here)))
-        now = now.take(np.concatenate([k * here + resampled(own, n, rng) for k, own in enumerate(weight)]))
+        now = now.take(np.concatenate([k * here + resampled_rows(own, n, rng) for k, own in enumerate(weight)]))
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):

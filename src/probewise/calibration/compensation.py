@@ -20,7 +20,7 @@ from probewise.calibration.coordinates import MomentCoordinates
 from probewise.calibration.gaussian_responses import LoneResponses, light_of
 from probewise.calibration.whole_coordinates import WholeCoordinates
 from probewise.inference import SensorProblem, sd_floor
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 
 # All particles take their shapes from one pool, whose scatter no cloud tells: with 6,000 it was the greatest part of
 # the error of ln Z of two Gaussians. So many are drawn at a time, until enough are effective or there are many.
@@ -231,7 +231,7 @@ class Compensation:
     def draw(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, Answer]:
         """Draw shapes, (n, 6) with amplitudes to be replaced, and the answers to them."""
         log_weight = self.log_tilt(self.answers)
-        rows = rng.permutation(resampled(np.exp(log_weight - log_weight.max()), n, rng))
+        rows = rng.permutation(resampled_rows(np.exp(log_weight - log_weight.max()), n, rng))
         return self.pool[rows], self.answers.take(rows)
 
     def log_tilt(self, answer: Answer) -> FloatArray:

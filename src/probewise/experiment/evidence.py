@@ -19,7 +19,7 @@ from probewise.errors import NotConvergedError
 from probewise.experiment.kernels import LocalKernels
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 
 _WIDE = 3.0  # factor on the width of some kernels, so that draws extend beyond the samples
 _OF_WIDE = 0.15  # share of the draws from those
@@ -57,7 +57,7 @@ def bridged_evidence(posterior: Weighted, problem: SensorProblem, *, rng: np.ran
         The mean of the two halves' estimates; the error is their standard error, or their difference if larger.
     """
     n = len(posterior.theta) // 2 * 2
-    rows = resampled(posterior.weight, n, rng)
+    rows = resampled_rows(posterior.weight, n, rng)
     # Copies of a sample are adjacent, and so are in the same half.
     halves = np.split(rows, 2)
     if min(len(np.unique(posterior.theta[half, 0])) for half in halves) <= 2 * posterior.theta.shape[1]:

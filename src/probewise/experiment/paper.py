@@ -38,7 +38,7 @@ from probewise.nested import (
     diversify,
 )
 from probewise.nested.run import run
-from probewise.nested.weights import resampled
+from probewise.nested.weights import resampled_rows
 from probewise.recordings import Recording
 from probewise.recordings import Uniform as UniformPattern
 from probewise.recordings.plan import require_described, require_recording
@@ -100,7 +100,7 @@ class NestedSampling:
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
         """See `Method.drawn`; samples of a nested run may be copies, so each takes its own steps."""
-        which = resampled(posterior.probability, n, rng)
+        which = resampled_rows(posterior.probability, n, rng)
         drawn = []
         for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
             if n_own := int((which == k).sum()):

@@ -22,7 +22,7 @@ from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
 from probewise.inference.problem import SensorProblem, scores
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 from probewise.priors import Prior
 
 _KEEP = 0.5  # least effective share of the samples without resampling
@@ -194,7 +194,7 @@ def update(
         variance += max(1.0 / n_eff - 1.0 / n, 0.0)
         if share == 1.0 and n_eff >= least:
             break
-        rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
+        rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
         now, moves = _move_by_metropolis(
             now.take(rows), share, last, rng, _partition_rows(rows) if fall_back is None else None, effort
         )
@@ -242,7 +242,7 @@ def resample_and_move(
     had = particles.weighted
     if n == len(had.theta) or had.log_z == -math.inf:
         return particles
-    rows = resampled(had.weight, n, rng)
+    rows = resampled_rows(had.weight, n, rng)
     start = _EvaluatedSamples(
         had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1))
     )
@@ -260,7 +260,7 @@ def particles_from_posterior(
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     last = _LastReading(problem)
-    cloud = last.evaluate_samples(found.theta[resampled(found.weight, n, rng)])
+    cloud = last.evaluate_samples(found.theta[resampled_rows(found.weight, n, rng)])
     moved, moves = _move_by_metropolis(cloud, 1.0, last, rng, effort=effort)
     drawn = replace(_equally_weighted(moved, found), n_calls=found.n_calls + n + moves.n_calls)
     return Particles(drawn, np.arange(n), found.log_z_error**2)

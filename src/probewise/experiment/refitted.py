@@ -22,7 +22,7 @@ from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.pace import EACH_S, run_time_s
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 
 _STARTS = 90
 _STEPS = 8
@@ -224,7 +224,7 @@ def _inverse_precision(precision: FloatArray) -> FloatArray:
 
 def _resampled_rows(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
     """Resample rows of a posterior; none where too few are distinct to fit kernels."""
-    rows = resampled(posterior.weight, len(posterior.theta), rng)
+    rows = resampled_rows(posterior.weight, len(posterior.theta), rng)
     return rows if len(np.unique(rows)) > 4 * n_params else rows[:0]
 
 

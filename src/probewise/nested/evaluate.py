@@ -70,7 +70,7 @@ class Points:
         self.log_likelihood[rows] = points.log_likelihood[which]
 
     def order(self) -> IntArray:
-        """Row numbers from worst to best, ties by label."""
+        """Return the row numbers from the least to the greatest log likelihood, ties by label, (n,)."""
         return np.lexsort((self.label, self.log_likelihood))
 
     @staticmethod
@@ -130,14 +130,18 @@ class Evaluator:
         self.names = self.problem.prior.names
         self.space = space_of(self.problem.prior, getattr(self.problem, "periodic", ()))
 
-    def from_prior(self, n: int, rng: np.random.Generator) -> Points:
+    def draw_from_prior(self, n: int, rng: np.random.Generator) -> Points:
         """Draw from the prior and evaluate."""
         return self(self.space.draw(n, rng=rng), rng)
 
-    def known(self, theta: FloatArray, log_likelihood: FloatArray, label: FloatArray) -> Points:
-        """Make points of hypotheses (n, n_params) that were evaluated before."""
+    from_prior = draw_from_prior  # its earlier name
+
+    def points_from_known_values(self, theta: FloatArray, log_likelihood: FloatArray, label: FloatArray) -> Points:
+        """Make points of hypotheses (n, n_params) whose log likelihood and label, (n,), are known; evaluate nothing."""
         u = self.space.enter(theta)
         return Points(u, theta, self.space.leave(u)[1], log_likelihood, label)
+
+    known = points_from_known_values  # its earlier name
 
     def __call__(self, u: FloatArray, rng: np.random.Generator) -> Points:
         """Evaluate `u`, (n, n_params), inside the space, and give every point a new label.

@@ -19,7 +19,7 @@ def n_effective(log_weight: FloatArray) -> float:
     return float(weight.sum() ** 2 / (weight @ weight))
 
 
-def resampled(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
+def resampled_rows(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
     """Draw rows by weight with systematic resampling, (n_weights,) -> (n,): counts are n w rounded up or down."""
     ladder = np.cumsum(weight)
     rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")

@@ -19,7 +19,7 @@ from probewise.inquiry.any_settings.settings import Settings
 from probewise.inquiry.choice import choose
 from probewise.nested import Weighted, pose
 from probewise.nested.pose import AnyPrior
-from probewise.nested.weights import resampled
+from probewise.nested.weights import resampled_rows
 from probewise.priors import require_prior
 
 _N_ASKED = 1000  # samples whose predictions value the settings
@@ -254,7 +254,7 @@ class Inquiry(ShowsItself):
     def _utility_by_weights(self, weight: FloatArray) -> FloatArray:
         """Compute the acquisition function for the posterior samples with these weights, (n_settings,)."""
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
-        theta = self._posterior.theta[resampled(weight, n, self._rng)]
+        theta = self._posterior.theta[resampled_rows(weight, n, self._rng)]
         theta = theta[self._rng.permutation(n)]  # copies of one sample apart
         predicted = self._model.predict(theta, self._settings)
         predictive = Predictive(predicted, self._model.scale(theta, predicted), self._model.noise)

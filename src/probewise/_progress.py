@@ -16,7 +16,7 @@ from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from probewise.calibration import Rung
+    from probewise.calibration import TemperatureSummary
 
 _PATIENCE_S = 2.0  # shorter work shows no bar
 _BETWEEN_LINES_S = 5.0
@@ -81,10 +81,10 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         yield progress
 
 
-def nested_progress(progress: Progress) -> Callable[[int | str, RoundSummary | Rung], None]:
+def nested_progress(progress: Progress) -> Callable[[int | str, RoundSummary | TemperatureSummary], None]:
     """Adapt a progress function to reports of nested sampling and climbs, each by its name or number of Gaussians."""
 
-    def tell(what: int | str, state: RoundSummary | Rung) -> None:
+    def tell(what: int | str, state: RoundSummary | TemperatureSummary) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
         if not isinstance(state, RoundSummary):
             progress(stage, note=f"temperature {state.temperature:.3f} of 1, ln Z {state.log_z:.1f}")

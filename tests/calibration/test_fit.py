@@ -11,7 +11,7 @@ import pytest
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
 from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth, wilson_interval
-from probewise.calibration.distinct_rows import DistinctRows
+from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import EvidenceChange, RoundSummary
@@ -90,7 +90,7 @@ def test_the_order_of_the_gaussians_does_not_matter(recording: Recording) -> Non
 def test_rows_predicted_once_are_those_predicted_one_by_one(recording: Recording, truth: FloatArray) -> None:
     plan = recording.plan.take(np.array([5, 40, 5, 100, 40, 7]))
     chain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
-    wrapped = DistinctRows(chain, plan)
+    wrapped = DeduplicatedModel(chain, plan)
     np.testing.assert_allclose(wrapped.predict(truth[None], plan), chain.predict(truth[None], plan), rtol=1e-12)
     with pytest.raises(ParameterError, match="plan"):
         wrapped.predict(truth[None], recording.plan)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray, floats
-from probewise.calibration.distinct_rows import DistinctRows
+from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_sensor
 from probewise.effects import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
@@ -83,7 +83,7 @@ def predict(
     scored = Recording(plan, recorded).usable
     step = plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
-    model = chain if sensor.effects else DistinctRows(chain, plan)
+    model = chain if sensor.effects else DeduplicatedModel(chain, plan)
     for effect in sensor.carried_effects:
         for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
             warnings.warn(

@@ -183,7 +183,7 @@ def paper_experiment(
     for name, value, allowed in (("model", model, get_args(Model)), ("nested_stop", nested_stop, tuple(NESTED_STOP))):
         if value not in allowed:
             raise ParameterError(name, value, " or ".join(map(repr, allowed)))
-    sensor = sensor.leading()
+    sensor = sensor.with_leading_effects()
     scale, scene = scale_of(sensor.instrumentation), HypothesisScene(shape)
     if naive is not None and model != "naive":
         raise ParameterError("naive", naive, 'None, but with the model "naive"')
@@ -225,7 +225,7 @@ def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
     require_recording(recording)
     require_sensor(sensor)
     require_described(recording.plan)
-    mixture, patterns = sensor.leading().mixture(), KnownScene(recording.plan.patterns)
+    mixture, patterns = sensor.with_leading_effects().mixture(), KnownScene(recording.plan.patterns)
     share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)
     seen = share.predict(np.empty((1, 0)), recording.plan)[0]
     black, white = (

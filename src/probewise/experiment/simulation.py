@@ -169,7 +169,7 @@ def experiment_for(
     require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
-    sensor = sensor.leading()  # a mean over several hypotheses describes none of them
+    sensor = sensor.with_leading_effects()  # a mean over several hypotheses describes none of them
     levels, noise_sd, scale = levels_of(sensor), float(sensor.noise_sd.mean()), scale_of(sensor.instrumentation)
     scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
     pose = partial(

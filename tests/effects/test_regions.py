@@ -18,7 +18,7 @@ from probewise.scene.regions import (
     UniformRegion,
     disc_region,
 )
-from probewise.sensor import FixedMixture, Poses, field_of, seen, seen_discrete
+from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels, mean_albedo_under_gaussians
 
 EDGE = HalfPlaneRegion([0.5], [1.0], 0.9, 0.1)
 CHANGED = {
@@ -54,8 +54,10 @@ def test_a_changed_surface_is_seen_alike_by_closed_form_and_by_the_papers_sum(ki
     grid = np.arange(-25.0, 25.25, 0.5)
     field = field_of(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
     x, y = np.array([[-6.0, 0.0, 2.0, 7.0]]), np.array([[3.0, -2.0, 1.0, 0.0]])
-    discrete = seen_discrete(region, field, Poses(x, y, np.zeros((1, 4))))
-    closed = seen(region, x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0)))
+    discrete = mean_albedo_by_pixels(region, field, Poses(x, y, np.zeros((1, 4))))
+    closed = mean_albedo_under_gaussians(
+        region, x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0))
+    )
     np.testing.assert_allclose(closed[:, :, 0], discrete, atol=2e-4)
 
 

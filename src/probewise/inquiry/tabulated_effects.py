@@ -50,4 +50,4 @@ class TabulatedChain:
         seen = (level - table.dark) / (table.bright - table.dark)
         if self.cards is not None:
             seen = seen_with_cards(seen, self.cards.cards, self.cards.covered(poses, plan))
-        return self.chain.read(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)
+        return self.chain.readings_of_view(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)

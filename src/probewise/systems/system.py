@@ -308,9 +308,9 @@ class SystemChain:
 
     def predict(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
-        return self.read(self.look(theta, plan), theta, plan)
+        return self.readings_of_view(self.simulated_view(theta, plan), theta, plan)
 
-    def look(self, theta: FloatArray, plan: Any) -> FloatArray:
+    def simulated_view(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
         system = self.system
         columns: Mapping[str, NDArray[Any]] = given_columns(system.simulator, plan)
@@ -375,7 +375,7 @@ class SystemChain:
         ]
         return np.concatenate(each)
 
-    def read(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
+    def readings_of_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""
         for effect, columns in self._columns:
             if Stage.SEEN <= effect.stage <= Stage.SATURATION:

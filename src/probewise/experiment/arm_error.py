@@ -138,7 +138,7 @@ def moved_by_arm(
     """Draw an error of the arm for each sample, theta (n_samples, n_params), and return its shift, of the same form."""
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     if isinstance(experiment.shape, AnyOf):
-        moved[experiment.shape.which(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
+        moved[experiment.shape.shape_index(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
     return np.asarray(moved)
 
 

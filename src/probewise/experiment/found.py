@@ -53,7 +53,7 @@ def found_shape(run: Exploration) -> FoundShape:
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
     name = last.likely_shape or _shape_name(shape)
     if isinstance(shape, AnyOf):
-        own = shape.which(theta) == shape.labels.index(name)
+        own = shape.shape_index(theta) == shape.labels.index(name)
         theta, weight = theta[own], weight[own]
     low, high = weighted_quantiles(theta, weight, [0.025, 0.975])
     parameters = tuple(
@@ -100,7 +100,7 @@ def samples_csv(run: Exploration) -> str:
     several = isinstance(shape, AnyOf)
     columns = [k for k, name in enumerate(names) if name != "shape"]
     writer.writerow(["weight", *(["shape"] if several else []), *(names[k] for k in columns)])
-    which = shape.which(theta) if isinstance(shape, AnyOf) else np.zeros(len(theta), dtype=np.int64)
+    which = shape.shape_index(theta) if isinstance(shape, AnyOf) else np.zeros(len(theta), dtype=np.int64)
     for row in np.flatnonzero(weight > 0).tolist():
         label, held = [], set(columns)
         if isinstance(shape, AnyOf):

@@ -30,10 +30,10 @@ from probewise._kinds import require_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, shown
 from probewise.recordings.atomic import write_text_atomically
-from probewise.recordings.locking import locked
+from probewise.recordings.locking import hold_lock
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.recordings.strict_json import json_of
+from probewise.recordings.strict_json import parse_json_file_text
 from probewise.recordings.text import read_bytes
 
 FORMAT = "journal/1"
@@ -177,7 +177,7 @@ def read_journal(path: str | Path) -> Journal:
 
 
 def _parse_line(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
-    value = json_of(path, line, "one JSON object a line", row=row)
+    value = parse_json_file_text(path, line, "one JSON object a line", row=row)
     if not isinstance(value, dict):
         raise FileError(path, f"a JSON {type(value).__name__}", "one JSON object a line", row=row)
     return value
@@ -309,7 +309,7 @@ class JournalWriter:
         except OSError as error:
             raise FileError(path.parent, f"cannot be made ({error.strerror})", "a folder you may write to") from error
         with contextlib.ExitStack() as stack:
-            stack.enter_context(locked(path))
+            stack.enter_context(hold_lock(path))
             if path.exists():
                 raise _error_of_existing_file(path)
             write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
@@ -328,7 +328,7 @@ class JournalWriter:
             If the file cannot be written, another process writes to it, or one has since it was read.
         """
         with contextlib.ExitStack() as stack:
-            stack.enter_context(locked(journal.path))
+            stack.enter_context(hold_lock(journal.path))
             try:
                 file = stack.enter_context(open(journal.path, "r+b", buffering=0))
             except OSError as error:

@@ -155,7 +155,7 @@ def _candidate_designs(
     shapes = np.concatenate([own[:, start : start + n_shape] for own in theta if len(own)])
     some = shapes[rng.choice(len(shapes), _AT_EDGES)]  # equally often, regardless of probability
     places = [np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings])]
-    places += [card.informative_mm for card in experiment.cards]
+    places += [card.informative_places_mm for card in experiment.cards]
     region = experiment.shape.region(some)
     if isinstance(region, EllipseRegion | PolygonRegion):
         edges = outlines(region)

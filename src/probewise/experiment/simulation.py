@@ -236,7 +236,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
     """
     means = sensor.mean()
     effects: list[AnyEffect] = []
-    for effect in sensor.carried_effects:
+    for effect in sensor.effects_on_new_scans:
         if effect.stage is Stage.NOISE:  # noise of readings far apart in place and time is independent
             continue
         names = [f"{effect.name}.{name}" for name in effect.prior.names]

@@ -34,7 +34,7 @@ def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, Fl
     if not isinstance(experiment.shape, AnyOf):
         mean = weight @ theta
         return mean, np.sqrt(weight @ (theta - mean) ** 2), {}
-    which = experiment.shape.which(theta)
+    which = experiment.shape.shape_index(theta)
     share = np.bincount(which, weights=weight, minlength=len(experiment.shape.labels))
     likely = int(share.argmax())
     columns = experiment.shape.prior.columns[likely]
@@ -58,7 +58,7 @@ def chance_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> fl
     ]
     off = (np.abs(theta[:, lengths] - mean[lengths]) > off_mm).any(axis=1)
     if isinstance(experiment.shape, AnyOf):
-        which = experiment.shape.which(theta)
+        which = experiment.shape.shape_index(theta)
         off |= which != np.bincount(which, weights=weight).argmax()
     return float(weight[off].sum() / weight.sum())
 

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.designs import Designs
 from probewise.inquiry.forecast import Forecast, PredictiveDistributions, resampled_hypotheses, weight_by_level
 from probewise.recordings.plan import Plan
-from probewise.scene.cards import Card, CardedScene, seen_with_cards
+from probewise.scene.cards import Card, CardedScene, mean_albedo_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import Layout, response
 from probewise.sensor.stages import Poses, SensorModel
@@ -52,7 +52,7 @@ class CardedModel:
         covered = self.covered(Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan)
         dark, bright = self.ends
         seen = (self.plain.predict(theta, plan) - dark) / (bright - dark)
-        return np.asarray(dark + (bright - dark) * seen_with_cards(seen, self.cards, covered))
+        return np.asarray(dark + (bright - dark) * mean_albedo_with_cards(seen, self.cards, covered))
 
     @property
     def ends(self) -> tuple[float, float]:

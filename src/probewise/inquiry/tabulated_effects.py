@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.inquiry.carded import CardedModel
 from probewise.inquiry.discs import DiscTable, is_alike_everywhere
 from probewise.recordings.plan import Plan
-from probewise.scene.cards import seen_with_cards
+from probewise.scene.cards import mean_albedo_with_cards
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel, Stage, View
 
@@ -49,5 +49,5 @@ class TabulatedChain:
         level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
         seen = (level - table.dark) / (table.bright - table.dark)
         if self.cards is not None:
-            seen = seen_with_cards(seen, self.cards.cards, self.cards.covered(poses, plan))
+            seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.covered(poses, plan))
         return self.chain.readings_of_view(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)

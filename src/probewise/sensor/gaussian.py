@@ -19,7 +19,7 @@ from scipy.special import ndtr, owens_t
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, SlowWarning
 from probewise.scene.albedo import Region
-from probewise.scene.cards import CardedRegion, seen_with_cards
+from probewise.scene.cards import CardedRegion, mean_albedo_with_cards
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -177,30 +177,30 @@ def _broadcast_entry(array: FloatArray, i: int, j: int) -> float:
     return float(array[i if array.shape[0] > 1 else 0, j if array.shape[1] > 1 else 0])
 
 
-def _mix_by_share(outside: float, inside: float, share: FloatArray) -> FloatArray:
+def _albedo_by_share_inside(outside: float, inside: float, share: FloatArray) -> FloatArray:
     if (outside, inside) == (0.0, 1.0):
         return share
     return outside + (inside - outside) * share
 
 
 @seen_by_one.register
-def _(region: UniformRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_uniform(region: UniformRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     return region.level[:, None]
 
 
 @seen_by_one.register
-def _(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the cumulative of the Gaussian's projection on the normal."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     place = cosine * gaussian.x_mm + sine * gaussian.y_mm - region.offset_mm[:, None]
     shift = cosine * gaussian.dx_mm + sine * gaussian.dy_mm
     variance = cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + 2 * cosine * sine * gaussian.cov_xy
     per_sd = 1 / np.sqrt(variance)
-    return _mix_by_share(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
+    return _albedo_by_share_inside(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
 
 
 @seen_by_one.register
-def _(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the field at the Gaussian's mean, which is exact for a linear field."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     return region.per_mm[:, None] * (
@@ -209,7 +209,7 @@ def _(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
 
 
 @seen_by_one.register
-def _(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_stripes(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum cumulatives or, for stripes finer than the footprint, their Fourier series."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     period, duty = region.period_mm[:, None], region.duty[:, None]
@@ -235,7 +235,7 @@ def _(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         for k in range(-4, 6):  # 8 sd are at most 3.2 periods
             total += normal_cdf((a - k) / s) - normal_cdf((a - k - d) / s)
         share[coarse] = total
-    return _mix_by_share(region.outside, region.inside, share)
+    return _albedo_by_share_inside(region.outside, region.inside, share)
 
 
 _FAR = 26.0  # sds: the mass beyond is 0, and exp is ten times slower where it underflows
@@ -278,10 +278,10 @@ def probabilities_beyond_corner(
 
 
 @seen_by_one.register
-def _(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_quadrant(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     corner, direction = region.corner_mm, region.direction
     share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], gaussian)
-    return _mix_by_share(region.outside, region.inside, share)
+    return _albedo_by_share_inside(region.outside, region.inside, share)
 
 
 def mass_in_quadrant(
@@ -298,7 +298,7 @@ def mass_in_quadrant(
 
 
 @seen_by_one.register
-def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum Owen's T over the edges, in the frame in which the Gaussian is the unit one."""
     sd_x = np.sqrt(gaussian.var_x)
     slope = gaussian.cov_xy / gaussian.var_x
@@ -324,14 +324,14 @@ def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         near = (np.abs(height) < _REACH) & (start < _REACH) & (end > -_REACH) & (height != 0)
         angle[near] -= 2 * np.pi * _mass_beyond_edges(height[near], start[near], end[near])
         turning += angle
-    return _mix_by_share(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
+    return _albedo_by_share_inside(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
 
 
 @seen_by_one.register
-def _(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_carded_region(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate over the region and over each card by itself, then lay the cards over the region."""
     covered = [seen_by_one(card.region, gaussian, n_nodes) for card in region.cards]
-    return seen_with_cards(seen_by_one(region.region, gaussian, n_nodes), region.cards, covered)
+    return mean_albedo_with_cards(seen_by_one(region.region, gaussian, n_nodes), region.cards, covered)
 
 
 def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
@@ -359,7 +359,7 @@ def _half_legendre_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 @seen_by_one.register
-def _(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_ellipse(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate cumulatives along the normal by quadrature along the tangent, after a map to the unit disc."""
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
     cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
@@ -378,7 +378,9 @@ def _(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         var_q = (sine**2 * gaussian.var_x + cosine**2 * gaussian.var_y - cross) / b**2
         twist = cosine * sine * (gaussian.var_y - gaussian.var_x) + (cosine**2 - sine**2) * gaussian.cov_xy
         cov_pq = twist / (a * b)
-    return _mix_by_share(region.outside, region.inside, _mass_in_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes))
+    return _albedo_by_share_inside(
+        region.outside, region.inside, _mass_in_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes)
+    )
 
 
 def _mass_in_unit_disc(
@@ -537,7 +539,7 @@ def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 @seen_by_one.register
-def _(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_mixture(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate each hypothesis by the rule for its kind of region."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows_and_regions():
@@ -546,7 +548,7 @@ def _(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArr
 
 
 @seen_by_one.register
-def _(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate each row of pixels exactly along x, and by Gauss-Legendre across it, in panels within the footprint."""
     shape = gaussian.shape
     out = np.empty(shape)

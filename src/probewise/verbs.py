@@ -79,7 +79,7 @@ def calibrate(
     method
         "quick" (the default): widths evenly probable over orders of magnitude; each number of Gaussians is reached by
         sequential Monte Carlo, from the peak of its likelihood or from the number below. One search of the whole prior
-        with few live points vouches for the chosen number; what is doubtful is searched in full.
+        with few live points checks the chosen number; a number in doubt is searched in full.
         "full": the same priors; every number is searched by nested sampling, and its evidence refined by importance
         sampling. Takes two to ten times as long. "refined" is its former name.
         "paper": uniform priors, and the evidence of nested sampling alone. All have the Student-t likelihood.
@@ -116,7 +116,7 @@ def calibrate(
     1
     """
     from probewise import calibration
-    from probewise._progress import nested_progress, progress_or_bar
+    from probewise._progress import progress_or_bar, sampler_progress
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
 
@@ -136,7 +136,7 @@ def calibrate(
             stop=NESTED_STOP[nested_stop or "change"] if paper else None,
             refined=not paper,
             rng=rng,
-            progress=nested_progress(told),
+            progress=sampler_progress(told),
         )
 
 

@@ -10,7 +10,14 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
-from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth, wilson_interval
+from probewise.calibration.coverage import (
+    Coverage,
+    coverage,
+    draw_truth,
+    log_z_lead_of_one_gaussian,
+    simulate_truth,
+    wilson_interval,
+)
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
@@ -166,7 +173,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 @pytest.mark.slow
 def test_evidence_prefers_one_gaussian_where_there_is_one() -> None:
     rng = np.random.default_rng(20)
-    assert order_lead(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
+    assert log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ def _by_grid(recording: Recording, theta: FloatArray, k: int) -> float:
 def test_light_is_integrated_as_on_a_fine_grid(recording: Recording, truth: FloatArray, n: int) -> None:
     theta = _near_truth(truth, n, np.random.default_rng(4))
     removal = LightIntegral(default_prior(recording, n), OrderProblems(recording, default_prior).problem(1), 1)
-    taken = removal.log_ratio_of_taken(theta)
+    taken = removal.log_ratio_when_taken_away(theta)
     for k in range(1, n):
         assert taken[0, k - 1] == pytest.approx(_by_grid(recording, theta[0], k), abs=5e-3)
 
@@ -48,8 +48,8 @@ def test_light_is_integrated_as_on_a_fine_grid(recording: Recording, truth: Floa
 def test_adding_is_taking_away_seen_from_below(recording: Recording, truth: FloatArray) -> None:
     theta = _near_truth(truth, 3, np.random.default_rng(5))
     removal = LightIntegral(default_prior(recording, 3), OrderProblems(recording, default_prior).problem(1), 1)
-    added = removal.log_ratio_of_added(np.delete(theta, slice(12, 18), axis=1), theta[:, 12:18])
-    np.testing.assert_allclose(added, removal.log_ratio_of_taken(theta)[:, 1], atol=1e-9)
+    added = removal.log_ratio_when_added(np.delete(theta, slice(12, 18), axis=1), theta[:, 12:18])
+    np.testing.assert_allclose(added, removal.log_ratio_when_taken_away(theta)[:, 1], atol=1e-9)
 
 
 def test_a_bridge_finds_the_ratio_of_two_normal_densities() -> None:

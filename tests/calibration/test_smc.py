@@ -13,7 +13,7 @@ from probewise.calibration import SMCResult, TemperatureSummary, calibrate, defa
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import search_order
-from probewise.calibration.posterior_parts import WholeFootprint
+from probewise.calibration.posterior_parts import FootprintPlaceAndSize
 from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.calibration.reference import FaintGaussianReference
 from probewise.calibration.smc import run_smc
@@ -51,7 +51,7 @@ def _climbed(recording: Recording, compensation: Compensation, seed: int) -> tup
         log_z_below=np.full(8, -3.0),
         error_below=0.0,
         rng=rng,
-        space=WholeFootprint((0.0, 0.0), 50.0).coordinates(prior, 1),
+        space=FootprintPlaceAndSize((0.0, 0.0), 50.0).coordinates(prior, 1),
         n_steps=5,
         progress=rungs.append,
     )

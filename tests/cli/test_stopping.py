@@ -10,7 +10,7 @@ import time
 import numpy as np
 import pytest
 
-from probewise._signals import ENDING, SAME_S, deferred
+from probewise._signals import ENDING, SAME_S, defer_signals
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
@@ -92,7 +92,7 @@ def test_deferred_lines_are_finished_first():
 
     def lines():
         with stoppable():
-            with deferred(), deferred():
+            with defer_signals(), defer_signals():
                 signal.raise_signal(signal.SIGTERM)
                 done.append("finished")
             done.append("gone on")
@@ -108,7 +108,7 @@ def test_a_repeated_signal_cuts_deferred_lines_short(monkeypatch):
     done = []
 
     def lines():
-        with stoppable(), deferred():
+        with stoppable(), defer_signals():
             signal.raise_signal(signal.SIGTERM)
             now_s[0] += 2 * SAME_S
             done.append("still here")

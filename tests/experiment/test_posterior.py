@@ -104,7 +104,7 @@ def test_samples_of_all_kinds_are_one_posterior_of_the_whole(small):
     joined = now.joined(rng=rng())
     assert joined.names == experiment.names
     assert joined.weight.sum() == pytest.approx(1.0)
-    which = experiment.shape.which(joined.theta)
+    which = experiment.shape.shape_index(joined.theta)
     np.testing.assert_allclose(np.bincount(which, weights=joined.weight), now.probability)
     assert np.isfinite(experiment.prior.log_prob(joined.theta)).all()
     np.testing.assert_allclose(

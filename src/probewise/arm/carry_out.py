@@ -16,7 +16,7 @@ from probewise.arm.reach import Bounds, require_reach
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
-from probewise.recordings.where_white import where_white
+from probewise.recordings.where_white import where_white_in_words
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)
@@ -97,7 +97,7 @@ def carry_out(
             lying = int(plan.pattern[row])
             name = plan.pattern_names[lying]
             where = f"its origin at ({origin_mm[0]:g}, {origin_mm[1]:g}) mm of the field, its x axis along the field's"
-            shown = f": {where_white(plan.patterns[name])}" if name in plan.patterns else ""
+            shown = f": {where_white_in_words(plan.patterns[name])}" if name in plan.patterns else ""
             ask(Request(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
             mounted = float(turns[row])

@@ -34,7 +34,7 @@ __all__ = [
     "coverage",
     "draw_truth",
     "interval_holds_truth",
-    "order_lead",
+    "log_z_lead_of_one_gaussian",
     "simulate_truth",
     "wilson_interval",
 ]
@@ -156,7 +156,7 @@ def interval_holds_truth(truth: Truth, samples: FloatArray) -> dict[str, bool]:
     return held
 
 
-def order_lead(
+def log_z_lead_of_one_gaussian(
     truth: Truth, *, rng: np.random.Generator, n_live: int = 300, quick: bool = False
 ) -> tuple[float, float]:
     """Simulate a single-Gaussian recording; return log Z of one Gaussian minus that of two, and its error."""
@@ -165,8 +165,8 @@ def order_lead(
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
 
 
-def _order_lead_of_drawn_truth(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
-    return order_lead(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
+def _lead_for_drawn_truth(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
+    return log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
 
 
 def main() -> None:
@@ -207,7 +207,7 @@ def main() -> None:
             return
         leads = []
         each = rng.spawn(asked.recordings), [asked.live] * asked.recordings, [asked.quick] * asked.recordings
-        for lead, error in executor.map(_order_lead_of_drawn_truth, *each):
+        for lead, error in executor.map(_lead_for_drawn_truth, *each):
             leads.append((round(lead, 3), round(error, 3)))
             bar.update()
     preferred = sum(lead > 0 for lead, _ in leads)

@@ -52,7 +52,7 @@ class LightIntegral:
     alone: SensorProblem
     n_bright: int
 
-    def log_ratio_of_taken(self, theta: FloatArray) -> FloatArray:
+    def log_ratio_when_taken_away(self, theta: FloatArray) -> FloatArray:
         """Log of the ratio for each faint Gaussian of sorted samples of N, (n, 6 N + 2) -> (n, N - n_bright)."""
         n = self.prior.n_gaussians
         at_once = max(1, _AT_ONCE // (n * self._readings.size))
@@ -63,7 +63,7 @@ class LightIntegral:
             else np.empty((0, n - self.n_bright))
         )
 
-    def log_ratio_of_added(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
+    def log_ratio_when_added(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
         """Log of the ratio for a Gaussian `gaussian`, (n, 6), of any light, added to samples of N - 1, (n, 6 N - 4)."""
         if not len(rest):
             return np.empty(0)
@@ -214,9 +214,9 @@ def bridge_evidences(added: FloatArray, taken: FloatArray) -> tuple[float, float
     Parameters
     ----------
     added
-        `LightIntegral.log_ratio_of_added` at samples of N - 1, (n_below,).
+        `LightIntegral.log_ratio_when_added` at samples of N - 1, (n_below,).
     taken
-        `LightIntegral.log_ratio_of_taken` at samples of N, (n, N - n_bright).
+        `LightIntegral.log_ratio_when_taken_away` at samples of N, (n, N - n_bright).
     """
     each, added = taken.ravel(), np.where(added > -np.inf, added, -1e300)
     real = np.concatenate([added[added > -1e300], each])

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.calibration.known_density import StartDensity
 from probewise.calibration.peak_density import PeakDensity
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.start_density import StartDensity
 
 _SHARE = 0.3
 

@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import fdtri, gammaln, logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.calibration.known_density import independent_proposal
 from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.start_density import propose_independently
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested.weights import n_effective
@@ -109,8 +109,8 @@ class PeakDensity:
         return self._log_density(y) - self.space.leave(y)[1]
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose a draw for each particle; see `independent_proposal`."""
-        return independent_proposal(self, here, rng=rng)
+        """Propose a draw for each particle; see `propose_independently`."""
+        return propose_independently(self, here, rng=rng)
 
     def _log_density(self, y: FloatArray) -> FloatArray:
         each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.label_permutations]

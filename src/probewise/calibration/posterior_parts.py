@@ -28,14 +28,14 @@ _COUNTS = 0.1
 
 
 @dataclass(frozen=True)
-class WholeFootprint:
+class FootprintPlaceAndSize:
     """Place and size of the whole footprint: `centre_mm`, and `size_mm2`, the trace of its covariance."""
 
     centre_mm: tuple[float, float]
     size_mm2: float
 
     @classmethod
-    def from_gaussian(cls, theta: FloatArray) -> WholeFootprint:
+    def from_gaussian(cls, theta: FloatArray) -> FootprintPlaceAndSize:
         """Take place and size from the parameters of an SSF of one Gaussian, (8,)."""
         _, u, v, a, b, c = theta[:6]
         return cls((float(u), float(v)), float(0.5 * (a + b) / (a * b - c * c)))

@@ -84,14 +84,14 @@ def predict(
     step = plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
     model = chain if sensor.effects else DeduplicatedModel(chain, plan)
-    for effect in sensor.carried_effects:
+    for effect in sensor.effects_on_new_scans:
         for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
             warnings.warn(
                 f"the plan has no column {column}, which {effect.name} reads: predicted as for its reference value",
                 DoubtfulResultWarning,
                 stacklevel=2,
             )
-    theta = sensor.carried_samples
+    theta = sensor.samples_for_new_scans
     n_samples, n_points = len(theta), len(plan)
     per_block = max(1, _BLOCK // max(1, n_points * sensor.n_gaussians))
 

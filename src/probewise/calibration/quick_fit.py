@@ -20,7 +20,6 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.calibration.check_by_search import missed_part_in_words
 from probewise.calibration.compensation import Compensation
-from probewise.calibration.known_density import StartDensity
 from probewise.calibration.light_integral import LightIntegral, bridge_evidences
 from probewise.calibration.mixed_reference import MixedReference
 from probewise.calibration.order_problems import OrderProblems
@@ -28,8 +27,8 @@ from probewise.calibration.order_search import OrderPosterior, Progress, Search
 from probewise.calibration.peak_density import PeakDensity, fit_density_about_peak, share_missed_about_peak
 from probewise.calibration.peaks import Peak, find_peaks
 from probewise.calibration.posterior_parts import (
+    FootprintPlaceAndSize,
     PosteriorPart,
-    WholeFootprint,
     evidence_shares,
     join_parts,
     split_by_n_bright,
@@ -37,6 +36,7 @@ from probewise.calibration.posterior_parts import (
 from probewise.calibration.reference import FaintGaussianReference, has_uniform_light
 from probewise.calibration.shared_light import SharedLightDensity
 from probewise.calibration.smc import N_CLOUDS, N_SNAPSHOTS, SMCResult, TemperatureSummary, run_smc
+from probewise.calibration.start_density import StartDensity
 from probewise.calibration.whole_coordinates import count_bright
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
@@ -94,7 +94,7 @@ def fit_orders_quickly(
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
     peaks = find_peaks(problems.problem, highest, rng=climbing)
-    whole = WholeFootprint.from_gaussian(peaks[1].theta)
+    whole = FootprintPlaceAndSize.from_gaussian(peaks[1].theta)
     found: dict[int, OrderPosterior] = {}
     parts: dict[int, PosteriorPart] = {}
     for n in range(1, highest + 1):
@@ -151,7 +151,7 @@ def fit_next_order(
     peak: Peak,
     rng: np.random.Generator,
     *,
-    whole: WholeFootprint,
+    whole: FootprintPlaceAndSize,
     needed: bool,
     search: Search,
     progress: Progress | None,
@@ -246,7 +246,7 @@ def _smc_from_order_below(
     n: int,
     below: dict[int, PosteriorPart],
     peak: Peak,
-    whole: WholeFootprint,
+    whole: FootprintPlaceAndSize,
     rng: np.random.Generator,
     report: Callable[[TemperatureSummary], None] | None,
 ) -> tuple[SMCResult, dict[int, PosteriorPart]]:
@@ -278,7 +278,7 @@ def _smc_with_faint_gaussian_added(
     n_bright: int,
     below: PosteriorPart,
     about: tuple[PeakDensity, ...],
-    whole: WholeFootprint,
+    whole: FootprintPlaceAndSize,
     *,
     many: bool,
     rng: np.random.Generator,
@@ -321,7 +321,7 @@ def _smc_with_faint_gaussian_added(
     labels = math.log(n / (n - n_bright))
     log_z = below.log_z_of_clouds + labels
     return _with_bridged_evidence(
-        made, log_z, integral.log_ratio_of_added(rest, gaussian), integral.log_ratio_of_taken(made.theta)
+        made, log_z, integral.log_ratio_when_added(rest, gaussian), integral.log_ratio_when_taken_away(made.theta)
     )
 
 
@@ -330,7 +330,7 @@ def _smc_with_all_gaussians_bright(
     n: int,
     below: PosteriorPart,
     about: tuple[PeakDensity, ...],
-    whole: WholeFootprint,
+    whole: FootprintPlaceAndSize,
     *,
     rng: np.random.Generator,
     report: Callable[[TemperatureSummary], None] | None,

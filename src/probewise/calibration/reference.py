@@ -48,7 +48,7 @@ def has_uniform_light(prior: SSFPrior) -> bool:
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
 
 
-class _DrawGaussianMore(Protocol):
+class _AddGaussian(Protocol):
     def __call__(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray: ...
 
 
@@ -68,7 +68,7 @@ class JumpProposal:
     """
 
     share: float
-    draw: _DrawGaussianMore
+    draw: _AddGaussian
     back: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind, require_path
-from probewise._posterior_samples import require_absent, require_samples
+from probewise._posterior_samples import require_masks_of_absent_effects, require_samples
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -24,7 +24,7 @@ from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 from probewise.effects import EFFECTS, EdgeShadow
 from probewise.errors import FileError, ParameterError, ProbewiseError, shown
-from probewise.recordings import Instrumentation, json_of, read_text, write_text_atomically
+from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
     AnyEffect,
@@ -137,7 +137,7 @@ class FittedSensor(ShowsItself):
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
-        require_absent(self.absent, self.effects, len(samples))
+        require_masks_of_absent_effects(self.absent, self.effects, len(samples))
         if not 1 <= self.n_gaussians <= len(self.names) // 6:
             allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
             raise ParameterError("n_gaussians", self.n_gaussians, allowed)
@@ -145,7 +145,7 @@ class FittedSensor(ShowsItself):
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
         owners = {name.partition(".")[0] for name in self.names[len(wanted) :]}
-        columns = {f"{effect.name}.{p}" for effect in self.carried_effects for p in effect.prior.names}
+        columns = {f"{effect.name}.{p}" for effect in self.effects_on_new_scans for p in effect.prior.names}
         if owners != set(self.effects) or not columns <= set(self.names):
             raise ParameterError(
                 "names", self.names, f"after I_max the columns of the effects {self.effects}: {sorted(columns)}"
@@ -157,7 +157,7 @@ class FittedSensor(ShowsItself):
         object.__setattr__(self, "noise_sd", noise_sd)
 
     @property
-    def carried_effects(self) -> tuple[AnyEffect, ...]:
+    def effects_on_new_scans(self) -> tuple[AnyEffect, ...]:
         """The effects that also apply to new scans."""
         return tuple(
             _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else EFFECTS[name]()
@@ -166,16 +166,18 @@ class FittedSensor(ShowsItself):
         )
 
     @property
-    def carried_samples(self) -> FloatArray:
+    def samples_for_new_scans(self) -> FloatArray:
         """Samples with the columns of `chain`, without the effects of single scans."""
         return self.samples[:, [self.names.index(name) for name in self.chain(KnownScene({})).names]]
+
+    carried_effects, carried_samples = effects_on_new_scans, samples_for_new_scans  # their earlier names
 
     def chain(self, scene: Scene) -> Chain:
         """Build the model that predicts new readings over a scene, with the effects that apply to new scans.
 
-        Its parameters are the columns of `carried_samples`, unless the scene has parameters.
+        Its parameters are the columns of `samples_for_new_scans`, unless the scene has parameters.
         """
-        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.carried_effects)
+        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.effects_on_new_scans)
 
     @property
     def is_free_form(self) -> bool:
@@ -337,7 +339,7 @@ class FittedSensor(ShowsItself):
         FileError
             If the text is damaged, incomplete, or of another format or version.
         """
-        document = json_of(path, _GAIN_STEP.sub('"gain_jump', text), _ALLOWED)
+        document = parse_json_file_text(path, _GAIN_STEP.sub('"gain_jump', text), _ALLOWED)
         found = document.get("format") if isinstance(document, dict) else None
         if found != FORMAT:
             raise FileError(
@@ -349,7 +351,7 @@ class FittedSensor(ShowsItself):
             sensor = cls(
                 names=tuple(_text_of_item(read, p, "name", "parameters") for p in read.items("parameters")),
                 samples=samples,
-                n_gaussians=read.whole("n_gaussians"),
+                n_gaussians=read.whole_number("n_gaussians"),
                 noise_sd=read.array("noise", "sd", ndim=1),
                 field=SSFField(
                     read.array("field", "values", ndim=2),
@@ -359,7 +361,7 @@ class FittedSensor(ShowsItself):
                 instrumentation=_read_instrumentation(read),
                 effects=tuple(read.texts("effects")),
                 patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
-                absent={name: read.marks(len(samples), "absent", name) for name in document.get("absent", {})},
+                absent={name: read.mask(len(samples), "absent", name) for name in document.get("absent", {})},
                 scan_noise=tuple(
                     _dataclass_of_item(read, ScanNoise, s, "noise.scans") for s in read.items("noise", "scans")
                 ),
@@ -474,7 +476,7 @@ class _Reader:
             raise self.error_for(".".join(keys), found, "a finite number")
         return float(found)
 
-    def whole(self, *keys: str) -> int:
+    def whole_number(self, *keys: str) -> int:
         found = self.value(*keys)
         if isinstance(found, bool) or not isinstance(found, int):
             raise self.error_for(".".join(keys), found, "a whole number")
@@ -490,7 +492,7 @@ class _Reader:
             raise self.error_for(".".join(keys), found, f"finite numbers in {ndim} equal dimensions")
         return array
 
-    def marks(self, n: int, *keys: str) -> BoolArray:
+    def mask(self, n: int, *keys: str) -> BoolArray:
         """Read a list of row numbers as a mask, (n,)."""
         found = self.array(*keys, ndim=1)
         if not np.isin(found, np.arange(n)).all():

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.known_density import independent_proposal
 from probewise.calibration.peak_density import StudentTDensity
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.start_density import propose_independently
 from probewise.calibration.whole_coordinates import WholeCoordinates
 
 # Of the others' log ratios to the heaviest: mean and sd; in units of the whole: variance of places, sd of the logs.
@@ -64,5 +64,5 @@ class SharedLightDensity:
         return theta
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose a draw for each particle; see `independent_proposal`."""
-        return independent_proposal(self, here, rng=rng)
+        """Propose a draw for each particle; see `propose_independently`."""
+        return propose_independently(self, here, rng=rng)

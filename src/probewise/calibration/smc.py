@@ -18,7 +18,7 @@ from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
-from probewise.calibration.known_density import StartDensity
+from probewise.calibration.start_density import StartDensity
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective, resampled_rows
 from probewise.priors import Coordinates

@@ -37,7 +37,7 @@ class StartDensity(Protocol):
         ...
 
 
-def independent_proposal(
+def propose_independently(
     density: StartDensity, here: FloatArray, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Draw from a density, independently of the particles `here`, (n, 6 N + 2).

@@ -43,7 +43,7 @@ class SheetCheck:
 
     def __init__(self, plan: Plan, *, white_is_bright: bool) -> None:
         self._plan, self._bright = plan, white_is_bright
-        ends = plan.instrumentation.ends
+        ends = plan.instrumentation.declared_ends
         self._range = ends[1] - ends[0] if len(ends) == 2 else math.nan
         self._read: dict[bool, list[float]] = {True: [], False: []}
         self._reported: set[tuple[str, bool]] = set()

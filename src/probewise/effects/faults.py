@@ -69,7 +69,7 @@ class Dropouts(NoiseEffect):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Allow any value from 1 % below the range of the readings to 1 % above; note the declared range's ends."""
         low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
-        return cls(low, high, extent.plan.instrumentation.ends, unit=extent.unit)
+        return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.unit)
 
     @cached_property
     def prior(self) -> Product:

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from probewise._kinds import require_kind, require_rng, require_takes_places, require_whole
+from probewise._kinds import require_accepts_positional, require_kind, require_rng, require_whole
 from probewise.diagnosis import Diagnosis, NextMeasurement, SensorPrior, diagnose
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.investigation.budget import Budget
@@ -66,7 +66,7 @@ def investigate(
     ParameterError
         If an argument is invalid; see also `diagnose`.
     """
-    require_takes_places("record", record, 3, "a function of a round's number, its plan and the plan in words")
+    require_accepts_positional("record", record, 3, "a function of a round's number, its plan and the plan in words")
     require_plan(plan)
     require_rng(rng)
     if budget is not None:

@@ -30,7 +30,7 @@ from probewise.nested.hops import HoppingMove
 from probewise.nested.missing import DISAGREE, MissedHills, find_missed_hills, rise_in_errors
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, repartitioned, split_into_clusters
-from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible
+from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible_draws
 from probewise.nested.space import space_of
 
 # Above this many errors the second estimate is repeated with more live points.
@@ -92,7 +92,7 @@ class _EvidenceRoute:
 
 
 @dataclass
-class _Budget:
+class _CallBudget:
     """The evaluations that a check may use, those of the first run included: `limit` in all, `spent` so far."""
 
     search: SingleRun
@@ -192,7 +192,7 @@ def check_and_repeat(
         estimate. A warning is added if the two still disagree, or if the second does not end within the limits.
     """
     limit = max_cost * first.n_calls if max_calls is None else min(max_cost * first.n_calls, max_calls)
-    budget = _Budget(search, limit, first.n_calls, rng)
+    budget = _CallBudget(search, limit, first.n_calls, rng)
     now, missing, notes = first, MissedHills(), tuple[str, ...]()
     try:
         missing = find_missed_hills(first, problem, max_calls=budget.calls_left, rng=rng)
@@ -242,11 +242,11 @@ def _clusters_of_met_and_lost_modes(
 
 
 def _estimate_again(
-    now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _Budget
+    now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _CallBudget
 ) -> tuple[_EvidenceRoute, _SecondEstimate | None]:
     """Estimate the evidence by the first route that is confirmed, else by the last; None if that did not end."""
     curved, second = False, None
-    for route in _second_routes(now, problem, move, least_live, budget.rng):
+    for route in _routes_to_second_estimate(now, problem, move, least_live, budget.rng):
         found = budget.run_route(route)
         second = None if found is None else _SecondEstimate(route, (found,), curved)
         if found is not None and route.is_confirmed_by(found):
@@ -256,7 +256,7 @@ def _estimate_again(
 
 
 def _with_run_of_more_live_points(
-    second: _SecondEstimate, now: NestedResult, first: NestedResult, budget: _Budget
+    second: _SecondEstimate, now: NestedResult, first: NestedResult, budget: _CallBudget
 ) -> _SecondEstimate:
     """Add a run with more live points, at most as many as the first run has, to a second estimate.
 
@@ -290,7 +290,7 @@ def _agreeing_run_and_estimate(
     return now, second
 
 
-def _second_routes(
+def _routes_to_second_estimate(
     first: NestedResult, problem: Samplable, move: Move, least_live: int, rng: np.random.Generator
 ) -> Iterator[_EvidenceRoute]:
     """Yield the routes to a second estimate, the cheapest first; the last one is an estimate whatever it finds."""
@@ -375,7 +375,7 @@ def _with_check_stored(now: NestedResult, second: _SecondEstimate, n_check: int)
         warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
         # A poorly known share of possible hypotheses, or error, no longer matters once a second estimate agrees.
-        settled = [warning_of_few_possible(now.log_start, now.log_start_error, now.n_live)]
+        settled = [warning_of_few_possible_draws(now.log_start, now.log_start_error, now.n_live)]
         if error < now.log_z_error:
             settled.append(warning_of_few_lineages(now.memory))
         warnings = tuple(note for note in warnings if note not in settled)

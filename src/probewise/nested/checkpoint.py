@@ -218,7 +218,7 @@ class CheckpointFile:
                 # Read the state only then: another version or move may have stored other fields.
                 same = found == _FORMAT and settings == self.settings
                 now = (
-                    _run_from_file(head, {name: file[name] for name in file.files if name != "head"}, move)
+                    _run_state_from_file(head, {name: file[name] for name in file.files if name != "head"}, move)
                     if same
                     else None
                 )
@@ -288,7 +288,7 @@ _BIRTHS = ("log_birth", "birth_label", "ident", "parent")
 _RECORD = ("n_at_death", "rank", "n_ranked")
 
 
-def _run_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> RunState:
+def _run_state_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> RunState:
     """Rebuild the state of a run from the head and the arrays of a checkpoint; `move` is the one given on resuming."""
     ends = np.cumsum(np.asarray(head["sizes"], dtype=np.int64))
     dead = []
@@ -305,7 +305,7 @@ def _run_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move:
     plain = {name: head[name] for name in _PLAIN}
     plain["notes"] = tuple(plain["notes"])  # type: ignore[arg-type]
     moving = _with_numeric_fields(move, head["moving"])
-    return RunState(live, tuple(dead), moving, rng_state=_state_with_arrays(head["rng_state"]), **plain)  # type: ignore[arg-type]
+    return RunState(live, tuple(dead), moving, rng_state=_generator_state_with_arrays(head["rng_state"]), **plain)  # type: ignore[arg-type]
 
 
 def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
@@ -338,7 +338,7 @@ def _as_json(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
-def _state_with_arrays(value: object) -> dict[str, Any]:
+def _generator_state_with_arrays(value: object) -> dict[str, Any]:
     """Convert the lists in a generator's state back to arrays."""
     if not isinstance(value, dict):
         raise ValueError("no state of a random generator")

@@ -37,14 +37,14 @@ def to_anesthetic(result: DeadPoints) -> Any:
 
 
 def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.random.Generator, n: int) -> Any:
-    """Convert to ArviZ's container: `n` equally weighted samples as one chain, and what the run says of itself.
+    """Convert to ArviZ's container: `n` equally weighted samples as one chain, and attributes of the run.
 
     Parameters
     ----------
     result
         The dead points to draw from.
     attributes
-        What the container says of the whole: the evidence, its error, versions.
+        Attributes of the container: the evidence, its error, versions.
     rng
         Source of randomness, for drawing the samples.
     n

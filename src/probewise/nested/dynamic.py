@@ -26,7 +26,7 @@ from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integ
 from probewise.nested.merging import JoinedRecord, combined_p_value, generator_states_of
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, software_versions
-from probewise.nested.sampler import least_live, move_at_volume, state_as_json, step
+from probewise.nested.sampler import generator_state_as_json, least_live, move_at_volume, step
 
 Goal: TypeAlias = Literal["posterior", "evidence"]
 
@@ -70,7 +70,7 @@ def intensified(
     Returns
     -------
     NestedResult
-        The run with the new points. Its `n_live` is still the run's; `n_at_death` says how many points were alive at
+        The run with the new points. Its `n_live` is still the run's; `n_at_death` is the number of points alive at
         each level. `memory` and `check` are the run's, `warnings` too, with one more if the new points' insertion
         ranks are not uniform.
 
@@ -93,7 +93,7 @@ def intensified(
         require_whole("max_calls", max_calls, least=n_live)
     evaluate = Evaluator(problem)
     _require_complete_run_of(result, evaluate)
-    seed_state = state_as_json(rng.bit_generator.state)
+    seed_state = generator_state_as_json(rng.bit_generator.state)
     first, last = _rows_to_intensify(result, goal)
     thread = _draw_thread(result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng)
     return _join_thread_to_run(result, thread, seed_state, evaluate.n_calls, rng)

@@ -1,4 +1,4 @@
-"""Weigh a hill of the posterior by importance sampling, and ask whether a run has met it."""
+"""Estimate the evidence of a hill of the posterior by importance sampling, and whether a run has met the hill."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _n_points_on_hill(n_params: int) -> int:
     return max(_PER_PARAM * n_params, 20)
 
 
-def calls_to_weigh_hill(n_params: int) -> float:
+def calls_for_hill_evidence(n_params: int) -> float:
     """Return about how many evaluations it takes to weigh a hill: two or three rounds of chains."""
     return 2.5 * _n_points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
 
@@ -102,7 +102,7 @@ def draw_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> P
     return drawn
 
 
-def weigh_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
+def estimate_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
     """Compute a hill's evidence by draws from a Student t about points on it; None where no Student t fits.
 
     Where there are too few effective samples, the Student t is fitted anew to the weighted draws.

@@ -18,7 +18,13 @@ import numpy as np
 from probewise.nested.ascent import Top, climb_to_top, top_from_live_points
 from probewise.nested.beyond import find_higher_peaks
 from probewise.nested.evaluate import Evaluator, Points, Samplable
-from probewise.nested.hills import Hill, calls_to_weigh_hill, draw_from_hill, log_evidence_of_unmet_hills, weigh_hill
+from probewise.nested.hills import (
+    Hill,
+    calls_for_hill_evidence,
+    draw_from_hill,
+    estimate_hill,
+    log_evidence_of_unmet_hills,
+)
 from probewise.nested.importance import Posterior
 from probewise.nested.lost import are_beyond_dip, sds_of_next_dead_points, tops_from_early_points
 from probewise.nested.result import NestedResult
@@ -117,12 +123,12 @@ def _hills_not_met(
     hills, most = list[Hill](), evaluate.n_calls + max_calls
     rest = sorted(tops, key=lambda top: top.height)
     scale = sds_of_next_dead_points(run, evaluate.space)
-    while rest and evaluate.n_calls + calls_to_weigh_hill(len(run.names)) < most:
+    while rest and evaluate.n_calls + calls_for_hill_evidence(len(run.names)) < most:
         settled = draw_from_hill(rest.pop(), evaluate, rng)
         if rest:
             points = Points.join(*(top.highest for top in rest))
             apart = are_beyond_dip(points, settled, scale, 1, evaluate, rng)
             rest = [top for top, is_apart in zip(rest, apart, strict=True) if is_apart]
-        hill = weigh_hill(settled, evaluate, rng)
+        hill = estimate_hill(settled, evaluate, rng)
         hills += [] if hill is None or hill.is_met_by(run) else [hill]
     return tuple(hills)

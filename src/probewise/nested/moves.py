@@ -173,7 +173,7 @@ class SliceMove:
         axis = _axes_in_random_order(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
-        metrics = _Metrics.from_clusters(clusters, start.u, home, live)
+        metrics = _ClusterMetrics.from_clusters(clusters, start.u, home, live)
         line = np.empty((n_chains, n_params))
         low, high, level = np.empty(n_chains), np.empty(n_chains), np.empty(n_chains)
         step = np.zeros(n_chains, dtype=np.int64)
@@ -336,7 +336,7 @@ def _axes_in_random_order(n_chains: int, n_steps: int, n_params: int, rng: np.ra
 
 
 @dataclass(frozen=True, eq=False)
-class _Metrics:
+class _ClusterMetrics:
     """The clusters' metrics for each chain: its own cluster is computed without the chain's starting point.
 
     A metric that includes the start stretches the lines through it and shrinks the others; with
@@ -354,7 +354,7 @@ class _Metrics:
     own_row: IntArray  # row of the start among the live points
 
     @classmethod
-    def from_clusters(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _Metrics:
+    def from_clusters(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _ClusterMetrics:
         """Compute the metrics for chains that start at `u`, (n_chains, n_params), in clusters `home`, (n_chains,)."""
         same = np.logical_and.reduce(
             [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]

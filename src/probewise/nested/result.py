@@ -93,7 +93,7 @@ class Check:
     n_calls: int
 
 
-def warning_of_few_possible(log_start: float, log_start_error: float, n_live: int) -> str | None:
+def warning_of_few_possible_draws(log_start: float, log_start_error: float, n_live: int) -> str | None:
     """Return a warning if fewer possible hypotheses than live points were drawn from the prior, else None.
 
     A share s of the prior, estimated from m possible hypotheses, has the relative error sqrt((1 - s) / m).

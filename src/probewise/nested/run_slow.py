@@ -65,7 +65,7 @@ _WIDENING = 1.5
 _WIDER, _DEFENSIVE, _FROM_POWER = 1.6, 0.25, 0.1
 _FIRST = 0.75
 _N_SAMPLES = 2000
-# Draws of two densities have two groups of weights, which a longer tail would mix: only its end tells of the variance.
+# Draws of two densities have two groups of weights, which a longer tail would mix: only its end shows the variance.
 _TAIL = 1.0
 # Where the error is this many times too large, or doubtful, the draws go into another fit, up to a number of them.
 _MUCH, _MOST_FITS = 1.3, 3

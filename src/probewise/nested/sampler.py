@@ -29,7 +29,12 @@ from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import NestedResult, software_versions, warning_of_few_lineages, warning_of_few_possible
+from probewise.nested.result import (
+    NestedResult,
+    software_versions,
+    warning_of_few_lineages,
+    warning_of_few_possible_draws,
+)
 from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
 LIVE_PER_PARAM = 2
@@ -127,7 +132,7 @@ def run_once(
     n_params = len(evaluate.names)
     n_live, n_replaced = _require_counts(n_live, n_replaced, max_calls, n_params)
     rule = RemainingEvidence() if stop is None else stop
-    seed_state = json.dumps(state_as_json(rng.bit_generator.state))
+    seed_state = json.dumps(generator_state_as_json(rng.bit_generator.state))
     if n_params == 0:
         return _result_without_parameters(evaluate, n_live, seed_state)
     moving: Move = SliceMove() if move is None else move
@@ -344,7 +349,7 @@ def _final_result(
     """Let the remaining live points die and compute the result."""
     live, dead, notes = now.live, now.dead, now.notes
     n_dead = sum(len(d.points) for d in dead)
-    few = warning_of_few_possible(now.log_start, now.log_start_error, n_live)
+    few = warning_of_few_possible_draws(now.log_start, now.log_start_error, n_live)
     if few is not None:
         notes = (*notes, few)
     if now.n_stuck > _STUCK_SHARE * n_dead:
@@ -441,8 +446,8 @@ def _result_without_parameters(evaluate: Evaluator, n_live: int, seed_state: str
     )
 
 
-def state_as_json(value: object) -> object:
+def generator_state_as_json(value: object) -> object:
     """Convert a generator's state to JSON types."""
     if isinstance(value, dict):
-        return {str(key): state_as_json(item) for key, item in value.items()}
+        return {str(key): generator_state_as_json(item) for key, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_like, require_number
 from probewise.errors import ParameterError
-from probewise.recordings.columns import how_to_describe
+from probewise.recordings.columns import how_to_describe_pattern
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
@@ -208,7 +208,7 @@ class Chain:
         reading += i_min
         return reading
 
-    def seen(self, theta: FloatArray, plan: Plan) -> FloatArray:
+    def white_fraction(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Return the white fraction R that the sensor sees, before any effect on it, (n_samples or 1, n_points)."""
         return self.simulated_view(theta, plan).seen
 
@@ -230,7 +230,7 @@ class Chain:
             seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
-    look, read = simulated_view, readings_of_view  # their earlier names
+    look, read, seen = simulated_view, readings_of_view, white_fraction  # their earlier names
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
         """Return the sensor's true poses under each hypothesis: the chain up to stage POSE."""
@@ -287,7 +287,7 @@ class Chain:
         start = NoiseLevel(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
             return start
-        start = replace(start, seen=self.seen(theta, plan))
+        start = replace(start, seen=self.white_fraction(theta, plan))
         level: NoiseLevel = self._stage_applier(theta, plan)(Stage.NOISE, start)
         return level
 
@@ -465,7 +465,7 @@ def region_named(regions: Mapping[str, Region], name: str) -> Region:
     try:
         return regions[name]
     except KeyError:
-        raise ParameterError("pattern", name, how_to_describe(name, list(regions))) from None
+        raise ParameterError("pattern", name, how_to_describe_pattern(name, list(regions))) from None
 
 
 def _split_by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:

@@ -29,14 +29,14 @@ _PLACES, _WIDTHS = _places_and_widths_on_rings(
 )
 
 
-def _directions_without_moments() -> FloatArray:
+def _moment_preserving_basis() -> FloatArray:
     """Find an orthonormal basis of the shares that change neither mean nor covariance, (n_rings, n_bends)."""
     x, y = _PLACES.T
     moments = np.stack([x, y, x * x + _WIDTHS**2 - 1, y * y + _WIDTHS**2 - 1, x * y])
     return np.ascontiguousarray(np.linalg.svd(moments)[2][len(moments) :].T)
 
 
-_DIRECTIONS = _directions_without_moments()
+_DIRECTIONS = _moment_preserving_basis()
 
 N_BENDS: int = _DIRECTIONS.shape[1]
 """Number of free-form coefficients (bends)."""

@@ -24,7 +24,7 @@ _SAME_ANGLE, _SAME_MM = 1e-12, 1e-10  # smaller differences of angles (radians) 
 
 @dataclass(frozen=True, eq=False)
 class StraightEdges:
-    """Half-planes under the readings `rows`; each field is (n_rows,) unless said.
+    """Half-planes under the readings `rows`; each field is (n_rows,) unless stated otherwise.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ class _DistinctEdgeViews:
         return cls(angles, which, views[1], view.reshape(-1), low, high - low)
 
     @cached_property
-    def _views_from_angles(self) -> FloatArray:
+    def _matrix_from_angles_to_views(self) -> FloatArray:
         """Matrix from the angles' (1/sd, mean/sd) to the views' table positions, (2 n_angles, n_views)."""
         own = np.eye(len(self.angle_rad))[:, self.which]
         return np.concatenate([own * self.distance_mm, own])
@@ -168,7 +168,7 @@ class _DistinctEdgeViews:
         for start in range(0, n_samples, step):
             here = both[:, start : start + step]
             if n_angles <= _FEW_ANGLES:
-                cells = here @ self._views_from_angles
+                cells = here @ self._matrix_from_angles_to_views
             else:
                 cells = here[..., self.which] * self.distance_mm
                 cells += here[..., n_angles + self.which]

@@ -382,6 +382,8 @@ class SystemChain:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
 
+    look, read = simulated_view, readings_of_view  # their earlier names
+
     def _applied(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
         for effect, columns in self._columns:
             if effect.stage is stage:

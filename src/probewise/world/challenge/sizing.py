@@ -118,13 +118,15 @@ class EffectSizer:
     @cached_property
     def clean(self) -> Recording:
         """Recording of noise-free readings without any effect."""
-        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._view).unlimited()
+        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._view).without_declared_range()
 
     def recording(self, *concealed: Concealed) -> Recording:
         """Return a recording of the noise-free readings with these effects."""
         same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
         world = replace(self.setup.world, concealed=concealed)
-        return world.simulate(self.setup.plan, rng=None, view=self._view if same_view else None).unlimited()
+        return world.simulate(
+            self.setup.plan, rng=None, view=self._view if same_view else None
+        ).without_declared_range()
 
     def size(self, *concealed: Concealed) -> float:
         """Return lambda of the effects together, in sds of the noise's Gaussian core."""

@@ -22,7 +22,7 @@ from probewise.calibration.whole_coordinates import WholeCoordinates
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled_rows
 
-# All particles take their shapes from one pool, whose scatter no cloud tells: with 6,000 it was the greatest part of
+# All particles take their shapes from one pool, whose scatter no cloud shows: with 6,000 it was the greatest part of
 # the error of ln Z of two Gaussians. So many are drawn at a time, until enough are effective or there are many.
 _N_DRAWN, _EFFECTIVE, _MOST_DRAWN = 12_000, 4_000, 60_000
 _AT_ONCE = 500
@@ -138,7 +138,7 @@ class _LinearisedPosterior:
         per_sd = 1.0 / np.maximum(np.sqrt(variance), sd_floor(recording))[scan]
         x = coordinates.enter(theta)
         off = x - x.mean(axis=0)
-        # Only the whole and the levels shift: how Gaussians share the light, the readings tell too little to say.
+        # Only the whole and the levels shift: the readings contain too little information on the Gaussians' shares.
         shifts = np.zeros(x.shape[1], dtype=np.bool_)
         shifts[1:6] = shifts[-2:] = True
         off[:, ~shifts] = 0.0

@@ -282,7 +282,7 @@ def _sensor_from_posterior(
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
     pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
-    # Samples of a climb weigh alike, so that those that are kept serve for the field.
+    # Samples of an SMC run have equal weights, so those that are kept suffice for the field.
     theta, weight = (samples, None) if isinstance(result, SMCResult) else (result.theta, result.weight)
     blind = blind_axis_rad(recording)
     silent = _unconstrained_moments(samples, prior, rng)

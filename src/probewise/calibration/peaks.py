@@ -150,7 +150,7 @@ def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianRespons
         weighted = slope * likelihood.weights(own)[:, None, :]
         curvature = weighted @ slope.transpose(0, 2, 1)
         gradient = np.einsum("ndp,np->nd", weighted, own)
-        # Where the readings say nothing, about the curvature of the logistic prior holds the step.
+        # Without information in the readings, about the curvature of the logistic prior limits the step.
         scale = np.einsum("ndd->nd", curvature) + _PRIOR_CURVATURE
         damped = curvature + (damping[rows, None] * scale)[:, None, :] * np.eye(d) + 0.01 * _PRIOR_CURVATURE * np.eye(d)
         step = np.linalg.solve(damped, gradient[..., None])[..., 0].clip(-_LONGEST, _LONGEST)

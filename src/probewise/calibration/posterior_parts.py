@@ -23,7 +23,7 @@ from probewise.nested import NestedResult, Weighted
 _N_SAMPLES = 4000
 # A part of which there are fewer samples is left out.
 _LEAST_SAMPLES = 40
-# What speaks against a part speaks against the whole where the part holds this share.
+# A doubt about a part is a doubt about the whole where the part holds this share of the evidence.
 _COUNTS = 0.1
 
 
@@ -107,7 +107,7 @@ def join_parts(made: dict[int, SMCResult], rng: np.random.Generator) -> SMCResul
     n_clouds = len(main.log_z_of_clouds)
     blocks = n_clouds * N_SNAPSHOTS
     size = len(main.theta) // blocks
-    # As many of each part as its share asks for, on average: in each cloud at each time.
+    # Samples of each part in proportion to its share, on average: in each cloud and snapshot.
     up_to = np.floor(np.concatenate([[0.0], np.cumsum(share)])[:, None] * size + rng.random(blocks)).astype(np.int64)
     up_to[0], up_to[-1] = 0, size
     counts = np.diff(up_to, axis=0)

@@ -41,26 +41,26 @@ from probewise.calibration.whole_coordinates import count_bright
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
-# Quadrature nodes over curved edges where a Gaussian more is answered to first order: mostly within 0.001 of the span.
+# Quadrature nodes over curved edges for the first-order shifts of `Compensation`: mostly within 0.001 of the span.
 _FEW_NODES = 8
 _N_PARTICLES = 1000
-# Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
+# Gain in ln L by one Gaussian above which the posterior is assumed to lie about the highest peak.
 _NEEDED = 20.0
 # Least effective share of the samples in a bridge.
 _LEAST_SHARE = 0.05
-# The first climb from a peak starts from a density so much wider: particles gather more easily than they spread.
+# Factor by which the density of the first run from a peak is widened: particles gather more easily than they spread.
 _WIDENED = 1.6
-# From a peak: moves at each temperature; once the posterior is reached, at the first climb and at the second.
+# Runs from a peak: moves at each temperature; moves once the posterior is reached, in the first and the second run.
 _STEPS, _FEW_MOVES, _MANY_MOVES = 5, 6, 60
 # Draws of a density fitted to the samples about a peak.
 _N_FITTED = 6000
-# Two evidences this many errors apart disagree, if it is this far: few clouds tell their own scatter roughly.
+# Two evidences disagree beyond this many errors and this many nats: the scatter of few clouds is only rough.
 _DISAGREE, _APART = 4.0, 1.0
-# A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
+# A peak higher than all samples by this many nats is checked; it was missed if it holds this share of Z.
 _HIGHER, _MISSED = 2.0, 0.2
 _N_PILOTS, _N_WEIGHED = 400, 2000
 _AT_ONCE_FROM = 3
-# A part of the posterior below is followed where it holds this share of it; by many particles where it holds much.
+# A part of the posterior of the order below is used if it holds the first share, by many particles above the second.
 _LEAST_HELD, _MUCH_HELD, _FEW_PARTICLES = 0.005, 0.3, 400
 _POOL, _SMALL_POOL = 24_000, 6_000
 # All Gaussians may be bright where those of the order below are so with this share.

@@ -36,7 +36,7 @@ _LEAST_RATIO = 1e-4
 _SHAPE = slice(1, 6)
 # Shares of the draws that are added as they are, and that are split; the others are compensated for.
 _ADDED, _SPLIT = 0.2, 0.3
-# Share of the moves afresh that take the light from a bright one.
+# Share of the independent proposals that split the new Gaussian off a bright one.
 _RESPLIT = 0.5
 # Share of the compensated ones whose light follows the first-order posterior.
 _TOLD = 0.7

@@ -30,18 +30,19 @@ _BISECTIONS = 40
 _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: so many at a time, until enough are effective, and at most.
 _DRAWS, _MOST_DRAWS = 2, 16
-# Times that the posterior's samples are kept; moves of each particle once it is reached, and between two afresh.
+# Number of snapshots of the posterior's samples that are kept.
 N_SNAPSHOTS = 4
 # Clouds of particles, whose scatter gives the error of an evidence.
 N_CLOUDS = 8
+# Moves of each particle once the posterior is reached; an independent proposal after every second one.
 _N_MORE, _AFRESH = 16, 2
-# A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
+# A posterior that takes more temperatures lies far from the reference, and is left to a search of the prior.
 _MOST_TEMPERATURES = 12
 # Share of the moves that change the coordinates of one Gaussian, or the levels, alone.
 _BY_BLOCK = 0.5
 _WHOLE_JUMP = 0.1
 _JITTER = 1e-5
-# Doubt the clouds where they agree less than this.
+# Limits beyond which a run is doubtful: error of ln Z, effective share of the clouds, moves accepted, overlap.
 _MOST_ERROR = 0.5
 _LEAST_CLOUDS = 0.3
 _LEAST_ACCEPTED = 0.02

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.systems.runge_kutta import RungeKutta, Stepping
+from probewise.systems.runge_kutta import RungeKutta, Stepping, Terms
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
 
@@ -312,20 +312,28 @@ class Stepper:
 
     def _unsplit(self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]) -> dict[str, Any]:
         """Take one step of the method, with friction against fixed directions."""
-        width, given = self.gap * length, self.between(begin)
-        rates: list[Mapping[str, Any]] = []
-        for k, (row, share) in enumerate(zip(self.method.a, self.method.c, strict=True)):
-            if k and share != self.method.c[k - 1]:
-                given = self.between(begin + share * length)
-            at = {j: s[j] + width * _weighted(row, [rate[j] for rate in rates]) for j in s} if k else s
-            rates.append(self.motion.rates(at, *given, ways))
-        return {j: s[j] + width * _weighted(self.method.b, [rate[j] for rate in rates]) for j in s}
+        method, width, given = self.method, self.gap * length, self.between(begin)
+        rates = [self.motion.rates(s, *given, ways)]
+        for k, terms in enumerate(method.stages[1:], 1):
+            if method.c[k] != method.c[k - 1]:
+                given = self.between(begin + method.c[k] * length)
+            rates.append(self.motion.rates(_moved(s, width, terms, rates), *given, ways))
+        return _moved(s, width, method.weights, rates)
 
 
-def _weighted(weights: Sequence[float], values: Sequence[Any]) -> Any:
-    """Return the weighted sum of some values, without those of weight 0."""
-    first, *others = (w * v for w, v in zip(weights, values, strict=True) if w)
-    return sum(others, first)
+def _moved(s: Mapping[str, Any], width: Any, terms: Terms, rates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Move states for a time along a weighted sum of rates."""
+    (first, weight), *others = terms
+    if not others:  # of one stage, as all of fourth order are: one product less
+        share = weight * width
+        return {state: at + share * rates[first][state] for state, at in s.items()}
+    out = {}
+    for state, at in s.items():
+        rate = weight * rates[first][state]
+        for k, w in others:
+            rate = rate + w * rates[k][state]
+        out[state] = at + width * rate
+    return out
 
 
 def _zero_between(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:

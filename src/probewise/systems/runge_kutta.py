@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.integrate import DOP853
@@ -12,6 +13,9 @@ from probewise._arrays import IntArray
 _DEARER = (
     1.5  # evaluations of the eighth order, in those of the fourth, up to which its far smaller error is worth them
 )
+
+Terms = tuple[tuple[int, float], ...]
+"""The stages of a sum of rates that have a weight, and their weights."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +30,20 @@ class RungeKutta:
     def n_stages(self) -> int:
         """Evaluations of the rates per step."""
         return len(self.b)
+
+    @cached_property
+    def stages(self) -> tuple[Terms, ...]:
+        """The sums of earlier rates that lead to each stage."""
+        return tuple(map(_terms, self.a))
+
+    @cached_property
+    def weights(self) -> Terms:
+        """The sum of rates that leads to the end of the step."""
+        return _terms(self.b)
+
+
+def _terms(weights: tuple[float, ...]) -> Terms:
+    return tuple((k, weight) for k, weight in enumerate(weights) if weight)
 
 
 FOURTH_ORDER = RungeKutta(((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))

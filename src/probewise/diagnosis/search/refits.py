@@ -123,6 +123,10 @@ class Refits:
             self.known[key] = twin or self._extended(parent, effect, against)
         return self.known[key]
 
+    def replace(self, held: WeighedFit, better: WeighedFit) -> None:
+        """Put a better fit of the same combination in the place of the one that was found before."""
+        self.known.update({key: (better, scores) for key, (fit, scores) in self.known.items() if fit is held})
+
     def _as_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
         """Return the earlier refit of a twin with this effect in its place; None if no twin was refitted."""
         own = self.templates.of(parent.found, effect)

@@ -183,6 +183,7 @@ class SearchState:
                 again = self.refits.weighed(model, start[None, :], candidate.law).as_share(held.log_share, held.weights)
                 if again.log_z > held.log_z + SAME_MODE:
                     self.keep(again)
+                    self.refits.replace(held, again)
 
     def reach(self, names: Names) -> None:
         """Refit a combination, starting from its largest refitted subset."""

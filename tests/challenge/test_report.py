@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from probewise.challenge import Task, confusion, reliability, score
+from probewise.challenge import Task, confusion_counts, reliability, score
 from probewise.cli import main
 from probewise.report import challenge as report
 from probewise.report import plots
@@ -47,7 +47,7 @@ def test_nothing_but_failures_still_makes_a_page(results):
 
 
 def test_the_matrix_writes_every_count(results):
-    truths, said, counts = confusion([r for r in results if "failed" not in r])
+    truths, said, counts = confusion_counts([r for r in results if "failed" not in r])
     ax = plots.confusion_matrix(truths, said, counts)
     assert sorted(t.get_text() for t in ax.texts) == ["1", "1", "1", "2"]
     assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge and write its table."""
     from probewise._progress import progress_shown
-    from probewise.challenge import Investigated, run_case, run_challenge, score, score_rounds
+    from probewise.challenge import RunCaseInRounds, run_case, run_challenge, score, score_rounds
     from probewise.challenge.systems import run_system_case, score_systems
     from probewise.recordings import write_text_atomically
     from probewise.report import challenge as report
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.systems:
         work, scored, of = run_system_case, score_systems, "systems"
     elif arguments.rounds > 1:
-        work, scored, of = Investigated(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
+        work, scored, of = RunCaseInRounds(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
     cases = out / "cases.jsonl"
     kept = partial(campaign_kept_message, cases, "case", arguments)
     with campaign_running(cases, "case", arguments) as (executor, progress):

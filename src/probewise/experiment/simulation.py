@@ -43,7 +43,7 @@ from probewise.scene import (
 from probewise.scene.albedo import require_shape
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage
 from probewise.sensor.stages import AnyEffect
-from probewise.world import Covered, Oval, Spot, Surface, World
+from probewise.world import CoveredSurface, Oval, Spot, Surface, World
 
 Model: TypeAlias = Literal["ssf", "naive"]
 
@@ -328,10 +328,10 @@ def surface_under(region: Region, name: str) -> Surface:
 
 def with_cards(surface: Surface, cards: Sequence[Card]) -> Surface:
     """Add cards to a surface of the world; only geometry and albedo are shared."""
-    if not cards or isinstance(surface, Covered):
+    if not cards or isinstance(surface, CoveredSurface):
         return surface
     laid = [Polygon(tuple((float(x), float(y)) for x, y in card.corners_mm), inside=card.albedo) for card in cards]
-    return Covered(surface, tuple(laid))
+    return CoveredSurface(surface, tuple(laid))
 
 
 def arm_over(

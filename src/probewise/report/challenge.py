@@ -8,10 +8,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from probewise.challenge import Estimate, Row, by_effect, confusion, reliability
-from probewise.challenge.scoring import effects_to_name, leading, leading_name_right, names_match
-from probewise.challenge.systems import family_of
-from probewise.challenge.systems.table import gains_of
+from probewise.challenge import Estimate, Row, confusion_counts, detected_and_named_by_effect, reliability
+from probewise.challenge.scoring import effects_to_name, leading_hypothesis, leading_name_right, names_match
+from probewise.challenge.systems import name_without_target
+from probewise.challenge.systems.table import gains_on_held_out_runs
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
 from probewise.report.terms import explain_new_terms, with_explanations
@@ -76,7 +76,7 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
     sections = [Section("The table", (table_of_rows(rows), _legend()))]
     if done:
         drawn = figure(
-            png(confusion_matrix(*confusion(done, label=family_of if systems else str))),
+            png(confusion_matrix(*confusion_counts(done, label=name_without_target if systems else str))),
             "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
             "truth." + (" Targets are left out." if systems else ""),
         )
@@ -108,7 +108,7 @@ def _effect_table(done: Results) -> Markup:
         ("effect", "cases", "detected at alpha .01", "named first"),
         (
             (name, str(detected.n), *(f"{_value_text(e)} ({_interval_text(e)})" for e in (detected, named)))
-            for name, (detected, named) in by_effect(done).items()
+            for name, (detected, named) in detected_and_named_by_effect(done).items()
         ),
     )
 
@@ -134,9 +134,9 @@ def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
     begun = (str(number), result.get("system", ""), concealed, f"{result['size']:g}" if result["size"] else "")
     if "failed" in result:
         return (*begun, f"failed: {result['failed']}", "", "no", "")
-    names, probability = leading(result, clean=True)
+    names, probability = leading_hypothesis(result, clean=True)
     right = leading_name_right(result) if result["hidden"] else names_match(names, effects_to_name(result, merged=True))
-    gains = gains_of(result, "right")
+    gains = gains_on_held_out_runs(result, "right")
     said = " and ".join(names) or "clean"
     return (
         *begun,

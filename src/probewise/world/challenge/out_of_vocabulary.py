@@ -13,29 +13,29 @@ from probewise.world.challenge.effect_samplers import (
     EffectSampler,
     OfAmplitude,
     amplitude_only,
-    log_uniform,
-    random_sign,
-    sign,
+    draw_log_uniform,
+    draw_sign,
+    sign_only,
 )
 
 
 def _place_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, at_mm = sign(rng), rng.uniform(-3, 3)
+    s, at_mm = draw_sign(rng), rng.uniform(-3, 3)
     return lambda a: concealed.PlaceStep(s * a, at_mm)
 
 
 def _stick_slip(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    period_mm, phase = log_uniform(rng, 3.0, 8.0), rng.random()
+    period_mm, phase = draw_log_uniform(rng, 3.0, 8.0), rng.random()
     return lambda a: concealed.StickSlip(a, period_mm, phase)
 
 
 def _slipped_paper(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, at_s = sign(rng), setup.start_s + rng.uniform(0.2, 0.8) * setup.duration_s
+    s, at_s = draw_sign(rng), setup.start_s + rng.uniform(0.2, 0.8) * setup.duration_s
     return lambda a: concealed.SlippedPaper(s * a, at_s)
 
 
 def _ghost(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    dx_mm, dy_mm = sign(rng) * rng.uniform(8, 20), rng.uniform(-5, 5)
+    dx_mm, dy_mm = draw_sign(rng) * rng.uniform(8, 20), rng.uniform(-5, 5)
     return lambda a: concealed.Ghost(a, dx_mm, dy_mm)
 
 
@@ -50,21 +50,21 @@ def _cross_talk(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 def _after_glow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    tau_s, level = log_uniform(rng, 5.0, 20.0), (setup.world.black + setup.world.white) / 2
+    tau_s, level = draw_log_uniform(rng, 5.0, 20.0), (setup.world.black + setup.world.white) / 2
     return lambda a: concealed.AfterGlow(a, tau_s, level)
 
 
 def _chirp(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     phase = rng.uniform(0, 2 * math.pi)
     # By the end of the recording the frequency has grown eightfold.
-    first_hz = log_uniform(rng, 2.0, 6.0) / setup.duration_s
+    first_hz = draw_log_uniform(rng, 2.0, 6.0) / setup.duration_s
     rate = 7 * first_hz / setup.duration_s
     return lambda a: concealed.Chirp(a, first_hz, rate, phase)
 
 
 OUTSIDE: Mapping[str, EffectSampler] = {
-    "bent_rail": EffectSampler(("place",), random_sign(concealed.BentRail), 0.5, 20.0),
-    "twisted_rail": EffectSampler(("place",), random_sign(concealed.TwistedRail), 0.5, 20.0),
+    "bent_rail": EffectSampler(("place",), sign_only(concealed.BentRail), 0.5, 20.0),
+    "twisted_rail": EffectSampler(("place",), sign_only(concealed.TwistedRail), 0.5, 20.0),
     "place_step": EffectSampler(("place",), _place_step, 0.5, 10.0),
     "stick_slip": EffectSampler(("place",), _stick_slip, 0.5, 8.0),
     "slipped_paper": EffectSampler(("time",), _slipped_paper, 0.5, 10.0),

@@ -21,7 +21,7 @@ _FORM_STEP = 0.1  # of the form's own step
 _FAR = 1e9  # residual in sds where a law diverges
 
 
-def free_numbers(form: Form) -> tuple[str, ...]:
+def fitted_parameters(form: Form) -> tuple[str, ...]:
     """Return the parameters to fit: not the time of a step, nor values of absent runs."""
     return tuple(name for name, step in form.steps.items() if step > 0)
 
@@ -36,7 +36,7 @@ class AddedForm:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class LeastSquaresFit:
     """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), chi-square."""
 
     coordinates: FloatArray
@@ -126,7 +126,7 @@ class Model:
                     out[here, column] = slope[here]
         return found[0], out
 
-    def _with_slopes_or_far(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _with_slopes_or_huge(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings with their slopes; if a law diverges, values so large that the fit steps back."""
         try:
             readings, slopes = self.with_slopes(x)
@@ -136,7 +136,7 @@ class Model:
             return np.full(len(self.rows), _FAR * self.kind.sd), np.zeros((len(self.rows), len(x)))
         return readings, np.nan_to_num(slopes)
 
-    def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> Fitted:
+    def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> LeastSquaresFit:
         """Fit readings (n_points,) by least squares from a start.
 
         Raises
@@ -151,7 +151,7 @@ class Model:
             key = x.tobytes()
             if key not in last:
                 last.clear()
-                last[key] = self._with_slopes_or_far(x)
+                last[key] = self._with_slopes_or_huge(x)
             return last[key]
 
         def standardised_residuals(x: FloatArray) -> FloatArray:
@@ -175,7 +175,7 @@ class Model:
                 f, slopes = readings_and_slopes(np.asarray(found.x))
         except (ValueError, np.linalg.LinAlgError) as error:
             raise NotConvergedError(f"a fit of the {self.kind.name} left the finite numbers") from error
-        return Fitted(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))
+        return LeastSquaresFit(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))
 
 
 def project_out(change: FloatArray, slopes: FloatArray) -> FloatArray:
@@ -186,6 +186,6 @@ def project_out(change: FloatArray, slopes: FloatArray) -> FloatArray:
     return np.asarray(change - basis @ (basis.T @ change))
 
 
-def numbers_of(values: Mapping[str, float]) -> Numbers:
+def numbers_of_setting(values: Mapping[str, float]) -> Numbers:
     """Convert one setting to parameter arrays."""
     return {name: np.array([[value]]) for name, value in values.items()}

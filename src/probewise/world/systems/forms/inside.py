@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form
-from probewise.world.systems.forms.modulations import Modulation, one_by_one
+from probewise.world.systems.forms.modulations import Modulation, join_single_member
 from probewise.world.systems.forms.true_system import TrueSystem
 
 _N_WAVES = 20
@@ -75,7 +75,7 @@ def term_in_rate(
         lambda a, drawn: {"a": a, **drawn},
         draw,
         [[{"a": 0.1 * first}]],
-        one_by_one,
+        join_single_member,
         {"a": first},
         first,
         300 * first,
@@ -109,7 +109,7 @@ def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
             )
             if other != state:
                 yield term_in_rate(true, f"coupling:{state}:{other}", state, _term_of(other, lambda r: -r), most, seen)
-        yield _periodic(true, state)
+        yield _periodic_term(true, state)
         yield from _friction_and_bound(true, state)
 
 
@@ -118,7 +118,7 @@ def _term_of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any]
     return lambda s, now, v: term(s[state])
 
 
-def _periodic(true: TrueSystem, state: str) -> Form:
+def _periodic_term(true: TrueSystem, state: str) -> Form:
     how = modulations.waves(true, _N_WAVES)
     first = 0.02 * true.rms_rate(state)
     return Form(

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.cases import SystemCase
 from probewise.world.systems.chain import simulate
-from probewise.world.systems.fit import AddedForm, Model, free_numbers
+from probewise.world.systems.fit import AddedForm, Model, fitted_parameters
 from probewise.world.systems.forms.form import Numbers
 
 _MOMENTS = 8  # distinct values of a dead time over samples, since the integration stops at each of them in every gap
@@ -27,9 +27,9 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
         If the fit diverges.
     """
     drawn, kind = case.drawn, case.drawn.kind
-    beside = [AddedForm(e.form, e.values, free_numbers(e.form)) for e in case.effects]
-    model = Model(kind, drawn.diagnosed, beside)
-    fitted = model.fit(case.readings[drawn.kept_rows], model.coordinates(drawn.shared, drawn.by_run))
+    beside = [AddedForm(e.form, e.values, fitted_parameters(e.form)) for e in case.effects]
+    model = Model(kind, drawn.diagnosed_rows, beside)
+    fitted = model.fit(case.readings[drawn.diagnosed_row_numbers], model.coordinates(drawn.shared, drawn.by_run))
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
     x = fitted.coordinates + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
@@ -53,13 +53,14 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
     there = np.concatenate(parts, axis=1)
     effects = [
-        (form, _of_unseen_run(numbers, b.free)) for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
+        (form, _numbers_of_unseen_run(numbers, b.free))
+        for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
     ]
     with np.errstate(all="ignore"):
         return simulate(kind, later, ahead.parameters(there), effects).readings
 
 
-def _of_unseen_run(numbers: Numbers, free: Sequence[str]) -> Numbers:
+def _numbers_of_unseen_run(numbers: Numbers, free: Sequence[str]) -> Numbers:
     """Give a held-out run the mean of the fitted runs' values: a parameter takes up what they have in common."""
     fitted = [numbers[name] for name in free if name.startswith("values[")]
     if not fitted:

@@ -101,4 +101,4 @@ def predict(
         block = slice(first, first + per_block)
         level = chain.noise_level(theta[block], plan, sensor.noise_sd[block, None])
         mixture.add(model.predict(theta[block], plan), level)
-    return Prediction(plan, *mixture.finished(), recorded)
+    return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)

@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import NoiseRows
-from probewise.effects.vocabulary import NoiseEffect, give_or_take
+from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
@@ -42,8 +42,8 @@ class Outliers(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"outliers: {give_or_take(mean[0], sd[0], factor=100)} % of the readings scatter "
-            f"{give_or_take(mean[1], sd[1])} times as widely as the others"
+            f"outliers: {value_with_sd(mean[0], sd[0], factor=100)} % of the readings scatter "
+            f"{value_with_sd(mean[1], sd[1])} times as widely as the others"
         )
 
 
@@ -96,6 +96,6 @@ class Dropouts(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"readings are lost: {give_or_take(mean[0], sd[0], factor=100)} % of them read "
-            f"{give_or_take(mean[1], sd[1], self.unit)}, whatever the true value"
+            f"readings are lost: {value_with_sd(mean[0], sd[0], factor=100)} % of them read "
+            f"{value_with_sd(mean[1], sd[1], self.unit)}, whatever the true value"
         )

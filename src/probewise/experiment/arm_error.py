@@ -27,7 +27,7 @@ from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.state import ArmError, Exploration
-from probewise.inference.problem import scores
+from probewise.inference.problem import checked_log_prob
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
 from probewise.scene.shapes import AnyOf
@@ -240,7 +240,9 @@ def _slopes_by_error(
     for error in range(off.shape[2]):
         change = _STEP_SD * np.einsum("skp,kp->sk", by_pose, off[:, :, error])
         up, down = (
-            scores(kind.likelihood, recording.readings[usable], predicted[:, usable] + way * change[:, usable])
+            checked_log_prob(
+                kind.likelihood, recording.readings[usable], predicted[:, usable] + way * change[:, usable]
+            )
             for way in (1, -1)
         )
         out[:, error] = (up - down) / (2 * _STEP_SD)

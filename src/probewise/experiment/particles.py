@@ -19,7 +19,7 @@ from scipy.special import logsumexp
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
 from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
-from probewise.inference.problem import SensorProblem, scores
+from probewise.inference.problem import SensorProblem, checked_log_prob
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
 from probewise.nested.weights import n_effective, resampled_rows
@@ -314,7 +314,7 @@ class _LastReading:
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0
-        best = scores(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
+        best = checked_log_prob(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
         return float(self.perfect_log_likelihood - best)
 
     @property
@@ -322,7 +322,9 @@ class _LastReading:
         """Log likelihood of the last reading under a perfect prediction; zero if it is missing."""
         recording = self.problem.recording
         reading = recording.readings[-1:]
-        return float(scores(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
+        return (
+            float(checked_log_prob(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
+        )
 
     def log_likelihoods(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
@@ -335,7 +337,7 @@ class _LastReading:
         """Return the log likelihood of these readings; zero for none."""
         if not rows.any():
             return np.zeros(len(predicted))
-        return scores(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
+        return checked_log_prob(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
 
     def evaluate_samples(self, theta: FloatArray) -> _EvaluatedSamples:
         """Evaluate samples; the model is not evaluated outside the prior."""

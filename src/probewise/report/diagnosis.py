@@ -21,7 +21,7 @@ from probewise.diagnosis import (
     p_in_words,
 )
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import family_words, words_and_unit
 from probewise.report.covariate_view import ResidualNoise, places_in_order
@@ -163,7 +163,7 @@ def _simulator_facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 def _formula_in_words(formula: Formula) -> str:
     """Write a formula with its estimated parameters."""
-    numbers = ", ".join(f"{p.name} = {give_or_take(p.mean, p.sd)}" for p in formula.parameters)
+    numbers = ", ".join(f"{p.name} = {value_with_sd(p.mean, p.sd)}" for p in formula.parameters)
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
     held_out = f"{formula.heldout_log_density_per_reading:+.3f} nats per held-out reading"
     gained = f"log evidence {formula.log_evidence:+.1f} nats, {held_out}"
@@ -185,7 +185,7 @@ def _prediction_in_words(nats: float, sd: float) -> str:
 
 
 def _signed_nats(nats: float, sd: float) -> str:
-    written = give_or_take(nats, sd)
+    written = value_with_sd(nats, sd)
     return f"{typeset(written if written.startswith('-') else f'+{written}')} nats"
 
 
@@ -313,7 +313,7 @@ def _evidence_comparison(diagnosis: Diagnosis) -> tuple[Markup, ...]:
                     hypothesis_in_words(w.effects),
                     str(w.n_gaussians or "–"),
                     number(w.laplace, 2),
-                    typeset(give_or_take(w.nested, w.error)),
+                    typeset(value_with_sd(w.nested, w.error)),
                     ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
                 )
                 for w in diagnosis.report.weighings
@@ -446,7 +446,7 @@ def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Write a parameter with its sd (and unit, if asked), and its interval."""
     low, high = found.interval95
     own = _unit_text(found) if unit else ""
-    return typeset(f"{give_or_take(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
+    return typeset(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
 
 
 def _unit_text(found: ParameterFound) -> str:

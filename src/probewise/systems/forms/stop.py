@@ -50,7 +50,7 @@ class MeterStop(NoiseEffect):
         return None
 
     @property
-    def seen(self) -> FloatArray:
+    def certain_parameters(self) -> FloatArray:
         """The level, (1,)."""
         return np.array([self.level])
 

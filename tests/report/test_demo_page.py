@@ -10,7 +10,7 @@ import probewise
 from probewise.arm import Pose, SimulatedArm
 from probewise.cli import demo, main
 from probewise.errors import ParameterError
-from probewise.experiment import Experiment, run_from
+from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
@@ -37,7 +37,7 @@ def searched(max_readings):
     model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
     grid = Grid(n_x=66, n_y=33)
     experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, grid, ReadingEntropy(), n_live=60, n_particles=500)
-    return run_from(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
+    return run_from_place(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
 
 
 @pytest.fixture(scope="module")

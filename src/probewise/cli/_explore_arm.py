@@ -61,5 +61,5 @@ def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Readin
             workspace=geometry,
             scale=posing.scale_of(inputs.sensor.instrumentation),
         )
-    known = hidden.named_as(inputs.experiment.names)
-    return Site(arm, hidden.outline_mm, known, {"hidden": hidden.document})
+    known = hidden.parameters_by_names(inputs.experiment.names)
+    return Site(arm, hidden.outline_mm, known, {"hidden": hidden.journal_entry})

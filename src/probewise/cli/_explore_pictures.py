@@ -82,7 +82,7 @@ class Pictures:
         write_bytes_atomically(stage / "run.gif", gif(self.frames))
         write_text_atomically(stage / "result.json", posing.result_json(result))
         write_text_atomically(stage / "samples.csv", posing.samples_csv(result))
-        learnt = posing.repaired(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
+        learnt = posing.repaired_sensor(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
         write_text_atomically(stage / "sensor.json", learnt.to_json())
 
 

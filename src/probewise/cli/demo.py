@@ -225,7 +225,7 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
     """Search for the circle by the paper's rule; the first reading, on the circle, is the same for all models."""
     import numpy as np
 
-    from probewise.experiment import arm_over, experiment_for, run_from, surface_of
+    from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
     from probewise.inquiry import ReadingEntropy
     from probewise.scene import Field
     from probewise.world.shipped import truth as world_behind
@@ -236,7 +236,7 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
     )
     first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
-        return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
+        return run_from_place(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
 
 
 def place_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
@@ -257,7 +257,7 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
 
     import numpy as np
 
-    from probewise.experiment import arm_over, experiment_for, run_from, surface_of
+    from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
     from probewise.report.doubt import SATURATION
     from probewise.scene import Field
     from probewise.world import Saturation
@@ -268,7 +268,9 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
     world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
     first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world, surface, field, seed=seed) as arm:
-        return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT)
+        return run_from_place(
+            first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT
+        )
 
 
 def _diagnose_concealed(seed: int) -> Diagnosis:

@@ -202,7 +202,7 @@ def run(arguments: argparse.Namespace) -> int:
                 max_readings=arguments.max_readings,
                 journal=before or journal,
                 about={
-                    **posing.sensor_named(inputs.sensor, _relative_path(out, arguments.sensor)),
+                    **posing.sensor_entry(inputs.sensor, _relative_path(out, arguments.sensor)),
                     **site.about,
                     "arm": arguments.arm.partition(":")[0],
                 },
@@ -213,7 +213,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
-            under = posing.ArmOverGrid.under(site.arm, inputs.other.grid)
+            under = posing.ArmOverGrid.of(site.arm, inputs.other.grid)
             pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.add(step, shadow)

@@ -195,7 +195,7 @@ def _opened_take(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsF
     if arguments.origin_mm is not None:
         origin = parse_place("--origin-mm", arguments.origin_mm)
     opened, bench = open_arm(
-        chosen, geometry, arguments.geometry, seed=seed, start_s=folder.ended_s, n_taken=folder.n_readings
+        chosen, geometry, arguments.geometry, seed=seed, start_s=folder.last_time_s, n_taken=folder.n_readings
     )
     with opened as arm:
         by_hand, laid = prompter(arm), list[str]()

@@ -37,7 +37,7 @@ class BentRails(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical quadratic error to 0.5 % of the longest scan's length, at half that length or 10 mm if more."""
+        """Set the typical quadratic error to 0.5 % of the longest scan's length, at half of it or 10 mm if more."""
         return cls(typical_mm=0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:

@@ -1,4 +1,4 @@
-"""Inquire: the utility of every available reading, and the choice of the next."""
+"""The utility of every available reading, and the choice of the next (the paper's "inquire")."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ArmOverGrid:
     travel_s: Callable[[Pose, FloatArray], FloatArray]
 
     @classmethod
-    def under(cls, instrument: Instrument, grid: Grid) -> Self:
+    def of(cls, instrument: Instrument, grid: Grid) -> Self:
         """Build from an instrument."""
         return cls(
             np.asarray(instrument.reachable(grid.places_mm), dtype=np.bool_),
@@ -38,8 +38,11 @@ class ArmOverGrid:
             instrument.travel_s,
         )
 
+    under = of
+    """The old name of `of`."""
 
-def inquire(
+
+def predict_and_rate_readings(
     experiment: Experiment,
     posterior: Weighted,
     drawn: FloatArray,
@@ -48,7 +51,7 @@ def inquire(
     at: Reading | None,
     goal: Goal | None = None,
 ) -> tuple[Prospect, UtilityMap]:
-    """Compute the utility of every available reading.
+    """Predict every available reading, and compute its utility.
 
     Parameters
     ----------
@@ -65,7 +68,7 @@ def inquire(
 
     Returns
     -------
-    What is expected of each available reading, and their utilities.
+    Posterior, designs and predictive distributions; and the utility of each design.
     """
     designs = experiment.designs
     rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.combinations))

@@ -129,10 +129,10 @@ def arm_error(
     off[:, 2] *= -falls
     slopes = _mean_shifts(experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape)
     theta = posterior.theta[:, experiment.shape_columns]
-    return ArmError(slopes, moved_by_arm(experiment, slopes, theta, likely_shape, rng=rng))
+    return ArmError(slopes, shifts_by_arm_error(experiment, slopes, theta, likely_shape, rng=rng))
 
 
-def moved_by_arm(
+def shifts_by_arm_error(
     experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw an error of the arm for each sample, theta (n_samples, n_params), and return its shift, of the same form."""

@@ -211,9 +211,9 @@ def _parse_entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
         column = "time_s"
         time_s = _parse_number(line["time_s"])
         column = "reading"
-        value = _or_nan(line["reading"])
+        value = _nan_if_null(line["reading"])
         column = "covariates"
-        covariates = {str(name): _or_nan(number) for name, number in line["covariates"].items()}
+        covariates = {str(name): _nan_if_null(number) for name, number in line["covariates"].items()}
         column = "belief"
         summary = _parse_summary(line["belief"]) if "belief" in line else None
     except KeyError as error:
@@ -228,12 +228,12 @@ def _parse_summary(line: Mapping[str, Any]) -> PosteriorSummary:
     return PosteriorSummary(mean, sd, _parse_number(line["bits"]), _parse_pose(line["next"]))
 
 
-def _or_null(value: float) -> float | None:
+def _null_if_nan(value: float) -> float | None:
     """Convert NaN, a missing reading or covariate, to null, since JSON has no NaN."""
     return value if math.isfinite(value) else None
 
 
-def _or_nan(value: float | None) -> float:
+def _nan_if_null(value: float | None) -> float:
     return math.nan if value is None else _parse_number(value)
 
 
@@ -341,18 +341,18 @@ class JournalWriter:
             file.seek(0, os.SEEK_END)
             return cls(Path(journal.path), file, stack.pop_all())
 
-    def reading(self, index: int, reading: Reading) -> None:
+    def write_reading(self, index: int, reading: Reading) -> None:
         """Write a reading, the first part of its line."""
         line = {
             "index": index,
             "pose": _pose_as_json(reading.pose),
             "time_s": reading.time_s,
-            "reading": _or_null(reading.value),
-            "covariates": {name: _or_null(value) for name, value in reading.covariates.items()},
+            "reading": _null_if_nan(reading.value),
+            "covariates": {name: _null_if_nan(value) for name, value in reading.covariates.items()},
         }
         self._write_to_disk(json.dumps(line, allow_nan=False)[:-1])
 
-    def summary(self, summary: PosteriorSummary) -> None:
+    def write_summary(self, summary: PosteriorSummary) -> None:
         """Write the summary after that reading, the rest of its line."""
         line = {
             "mean": dict(summary.mean),
@@ -361,6 +361,9 @@ class JournalWriter:
             "next": _pose_as_json(summary.next_pose),
         }
         self._write_to_disk(_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n")
+
+    # Old names.
+    reading, summary = write_reading, write_summary
 
     def close(self) -> None:
         """Close the file and let other processes write to it."""

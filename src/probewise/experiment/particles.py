@@ -187,9 +187,9 @@ def update(
         given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
         strained |= given_up and all_at_once < least
         share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
-        weighed = _updated_log_weights(log_weight, now.at(share), base)
+        weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(share), base)
         gained = float(logsumexp(weighed))
-        log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
+        log_z, log_weight, base = log_z + gained, weighed - gained, now.log_likelihood_at_power(share)
         n_eff = n_effective(log_weight)
         variance += max(1.0 / n_eff - 1.0 / n, 0.0)
         if share == 1.0 and n_eff >= least:
@@ -203,7 +203,7 @@ def update(
             if fall_back is not None:
                 return _particles_from_run(fall_back(), n, last, n_calls, rng)
             strained = True
-        base, log_weight = now.at(share), np.full(n, -math.log(n))
+        base, log_weight = now.log_likelihood_at_power(share), np.full(n, -math.log(n))
         if share == 1.0:
             break
     tail = pareto_k(log_weight) if n_eff < n else -math.inf
@@ -283,14 +283,14 @@ class _EvaluatedSamples:
     before: FloatArray
     after: FloatArray
 
-    def at(self, share: float) -> FloatArray:
+    def log_likelihood_at_power(self, share: float) -> FloatArray:
         """Return the log likelihood with the last reading's raised to a power `share`."""
         return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
 
     def take(self, rows: IntArray) -> _EvaluatedSamples:
         return _EvaluatedSamples(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
 
-    def put(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
+    def overwritten(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
         """Overwrite rows with the samples of `other`, in the same order."""
         return _EvaluatedSamples(
             np.where(rows[:, None], other.theta, self.theta),
@@ -378,7 +378,7 @@ def _move_by_metropolis(
         return start, _MoveCounts(0.0, 0)
     parts = [np.arange(n)] if parts is None else parts
     effort = THOROUGH if effort is None else effort
-    kernels = [LocalKernels.about(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
+    kernels = [LocalKernels.fitted_to(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
     now, accepted, n_calls = start, 0.0, 0
     for _ in range(_MOST_ROUNDS):
         for propose in (_propose_from_kernels, _propose_along_differences):
@@ -386,9 +386,15 @@ def _move_by_metropolis(
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
             proposed = last.evaluate_samples(theta)
-            odds = proposed.log_prior + proposed.at(share) - now.log_prior - now.at(share) + log_ratio
+            odds = (
+                proposed.log_prior
+                + proposed.log_likelihood_at_power(share)
+                - now.log_prior
+                - now.log_likelihood_at_power(share)
+                + log_ratio
+            )
             taken = np.log(rng.random(n)) < odds
-            now = now.put(taken, proposed)
+            now = now.overwritten(taken, proposed)
             n_calls += n
             accepted += float(taken.mean())
         if accepted >= effort.steps_per_sample:
@@ -427,7 +433,7 @@ def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples
         middle = 0.5 * (low + high)
         low, high = (
             (middle, high)
-            if n_effective(_updated_log_weights(log_weight, now.at(middle), base)) >= enough
+            if n_effective(_updated_log_weights(log_weight, now.log_likelihood_at_power(middle), base)) >= enough
             else (low, middle)
         )
     return max(low, share + 1e-6)

@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
-from probewise.experiment.checking import ENOUGH_BITS, FAR_SIDE, NAMES, Outline, bits_of_names, places_of
+from probewise.experiment.checking import ENOUGH_BITS, FAR_SIDE, NAMES, Outline, bits_about_name, places_of_designs
 from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
@@ -70,16 +70,18 @@ def utility_near_end(
     outline = Outline.of(prospect, experiment.shape.region(_mean_shape(experiment, prospect)), readings)
     far = () if outline is None or outline.far_side is None else (outline.far_side,)
     rows = np.union1d(_candidate_designs(experiment, prospect, utilities, theta, readings, rng), far).astype(np.int64)
-    plan = Pace.of(readings).on(_plan_of_candidates(prospect, rows, readings[-1]))
+    plan = Pace.of(readings).plan_with_run_time(_plan_of_candidates(prospect, rows, readings[-1]))
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
     names = np.array([kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own])
     seen = (
-        np.ones(len(rows), dtype=np.bool_) if outline is None else outline.leaves_no_far_side(places_of(prospect)[rows])
+        np.ones(len(rows), dtype=np.bool_)
+        if outline is None
+        else outline.leaves_no_far_side(places_of_designs(prospect)[rows])
     )
     if known and not far:
-        utility = bits_of_names(weight, answers, names, prospect.readout)
+        utility = bits_about_name(weight, answers, names, prospect.readout)
         return _map_of_candidates(prospect, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
     utility = _expected_bits(weight, answers, prospect)
     if known:
@@ -96,7 +98,7 @@ def utility_near_end(
     if chance.max() < _LEAST_CHANCE:
         return _map_of_candidates(prospect, utilities, rows, utility, _LABEL), False
     # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
-    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_of_names(
+    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_about_name(
         weight, answers[:, best], names, prospect.readout
     )
     return _map_of_candidates(prospect, utilities, rows[best], ends, _ENDS), False
@@ -134,7 +136,7 @@ def _draw_hypotheses(
         own = particles.weighted.samples(int(n), rng=rng) if n else np.empty((0, len(kind.prior.names)))
         theta.append(own)
         if n:
-            lengths.append(kind.placed(own, rng)[:, columns])
+            lengths.append(kind.to_whole_theta(own, rng)[:, columns])
             weight.append(np.full(n, p / n))
     share = np.concatenate(weight)
     return theta, np.concatenate(lengths), share / share.sum()

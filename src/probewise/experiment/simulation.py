@@ -52,11 +52,11 @@ _USUAL_HEIGHT_MM = 14.0  # height of the paper's sensor above the surface
 _PAINTED_VERTICES = 512  # vertices of a curved outline that is not an ellipse: within 0.01 mm of a circle of 150 mm
 
 
-class Streams(NamedTuple):
+class RandomStreams(NamedTuple):
     """Independent random streams of one simulated run: robot, hidden shape, shadow run, noise.
 
     `noise` is a number, from which each reading's generator is made; see `arm_over`. `levels` is that of readings over
-    black and white before the run, see `levels_in`.
+    black and white before the run, see `naive_levels_from_world`.
     """
 
     run: np.random.Generator
@@ -66,13 +66,13 @@ class Streams(NamedTuple):
     levels: np.random.Generator
 
     @classmethod
-    def of(cls, rng: np.random.Generator) -> Streams:
+    def of(cls, rng: np.random.Generator) -> RandomStreams:
         """Spawn them from one generator, so that one seed gives the whole run."""
         run, truth, shadow, noise, levels = rng.spawn(5)
         return cls(run, truth, shadow, int(noise.integers(2**63)), levels)
 
 
-def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
+def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
     """Return a journal's entry for the sensor: its fingerprint, and its file if any."""
     require_sensor(sensor)
     named = {} if path is None else {"sensor_file": os.fspath(path)}
@@ -173,7 +173,9 @@ def experiment_for(
     levels, noise_sd, scale = levels_of(sensor), float(sensor.noise_sd.mean()), scale_of(sensor.instrumentation)
     scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
     pose = partial(
-        posing(sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm),
+        experiment_without_inference(
+            sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm
+        ),
         utility=Finishing() if utility is None else utility,
         batch=batch,
         n_live=n_live,
@@ -196,7 +198,7 @@ def experiment_for(
     return pose(chain, likelihood)
 
 
-def posing(
+def experiment_without_inference(
     sensor: FittedSensor,
     shape: Shape,
     field: Field,
@@ -262,7 +264,7 @@ TRUST = 0.9
 """Default prior probability that a sensor model is complete."""
 
 
-def usual_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
+def default_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
     """Return the default trust in a sensor.
 
     It is 1 if no rivals are available, for several shapes, or with a user's own utility.

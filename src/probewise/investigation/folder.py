@@ -94,7 +94,7 @@ class RoundsFolder:
         return sum(len(recording) for recording in self._recordings_of_rounds())
 
     @property
-    def ended_s(self) -> float:
+    def last_time_s(self) -> float:
         """Time of the last reading; 0 if there is none."""
         return max((float(recording.plan.time_s.max()) for recording in self._recordings_of_rounds()), default=0.0)
 

@@ -197,7 +197,7 @@ def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
         (
             (
                 str(s.number),
-                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.stance}",
+                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.orientation_and_height}",
                 f"{s.reading.value:g}",
                 number(s.widest_mm, 1),
                 number(s.bits, 1),
@@ -241,7 +241,7 @@ def write_page(
     off = probability(chance_off(run.experiment, run.posterior, OFF_MM))
     facts = [
         ("sensor model", MODEL_NAMES.get(model, model)),
-        ("inference", run.experiment.learning.label),
+        ("inference", run.experiment.inference_method.label),
         ("stopped because", run.stop_reason),
         ("cost", spent),
         ("information", gained),

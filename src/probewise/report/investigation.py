@@ -103,7 +103,7 @@ def _explanation_probabilities(each: Round) -> dict[str, float]:
 def _round_section(each: Round) -> Section:
     """Describe one round: the readings and their reason, the diagnosis, the next plan."""
     diagnosis = each.diagnosis
-    why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.asked}"
+    why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.reason_for_readings}"
     likely = [(name, p) for name, p in _explanation_probabilities(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
     asked = diagnosis.next_measurement
     between = (

@@ -4,7 +4,7 @@ A study is a campaign of autonomous runs: every row of its table has the same ci
 from a reference row in one factor.
 """
 
-from probewise.study.circles import POPULATIONS, Population, noise_of
+from probewise.study.circles import POPULATIONS, Population, noise_of_run
 from probewise.study.concealed import (
     CONCEALED,
     ConcealedRow,
@@ -36,7 +36,7 @@ __all__ = [
     "concealed_rows",
     "concealed_table",
     "experiment_of",
-    "noise_of",
+    "noise_of_run",
     "paper_rows",
     "read_study",
     "run_concealed",
@@ -47,3 +47,6 @@ __all__ = [
     "standard_rows",
     "summarise",
 ]
+
+noise_of = noise_of_run
+"""The old name of `noise_of_run`."""

@@ -59,7 +59,7 @@ _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
 
 
 @dataclass(frozen=True)
-class Fading:
+class FadingLamp:
     """A lamp that fades linearly: every eight seconds it loses the same share of its first signal, down to zero."""
 
     share: float
@@ -68,7 +68,7 @@ class Fading:
     stage: ClassVar[Stage] = "gain"
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Scale the signal by what is left at the time of each row."""
+        """Multiply the signal by the share of light that the lamp still gives at each row's time."""
         return np.asarray(values * np.maximum(1.0 - self.share * rows.time_s / _EACH_S, 0.0))
 
 
@@ -85,7 +85,7 @@ CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, 
     "halo": (lambda share: Halo(share, 25.0), (0.05, 0.2, 0.4)),
     "dropouts": (lambda share: Dropouts(share, DARK), (0.03, 0.1, 0.2)),
     "outliers": (lambda share: Outliers(share, 12.0), (0.03, 0.1, 0.2)),
-    "gain_loss": (Fading, (0.001, 0.005, 0.01)),
+    "gain_loss": (FadingLamp, (0.001, 0.005, 0.01)),
     "hysteresis": (Hysteresis, (1.0, 4.0, 10.0)),
     "lag": (Lag, (2.0, 4.0, 8.0)),
     "flicker": (lambda units: Flicker(units, 0.37, 1.0), (1.5, 4.0, 8.0)),

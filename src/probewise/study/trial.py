@@ -22,7 +22,7 @@ from probewise.experiment import (
     Step,
     chance_off,
     explore,
-    levels_in,
+    naive_levels_from_world,
     student_t_bounds,
 )
 from probewise.inference import GaussianKnown, Naive
@@ -32,7 +32,7 @@ from probewise.priors import Normal, Product
 from probewise.recordings import Disc
 from probewise.scene import HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
-from probewise.study.circles import FIELD, POPULATIONS, noise_of
+from probewise.study.circles import FIELD, POPULATIONS, noise_of_run
 from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, Spot, World, gaussian_spot
@@ -101,7 +101,7 @@ def experiment_for_trial(trial: Trial) -> Experiment:
     if (trial.row.method, trial.row.model) != ("paper", "naive"):
         return posed
     world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=trial.row.noise_sd)
-    naive = levels_in(world, _UNROUNDED, rng=np.random.default_rng([SEED, trial.circle, 1]))
+    naive = naive_levels_from_world(world, _UNROUNDED, rng=np.random.default_rng([SEED, trial.circle, 1]))
     model = NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), HypothesisScene(posed.shape))
     return replace(posed, model=model, likelihood=naive)
 
@@ -156,7 +156,7 @@ def timed_steps(
 
 def reached(last: Step, experiment: Experiment) -> bool:
     """Return whether a run reached the target precision with a posterior that fits its readings."""
-    known = experiment.is_known(last.sd, last.shapes, last.chance_off)
+    known = experiment.may_stop(last.sd, last.shapes, last.chance_off)
     return bool(last.p_value >= experiment.doubt_p and known)
 
 
@@ -180,7 +180,7 @@ def arm_of(trial: Trial) -> SimulatedArm:
     world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
-    noise, number = noise_of(trial.circle, trial.max_readings), itertools.count()
+    noise, number = noise_of_run(trial.circle, trial.max_readings), itertools.count()
 
     def light(pose: Pose, time_s: float, height_mm: float) -> float:
         clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)

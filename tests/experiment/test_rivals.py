@@ -287,8 +287,8 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
         field = ArmOverGrid.of(arm, doubting.grid)
-    prospect, _ = predict_and_rate_readings(doubting, joined, joined.theta[:20], field, at=inside)
-    outline = Outline.of(prospect, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
+    utility_input, _ = predict_and_rate_readings(doubting, joined, joined.theta[:20], field, at=inside)
+    outline = Outline.of(utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
     assert outline is not None
     far = outline.far_side
     opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])
@@ -297,7 +297,7 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     if asked_deg is None:
         assert far is None
         return
-    place = doubting.grid.places_mm[prospect.rows[far] % doubting.grid.n_places]
+    place = doubting.grid.places_mm[utility_input.rows[far] % doubting.grid.n_places]
     asked = x + radius * math.cos(math.radians(asked_deg)), y + radius * math.sin(math.radians(asked_deg))
     assert np.hypot(*(place - asked)) < 12.0
 

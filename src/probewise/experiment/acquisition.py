@@ -13,7 +13,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
-from probewise.inquiry import Goal, Grid, Prospect, UtilityMap, choose, choose_several, reachable_rows, utility_map
+from probewise.inquiry import Goal, Grid, UtilityInput, UtilityMap, choose, choose_several, reachable_rows, utility_map
 from probewise.inquiry.forecast import resampled_hypotheses
 from probewise.nested.importance import Weighted
 
@@ -50,7 +50,7 @@ def predict_and_rate_readings(
     *,
     at: Reading | None,
     goal: Goal | None = None,
-) -> tuple[Prospect, UtilityMap]:
+) -> tuple[UtilityInput, UtilityMap]:
     """Predict every available reading, and compute its utility.
 
     Parameters
@@ -89,7 +89,7 @@ def predict_and_rate_readings(
     if experiment.trust < 1:  # samples of several kinds: use no more than for one
         some, share = resampled_hypotheses(weight, experiment.n_particles)
         theta, weight = theta[some], share / share.sum()
-    prospect = Prospect(
+    utility_input = UtilityInput(
         experiment.forecast,
         experiment.readout,
         theta,
@@ -101,18 +101,18 @@ def predict_and_rate_readings(
         cost_s[rows],
         experiment.goal if goal is None else goal,
     )
-    return prospect, utility_map(prospect, experiment.utility)
+    return utility_input, utility_map(utility_input, experiment.utility)
 
 
 def next_poses(
-    experiment: Experiment, prospect: Prospect, utilities: UtilityMap, *, rng: np.random.Generator
+    experiment: Experiment, utility_input: UtilityInput, utilities: UtilityMap, *, rng: np.random.Generator
 ) -> tuple[Pose, ...]:
     """Choose the next pose, or a batch of poses, each repeated as its design says."""
     if experiment.batch > 1:
-        rows = choose_several(prospect, experiment.batch, rng=rng)
+        rows = choose_several(utility_input, experiment.batch, rng=rng)
     else:
         rows = (choose(utilities.values, utilities.reachable, rng=rng),)
-    orientation_rad = prospect.plan.orientation_rad  # the orientation that the sensor will have there
+    orientation_rad = utility_input.plan.orientation_rad  # the orientation that the sensor will have there
     designs = [(experiment.designs[row], float(orientation_rad[row])) for row in rows]
     return tuple(
         Pose(design.x_mm, design.y_mm, standing, dict(design.settings).get("height_mm"))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.arm.instrument import Reading
-from probewise.inquiry import Prospect, Readout, entropy_bits
+from probewise.inquiry import Readout, UtilityInput, entropy_bits
 from probewise.inquiry.given_reading import GivenReading
 from probewise.scene import outlines
 from probewise.scene.albedo import Region
@@ -116,14 +116,14 @@ class Outline:
     diameter_mm: float
 
     @classmethod
-    def of(cls, prospect: Prospect, region: Region, readings: Sequence[Reading]) -> Self | None:
+    def of(cls, utility_input: UtilityInput, region: Region, readings: Sequence[Reading]) -> Self | None:
         """Lay out the outline of one region; None if it is neither an ellipse nor a polygon, or out of reach."""
         if not isinstance(region, EllipseRegion | PolygonRegion):
             return None
         edge = outlines(region)[0]
-        grid = prospect.designs.grid
+        grid = utility_input.designs.grid
         spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
-        away = np.linalg.norm(edge[:, None] - places_of_designs(prospect), axis=2)
+        away = np.linalg.norm(edge[:, None] - places_of_designs(utility_input), axis=2)
         within = away.min(axis=1) <= spacing
         if not within.any():
             return None
@@ -151,6 +151,6 @@ class Outline:
         return np.asarray(self.distances_with_reading(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
 
 
-def places_of_designs(prospect: Prospect) -> FloatArray:
+def places_of_designs(utility_input: UtilityInput) -> FloatArray:
     """Return the places of the available designs, (n, 2)."""
-    return np.stack([prospect.plan.x_mm[prospect.rows], prospect.plan.y_mm[prospect.rows]], axis=1)
+    return np.stack([utility_input.plan.x_mm[utility_input.rows], utility_input.plan.y_mm[utility_input.rows]], axis=1)

@@ -71,7 +71,7 @@ def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generato
     posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
     joined = posterior.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
-    prospect, utilities = predict_and_rate_readings(experiment, joined, drawn, field, at=None)
+    utility_input, utilities = predict_and_rate_readings(experiment, joined, drawn, field, at=None)
     if utilities.flat:
         raise ParameterError(
             "utility",
@@ -79,7 +79,7 @@ def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generato
             "one that differs between places: as it is, no reading within reach is expected to tell anything; "
             "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
         )
-    pose, *planned = next_poses(experiment, prospect, utilities, rng=rng)
+    pose, *planned = next_poses(experiment, utility_input, utilities, rng=rng)
     return ExplorationState((), posterior, pose, tuple(planned))
 
 
@@ -151,19 +151,19 @@ def step(
 
     arm = error_of_arm() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
     known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
-    prospect, utilities = predict_and_rate_readings(
+    utility_input, utilities = predict_and_rate_readings(
         experiment, posterior, drawn, field, at=reading, goal=_remaining_goal(experiment, arm)
     )
     asks = False
     if experiment.trust < 1:
-        utilities, asks = utility_near_end(experiment, wary, prospect, utilities, readings, rng=rng, known=known)
+        utilities, asks = utility_near_end(experiment, wary, utility_input, utilities, readings, rng=rng, known=known)
         asks = asks and (max_readings is None or len(readings) < max_readings)
     if arm is None and (utilities.flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = error_of_arm()
         known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
     reason = stop_reason(experiment, sd, known and not asks, p_value, utilities, len(readings), max_readings, arm_sd)
-    pose, *planned = state.planned or next_poses(experiment, prospect, utilities, rng=rng)
+    pose, *planned = state.planned or next_poses(experiment, utility_input, utilities, rng=rng)
     info = Step(
         number=len(readings),
         reading=reading,
@@ -171,7 +171,7 @@ def step(
         mean=mean,
         sd=sd,
         shapes=shapes,
-        samples=prospect.drawn[:, experiment.shape_columns],
+        samples=utility_input.drawn[:, experiment.shape_columns],
         map=utilities,
         next_pose=None if reason else pose,
         bits=bits_gained(

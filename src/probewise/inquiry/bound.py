@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.inquiry.forecast import spread_levels
+from probewise.inquiry.forecast import evenly_spaced_levels
 from probewise.inquiry.readout import Readout, entropy_bits
 
 _PER_SD = 4.0
@@ -91,7 +91,7 @@ def capacity_bits(low: float, high: float, readout: Readout) -> float:
     """
     if not low < high:
         raise ParameterError("(low, high)", (low, high), "low < high")
-    levels = spread_levels(low, high, readout.noise_sd / _PER_SD)
+    levels = evenly_spaced_levels(low, high, readout.noise_sd / _PER_SD)
     chance = readout.probability(levels)
     given = -entropy_bits(chance)
     share: FloatArray = np.full(len(levels), 1.0 / len(levels))

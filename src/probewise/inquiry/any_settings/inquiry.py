@@ -158,7 +158,7 @@ class Inquiry(ShowsItself):
         if self._readings is None:
             return None
         best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
-        p_value, worst = self._readings.fit(best)
+        p_value, worst = self._readings.goodness_of_fit(best)
         if p_value >= _DOUBT_P:
             return None
         setting, value = self._taken[worst]
@@ -262,7 +262,7 @@ class Inquiry(ShowsItself):
             return predictive.information()
         values, goal = theta[:, [self._posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
         now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
-        return np.asarray(now - predictive.distance(values, np.array(goal)))
+        return np.asarray(now - predictive.distance_from_goal(values, np.array(goal)))
 
     def _costs_s(self) -> FloatArray:
         """Return the seconds of a reading at each setting from here, (n_settings,) or a single number."""

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probewise.arm import (
+    DryRun,
     Geometry,
     Instrument,
     LegoArm,
     Pose,
-    Rehearsal,
     SimulatedArm,
     SoftLimits,
     read_geometry,
@@ -189,7 +189,7 @@ def test_a_rehearsal_of_homing_goes_to_the_stops_first():
         SHIPPED, **{n: dataclasses.replace(getattr(SHIPPED, n), stop_rad=math.radians(a)) for n, a in stops.items()}
     )
     said = []
-    with LegoArm(Rehearsal(geometry, said.append), geometry) as arm:
+    with LegoArm(DryRun(geometry, said.append), geometry) as arm:
         arm.home()
     assert [line.split()[:4] for line in said[:3]] == [
         ["elbow", "up", "to", "its"],
@@ -315,7 +315,7 @@ def test_the_guard_lets_a_joint_that_is_outside_come_back():
 
 def test_a_rehearsal_says_the_moves_and_makes_none():
     said = []
-    arm: Instrument = LegoArm(Rehearsal(SHIPPED, said.append), SHIPPED)
+    arm: Instrument = LegoArm(DryRun(SHIPPED, said.append), SHIPPED)
     with arm:
         reading = arm.measure(Pose(300.0, 200.0, float(arm.orientation_rad(np.array([[300.0, 200.0]]))[0])))
     assert math.isnan(reading.value)

@@ -7,10 +7,10 @@ import pytest
 
 from probewise.arm import (
     Instrument,
-    LegoScale,
     Pose,
     Reach,
     Reading,
+    ReadingScale,
     SimulatedArm,
     Speed,
     read_geometry,
@@ -137,12 +137,12 @@ def test_readings_are_whole_lego_units_from_1_to_100(value, expected):
 
 
 def test_the_scale_can_be_finer_or_none():
-    assert SimulatedArm(flat(33.37), scale=LegoScale(step=0.25)).measure(HERE).value == 33.25
-    assert SimulatedArm(flat(133.37), scale=LegoScale(step=None)).measure(HERE).value == 100
+    assert SimulatedArm(flat(33.37), scale=ReadingScale(step=0.25)).measure(HERE).value == 33.25
+    assert SimulatedArm(flat(133.37), scale=ReadingScale(step=None)).measure(HERE).value == 100
     assert SimulatedArm(flat(133.37), scale=None).measure(HERE).value == 133.37
     assert math.isnan(SimulatedArm(flat(math.nan)).measure(HERE).value)
-    assert LegoScale(0.0, 10.0, 3.0).convert(10.0) == 9.0
-    assert LegoScale(0.0, 11.0, 3.0).convert(11.0) == 11.0
+    assert ReadingScale(0.0, 10.0, 3.0).convert(10.0) == 9.0
+    assert ReadingScale(0.0, 11.0, 3.0).convert(11.0) == 11.0
 
 
 def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
@@ -168,8 +168,8 @@ def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
     [
         lambda: Speed(move_mm_s=0.0),
         lambda: Speed(read_s=-1.0),
-        lambda: LegoScale(low=100.0),
-        lambda: LegoScale(step=0.0),
+        lambda: ReadingScale(low=100.0),
+        lambda: ReadingScale(step=0.0),
         lambda: SimulatedArm(flat(1.0), height_mm=0.0),
     ],
     ids=["no speed", "negative time", "no range", "no step", "no height"],

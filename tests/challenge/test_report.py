@@ -20,10 +20,10 @@ def results(make):
 
 def test_the_answer_counts_targets(results):
     rows = score(results)
-    assert report.answer(rows, 6).startswith("6 cases of concealed physics: ")
+    assert report.summary_sentence(rows, 6).startswith("6 cases of concealed physics: ")
     open_rows = sum(row.decision == "open" for row in rows)
-    assert f"{open_rows} undecided by so few cases" in report.answer(rows, 6)
-    assert len(report.answer(rows, 6).split()) <= 20
+    assert f"{open_rows} undecided by so few cases" in report.summary_sentence(rows, 6)
+    assert len(report.summary_sentence(rows, 6).split()) <= 20
 
 
 def test_the_csv_leaves_out_what_is_not_there(results):

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from probewise.arm import LegoArm, Rehearsal, Request, read_geometry, shipped_geometry
+from probewise.arm import DryRun, LegoArm, Request, read_geometry, shipped_geometry
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._arm import warn_of_place_sd
@@ -98,7 +98,7 @@ def test_fitting_needs_an_arm_or_marks_and_keeps_what_stands_there(tmp_path, cap
 
 def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     geometry = read_geometry(shipped_geometry())
-    arm = LegoArm(Rehearsal(geometry, lambda text: None), geometry)
+    arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
     said, answers = [], iter(["", "x 4 y -2", "sideways", "down 55", "up 3", "ok"])
     with arm:
         met = bring_to_mark(arm, (520.0, 260.0), 32.0, lambda look: next(answers), said.append, named="mark 1")
@@ -179,7 +179,7 @@ def test_a_scene_is_typed_as_it_is_read(scene):
 
 def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet(monkeypatch, capsys):
     geometry = read_geometry(shipped_geometry())
-    arm = LegoArm(Rehearsal(geometry, lambda text: None), geometry)
+    arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
     values = iter([12.0, 57.0])
     monkeypatch.setattr(arm, "measure", lambda pose: dataclasses.replace(_reading(pose), value=next(values)))
     monkeypatch.setattr("sys.stdin", io.StringIO("\n\n\n"))

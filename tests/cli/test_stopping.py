@@ -15,7 +15,7 @@ from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
 from probewise.cli._stopping import Stopped, raise_if_stopped, reporting_what_is_kept, stoppable
-from probewise.emulator import VirtualClock, VirtualLine, set_up
+from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
 from probewise.recordings import Uniform
@@ -131,7 +131,7 @@ def strike(number, frame):
 def struck_session(n):
     """Measure once, struck at the n-th telegram; return the emulated brick, and how many telegrams came."""
     clock = VirtualClock()
-    bench = set_up(read_numbers(shipped_geometry()), truth("paper"), Uniform(0.5), clock, seed=1)
+    bench = set_up_bench(read_numbers(shipped_geometry()), truth("paper"), Uniform(0.5), clock, seed=1)
     send, sent = bench.radio.send, []
 
     def struck(data):

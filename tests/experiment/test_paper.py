@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.arm import LegoScale
+from probewise.arm import ReadingScale
 from probewise.arm.instrument import Pose, Reading
 from probewise.calibration import FittedSensor
 from probewise.errors import FileError, NotConvergedError, ParameterError
@@ -258,11 +258,11 @@ def test_a_simulated_sensor_reads_its_levels_on_its_own_scale():
     """Twenty readings of a known world: mean within five standard errors, no sd below that of rounding."""
     spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))])
     world = World(spot, black=10.3, white=60.0, noise_sd=1.0)
-    found = naive_levels_from_world(world, LegoScale(), rng=rng())
+    found = naive_levels_from_world(world, ReadingScale(), rng=rng())
     assert found.mu_black == pytest.approx(10.3, abs=5 * 1.1 / math.sqrt(20))
     assert found.mu_white == pytest.approx(60.0, abs=5 * 1.1 / math.sqrt(20))
     assert 0.5 < found.sd_black < 2
-    quiet = naive_levels_from_world(replace(world, noise_sd=0.0), LegoScale(), rng=rng())
+    quiet = naive_levels_from_world(replace(world, noise_sd=0.0), ReadingScale(), rng=rng())
     assert (quiet.mu_black, quiet.sd_white) == (10.0, 1 / math.sqrt(12))
 
 

@@ -87,7 +87,7 @@ def carry_out(
     """
     arm = instrument_of(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
-    require_reach(bounds_of(arm), places, "row of the plan", way_out="; move the plan's origin")
+    require_reach(reach_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
     row_reader = _LegoRowReader(arm) if isinstance(arm, LegoArm) else _OwnRowReader(arm)
     turns = row_reader.hand_turns_rad(plan, places)
@@ -224,7 +224,7 @@ def readings_of(recording: Recording) -> list[Reading]:
     ]
 
 
-def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
+def reach_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
     """Return what says which places an arm can reach: its geometry, its `Reach`, or the instrument itself."""
     match arm:
         case LegoArm():

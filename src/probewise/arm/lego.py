@@ -14,11 +14,11 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.basics import Clock, Side
-from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped
+from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped_to_pi
 from probewise.arm.instrument import Pose, Reading
 from probewise.arm.machine import Machine
 from probewise.arm.reach import require_reach
-from probewise.arm.scale import LegoScale
+from probewise.arm.scale import ReadingScale
 from probewise.errors import LinkError, ReachError
 
 BASE, SHOULDER, ELBOW = range(3)
@@ -44,7 +44,7 @@ def in_lego_units(percent: float, geometry: Geometry) -> float:
     """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, as in recordings."""
     if geometry.whole_percent and math.isfinite(percent):
         percent = math.floor(percent)  # the brick truncates fractions
-    return LegoScale(step=1.0 if geometry.whole_percent else None).convert(percent)
+    return ReadingScale(step=1.0 if geometry.whole_percent else None).convert(percent)
 
 
 class LegoArm:
@@ -107,7 +107,7 @@ class LegoArm:
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2): shape (n_places,)."""
-        return wrapped(self.geometry.orientation_rad(places_mm) + self.turned_rad)
+        return wrapped_to_pi(self.geometry.orientation_rad(places_mm) + self.turned_rad)
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
@@ -142,7 +142,7 @@ class LegoArm:
                 "height_mm", pose.height_mm, f"{self.geometry.read_height_mm:g}, at which this arm reads, or None"
             )
         stands = float(self.orientation_rad(place)[0])
-        if not abs(float(wrapped(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
+        if not abs(float(wrapped_to_pi(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
             raise ReachError(
                 "orientation_rad",
                 pose.orientation_rad,
@@ -281,7 +281,7 @@ class LegoArm:
         angles = self.angles_rad
         x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0]
         standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
-        return Pose(float(x_mm), float(y_mm), float(wrapped(standing)))
+        return Pose(float(x_mm), float(y_mm), float(wrapped_to_pi(standing)))
 
     def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[Goal]:
         """Return the joints' goals for the sensor at a place and height; raise ReachError if it is out of reach."""

@@ -52,7 +52,7 @@ class Inputs:
         return means["I_min"], means["I_max"]
 
 
-def inputs_of(arguments: argparse.Namespace) -> Inputs:
+def checked_inputs(arguments: argparse.Namespace) -> Inputs:
     """Read and check the options.
 
     Raises ParameterError or FileError if an option contradicts another, or a file cannot be read.
@@ -95,7 +95,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     )
     if chosen.may_differ_from_geometry and geometry is not None and geometry.accuracy is not None:
         experiment = dataclasses.replace(experiment, fitted_arm=posing.FittedArm.of(geometry, sensor))
-    other, other_model = None, _other_model(arguments.model)
+    other, other_model = None, _model_to_compare_with(arguments.model)
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)
     return Inputs(
@@ -112,7 +112,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     )
 
 
-def _other_model(model: Model) -> Model:
+def _model_to_compare_with(model: Model) -> Model:
     return "naive" if model == "ssf" else "ssf"
 
 

@@ -82,7 +82,7 @@ def check_out_file(path: Path, *inputs: Path) -> Path:
 
 
 @contextlib.contextmanager
-def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[Stage]:
+def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[Stage]:
     """Yield an empty directory; move its files into `out` only if the block succeeds.
 
     An error or a signal before that leaves `out` as it was.

@@ -6,9 +6,9 @@ import argparse
 import shlex
 from functools import partial
 
-from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, say
-from probewise.cli._executor import add_executor, campaign_kept_message, campaign_running
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, print_result
+from probewise.cli._executor import add_executor, campaign_running, message_of_kept_campaign
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 
 
@@ -55,7 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.rounds > 1:
         work, scored, of = RunCaseInRounds(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
     cases = out / "cases.jsonl"
-    kept = partial(campaign_kept_message, cases, "case", arguments)
+    kept = partial(message_of_kept_campaign, cases, "case", arguments)
     with campaign_running(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
             arguments.cases,
@@ -73,14 +73,14 @@ def run(arguments: argparse.Namespace) -> int:
         ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
     )
     drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
         write_text_atomically(stage / "table.csv", report.table_csv(rows))
         write_text_atomically(
             stage / "report.html", report.write_page(results, rows, command=command, systems=arguments.systems)
         )
-    say(report.answer(rows, len(results)), quiet=arguments.quiet)
-    say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    print_result(report.summary_sentence(rows, len(results)), quiet=arguments.quiet)
+    print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 

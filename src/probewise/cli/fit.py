@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import json
 
-from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, parse_path, say
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, parse_path, print_result
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.cli._simulator import add_simulator, read_tables
 
 
@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         fitted = fit_simulator(simulator, table, source=source, notes=notes, rng=rng, progress=progress)
         progress("drawing the figures")
         drawn = report.figures(fitted)
-    with staged(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
+    with staged_output(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
         text = json.dumps(fit_json(fitted), allow_nan=False, indent=1)
         (stage / "fit.json").write_text(text + "\n", encoding="utf-8")
         write_fitted_system(fitted.fitted, stage / "fitted.json")
@@ -49,8 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
             (stage / name).write_bytes(png)
         (stage / "report.html").write_text(report.write_page(fitted, drawn, seed=arguments.seed), encoding="utf-8")
     for note in (*notes, *stage.notes):
-        say(f"note: {note}", quiet=arguments.quiet)
-    say(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+        print_result(f"note: {note}", quiet=arguments.quiet)
+    print_result(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 

@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm import LegoScale
+from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
 from probewise.errors import NotConvergedError, ParameterError
@@ -250,7 +250,7 @@ def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> N
 
 
 def naive_levels_from_world(
-    world: World, scale: LegoScale, *, rng: np.random.Generator, n_each: int = _N_EACH
+    world: World, scale: ReadingScale, *, rng: np.random.Generator, n_each: int = _N_EACH
 ) -> Naive:
     """Simulate `n_each` readings over a black and a white sheet, for the naive model's levels and sds."""
     black, white = (

@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import did_you_mean
-from probewise.arm import LegoScale, Pose, Reach, Reading, SimulatedArm, Workspace
+from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
 from probewise.effects import Estimated, Known
@@ -284,12 +284,12 @@ def calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[floa
     return height_mm
 
 
-def scale_of(instrumentation: Instrumentation) -> LegoScale:
+def scale_of(instrumentation: Instrumentation) -> ReadingScale:
     """Return the scale of readings: the LEGO brick's for its unit, otherwise the declared step and range."""
     if instrumentation.unit == "LEGO":
-        return LegoScale()
+        return ReadingScale()
     low, high = instrumentation.min, instrumentation.max
-    return LegoScale(-math.inf if low is None else low, math.inf if high is None else high, instrumentation.step)
+    return ReadingScale(-math.inf if low is None else low, math.inf if high is None else high, instrumentation.step)
 
 
 def world_like(sensor: FittedSensor) -> World:
@@ -344,7 +344,7 @@ def arm_over(
     seed: int,
     taken: Sequence[Reading] = (),
     workspace: Workspace | None = None,
-    scale: LegoScale | None = None,
+    scale: ReadingScale | None = None,
 ) -> SimulatedArm:
     """Return a simulated arm over a surface.
 
@@ -373,7 +373,7 @@ def arm_over(
     return SimulatedArm(
         light,
         reach=reach,
-        scale=LegoScale() if scale is None else scale,
+        scale=ReadingScale() if scale is None else scale,
         height_mm=world.height_mm,
         last=taken[-1] if taken else None,
     )

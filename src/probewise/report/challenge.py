@@ -22,7 +22,7 @@ Results = Sequence[Mapping[str, Any]]
 _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
 
 
-def answer(rows: Sequence[Row], n_cases: int) -> str:
+def summary_sentence(rows: Sequence[Row], n_cases: int) -> str:
     """Summarise in one sentence how many targets are met."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
@@ -97,7 +97,7 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
     known: set[str] = set()
     return page(
         "How good a diagnosis is",
-        answer=answer(rows, len(results)),
+        answer=summary_sentence(rows, len(results)),
         key_figure=fragment(honest, *explain_new_terms(honest, known)),
         sections=with_explanations(sections, known),
     )

@@ -50,7 +50,7 @@ def covariate_unit(name: str, unit: str) -> str:
     return known.get(name, SUFFIXES.get(name.rpartition("_")[2], ""))
 
 
-def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
+def covariate_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
     """Return the name of a covariate in words and its unit, "" if none is known."""
     unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
@@ -59,9 +59,9 @@ def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
     return apparatus.words.covariate(name), units.get(name, "")
 
 
-def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
+def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
     """Return an axis label: the covariate and its unit."""
-    said, unit = words_and_unit(diagnosis, name)
+    said, unit = covariate_words_and_unit(diagnosis, name)
     run = diagnosis.apparatus.words.run
     said += f", {run} {scan}" if scan is not None and name != run else ""
     return said + (f" ({unit_name(unit)})" if unit else "")

@@ -23,7 +23,7 @@ from probewise.diagnosis import (
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
-from probewise.report.covariate import family_words, words_and_unit
+from probewise.report.covariate import covariate_words_and_unit, family_words
 from probewise.report.covariate_view import ResidualNoise, places_in_order
 from probewise.report.diagnosis_figures import figures, first_figure_content
 from probewise.report.effect_words import (
@@ -38,7 +38,7 @@ from probewise.report.html import Markup, Section, definition_list, element, fig
 from probewise.report.terms import explain_new_terms, with_explanations
 from probewise.report.words import count, number, probability, typeset, unit_name
 
-__all__ = ["answer", "figures", "sections", "write_page"]
+__all__ = ["figures", "sections", "summary_sentence", "write_page"]
 
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
@@ -57,7 +57,7 @@ _NOISE_CAPTIONS = {
 }
 
 
-def answer(diagnosis: Diagnosis) -> str:
+def summary_sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in twenty words at most."""
     return headline(diagnosis)
 
@@ -100,7 +100,7 @@ def write_page(
     first = fragment(figure(drawn["first.svg"], _first_caption(diagnosis)), definition_list(_facts(diagnosis)))
     return page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
-        answer=answer(diagnosis),
+        answer=summary_sentence(diagnosis),
         key_figure=fragment(first, *explain_new_terms(f"{diagnosis.verdict} {first}", known)),
         sections=with_explanations([*sections(diagnosis, drawn), *design, run], known),
     )
@@ -515,7 +515,7 @@ def _as_sentence(text: str) -> str:
 def _place_words(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
     """Describe where residuals are significant, and whether their means leave the band."""
     run = diagnosis.apparatus.words.run
-    covariate, unit = words_and_unit(diagnosis, place.covariate)
+    covariate, unit = covariate_words_and_unit(diagnosis, place.covariate)
     if place.covariate == run:
         what = f"{run} {place.scan}"
     elif place.start is None or place.end is None:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm import LegoScale, Pose, Reach, SimulatedArm
+from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm
 from probewise.experiment import (
     AdjustedMixture,
     Change,
@@ -43,7 +43,7 @@ DARK, BRIGHT = 10.0, 60.0
 _CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
 _ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
 _PIXEL_MM = 0.5
-_UNROUNDED = LegoScale(-math.inf, math.inf, None)
+_UNROUNDED = ReadingScale(-math.inf, math.inf, None)
 
 
 @dataclass(frozen=True)

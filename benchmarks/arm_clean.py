@@ -37,7 +37,9 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     stands, read = [], arm.read_here
     arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]
     with arm:
-        readings = list(carry_out(arm, plan, origin_mm=origin_mm, ask=partial(bench.lay, plan.patterns, origin_mm)))
+        readings = list(
+            carry_out(arm, plan, origin_mm=origin_mm, ask=partial(bench.carry_out_request, plan.patterns, origin_mm))
+        )
     found = recording_of(plan, readings)
     off = np.array(
         [

@@ -17,7 +17,7 @@ from probewise.inference import GaussianKnown
 from probewise.recordings import Disc, Instrumentation, read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
-from probewise.report.animation import gif
+from probewise.report.animation import animated_gif
 from probewise.scene import Circle, HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
 from probewise.world import Blob, World, gaussian_spot
@@ -86,7 +86,7 @@ def has_green(image):
 @pytest.mark.slow
 def test_the_next_place_is_green_in_every_frame_but_the_last_of_the_moving_picture(frames):
     """In the frames it is in the key and in the field; the last frame has no next place."""
-    moving = Image.open(io.BytesIO(gif(frames)))
+    moving = Image.open(io.BytesIO(animated_gif(frames)))
     for number, frame in enumerate(frames):
         moving.seek(number)
         still = Image.open(io.BytesIO(frame))

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from probewise import experiment
-from probewise.cli.diagnose import generators
+from probewise.cli.diagnose import generators_of_diagnosis
 from probewise.diagnosis import diagnose
 from probewise.experiment import loop
 from probewise.recordings import read_recording, shipped
@@ -52,7 +52,7 @@ def test_the_readme_quotes_what_the_demo_said_when_its_pictures_were_made():
 
 @pytest.mark.slow
 def test_the_readme_quotes_what_the_command_says_of_the_shipped_recording():
-    rng, *_ = generators(QUOTED["seed"])
+    rng, *_ = generators_of_diagnosis(QUOTED["seed"])
     found = diagnose(read_recording(shipped("concealed")), rng=rng)
     assert typeset(found.reason) == QUOTED["reason"]
 

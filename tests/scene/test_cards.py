@@ -77,7 +77,7 @@ def test_an_outlook_knows_that_a_card_tells_nothing_of_the_shape(chain):
     even = np.full(len(theta), 1 / len(theta))
     plan = experiment.designs.plan("field")
     predictive = experiment.forecast.predictive(theta, even, experiment.designs, plan, np.arange(len(plan)), 1.0)
-    ((_, mass),) = list(predictive.maps(even))
+    ((_, mass),) = list(predictive.level_weights(even))
     on_card = int(np.argmin((plan.x_mm - 300.0) ** 2 + (plan.y_mm - 200.0) ** 2))
     beside = int(np.argmin((plan.x_mm - 500.0) ** 2 + (plan.y_mm - 260.0) ** 2))
     assert mass[on_card].max() > 0.999

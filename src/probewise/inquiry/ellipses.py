@@ -64,7 +64,7 @@ class Ellipses:
         )
 
     def crossed_by_rows(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
-        """Intersect ellipse number `which` with the row of places at `y_mm`; both (n_crossings,)."""
+        """Intersect each ellipse of `which` (by number) with a horizontal row at `y_mm`; both (n_crossings,)."""
         lab, growth_per_sd, growth_by_offsets, to_axes_frame, axes = (
             values.take(which, axis=-1)
             for values in (self.lab, self.growth_per_sd, self.growth_by_offsets, self.to_axes_frame, self.axes)

@@ -65,7 +65,7 @@ class EdgesInFootprintSds:
         )
 
     def crossed_by_rows(self, which: IntArray, y_mm: FloatArray) -> CrossedPolygons:
-        """Intersect polygon number `which` with the row of places at `y_mm`; both (n_crossings,)."""
+        """Intersect each polygon of `which` (by number) with a horizontal row at `y_mm`; both (n_crossings,)."""
         slope, up, offset = (values.take(which, axis=-1) for values in (self.across, self.up, self.offset))
         return CrossedPolygons(self.share, slope, up * y_mm + offset, self.opening, which)
 

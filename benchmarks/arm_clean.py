@@ -33,7 +33,7 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     plan = for_lego_arm(paper_plan(), geometry)
     origin_mm = (524 + 0.37 * seed, 260 + 0.61 * seed)
     bench = Bench(truth("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
-    arm = bench.emulated(geometry, file)
+    arm = bench.open_emulated_arm(geometry, file)
     stands, read = [], arm.read_here
     arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]
     with arm:

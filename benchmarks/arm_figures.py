@@ -86,7 +86,7 @@ def main() -> None:
     rng = np.random.default_rng(arguments.seed)
     geometry = read_geometry(shipped_geometry())
     anywhere = rng.uniform((0.0, 0.0), geometry.field_mm, (20 * arguments.readings, 2))
-    places = anywhere[geometry.holds(anywhere)][: arguments.readings]
+    places = anywhere[geometry.contains(anywhere)][: arguments.readings]
     line = np.column_stack([np.linspace(474.0, 574.0, arguments.readings), np.full(arguments.readings, 260.0)])
     figures = {
         "seed": arguments.seed,

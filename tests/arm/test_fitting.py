@@ -49,7 +49,7 @@ def touched(true, *, noise_mm=0.0, rng=None, marks=None):
 def errors_mm(fitted, true):
     """Where the sensor really is, less where it is sent, all over the field: (n, 3)."""
     places = GEOMETRY.places_over_field_mm
-    places = places[fitted.holds(places)]
+    places = places[fitted.contains(places)]
     angles = fitted.angles_rad(places, GEOMETRY.read_height_mm) - homes(fitted) + homes(true)
     return true.position_mm(angles) - np.column_stack([places, np.full(len(places), GEOMETRY.read_height_mm)])
 

@@ -113,7 +113,7 @@ def test_every_place_that_the_arm_holds_can_be_taken(bench):
     rng = np.random.default_rng(3)
     places = rng.uniform((0, 0), (1048, 520), (200, 2))
     with bench.arm as arm:
-        for x_mm, y_mm in places[bench.geometry.holds(places)]:
+        for x_mm, y_mm in places[bench.geometry.contains(places)]:
             arm.measure(bench.pose(float(x_mm), float(y_mm)))
             assert bench.sensor_mm[2] > bench.geometry.lowest_mm
 
@@ -338,7 +338,7 @@ def test_a_simulated_arm_takes_the_geometry_of_a_real_one():
     """Same reach, same orientation: a run on either asks for the same places."""
     arm = SimulatedArm(lambda pose, time_s, height_mm: 50.0, reach=SHIPPED)
     places = np.array(PLACES)
-    np.testing.assert_array_equal(arm.reachable(places), SHIPPED.holds(places))
+    np.testing.assert_array_equal(arm.reachable(places), SHIPPED.contains(places))
     np.testing.assert_array_equal(arm.orientation_rad(places), SHIPPED.orientation_rad(places))
     assert arm.measure(Pose(*PLACES[0])).value == 50
     with pytest.raises(ReachError, match="126 to 755 mm"):

@@ -28,7 +28,7 @@ def flat(value):
 
 def test_the_arm_reaches_all_but_the_two_far_corners_and_what_is_too_near():
     """Paper, Fig. entropy-map: dark jagged edges at the bottom, where the arm does not reach."""
-    held = Reach().holds(GRID)
+    held = Reach().contains(GRID)
     assert 0.95 < held.mean() < 0.99
     missed = GRID[~held]
     far, near = missed[missed[:, 1] < 260], missed[missed[:, 1] >= 260]
@@ -42,12 +42,12 @@ def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
     shipped, ring = read_geometry(shipped_geometry()), Reach()
     away = np.hypot(*(GRID - ring.axis_mm).T)
     apart = (abs(away - ring.nearest_mm) > 1) & (abs(away - ring.farthest_mm) > 1)
-    np.testing.assert_array_equal(ring.holds(GRID[apart]), shipped.holds(GRID[apart]))
+    np.testing.assert_array_equal(ring.contains(GRID[apart]), shipped.contains(GRID[apart]))
     assert shipped.sentence().startswith(Reach().sentence())
 
 
 def test_a_longer_arm_reaches_everywhere():
-    assert Reach.everywhere().holds(GRID).all()
+    assert Reach.everywhere().contains(GRID).all()
 
 
 def test_reach_agrees_with_trigonometry():
@@ -56,7 +56,7 @@ def test_reach_agrees_with_trigonometry():
         for away, expected in ((149.9, False), (150.1, True), (399.9, True), (400.1, False)):
             place = np.array([[524 + away * math.cos(angle), 620 + away * math.sin(angle)]])
             on_field = 0 <= place[0, 1] <= 520
-            assert reach.holds(place)[0] == (expected and on_field)
+            assert reach.contains(place)[0] == (expected and on_field)
 
 
 def test_places_off_the_field_are_out_of_reach():

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from probewise.challenge import Task, confusion_counts, reliability, score
+from probewise.challenge import Task, confusion_counts, reliability_bins, score
 from probewise.cli import main
 from probewise.report import challenge as report
 from probewise.report import plots
@@ -55,7 +55,7 @@ def test_the_matrix_writes_every_count(results):
 
 @pytest.mark.slow
 def test_the_diagram_says_of_how_many(results):
-    ax = plots.reliability_diagram(reliability(results[:-1]))
+    ax = plots.reliability_diagram(reliability_bins(results[:-1]))
     assert [t.get_text() for t in ax.texts] == ["1", "4"]
 
 

@@ -11,7 +11,7 @@ from probewise.challenge import (
     calibration_error,
     confusion_counts,
     detected_and_named_by_effect,
-    reliability,
+    reliability_bins,
     score,
 )
 from probewise.challenge.estimates import bootstrapped, mean, share
@@ -123,9 +123,9 @@ def test_the_calibration_error_of_hand_made_bins(make):
     """Half stated .8, one of two right; half stated .95, both right: (.3 + .05) / 2."""
     results = [make.case(p=0.8), make.case(p=0.8, said=["lag"]), make.case(p=0.95), make.case(p=0.95)]
     assert calibration_error(results).value == pytest.approx(0.175)
-    bins = reliability(results)
+    bins = reliability_bins(results)
     assert [(round(b.stated, 3), b.right.value, b.right.n) for b in bins] == [(0.8, 0.5, 2), (0.95, 1.0, 2)]
-    assert reliability([]) == ()
+    assert reliability_bins([]) == ()
 
 
 def test_the_place_counts_where_there_is_one(make):

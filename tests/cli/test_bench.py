@@ -59,12 +59,12 @@ def test_a_ramp_stays_where_it_is():
 def test_a_bench_does_what_a_person_would_be_asked_for():
     world = dataclasses.replace(world_of(None)[0], noise_sd=0.0)
     bench = Bench(world, "uniform:1", scale=ReadingScale(), seed=1)
-    with bench.simulated(None) as arm:
+    with bench.open_simulated_arm(None) as arm:
         place = type(arm.pose)(*ORIGIN)
         white = arm.measure(place).value
         bench.carry_out_request({"dark": Uniform(0.0)}, ORIGIN, Request("put it there", pattern="dark"))
         assert arm.measure(place).value < white
-    assert bench.simulated(None, start_s=70.0).time_s == 70.0
+    assert bench.open_simulated_arm(None, start_s=70.0).time_s == 70.0
 
 
 def test_what_the_simulated_arm_records_is_what_its_sensor_predicts(sensor_file, tmp_path):

@@ -41,7 +41,7 @@ def some_places(n: int) -> np.ndarray:
     # Half of them over the circle, which is small.
     places[: 10 * n] = [600, 250] + (places[: 10 * n] - [525, 265]) / 12
     from_edge = np.hypot(places[:, 0] - 600, places[:, 1] - 250) - 80
-    good = geometry.holds(places) & (abs(from_edge) > 20)
+    good = geometry.contains(places) & (abs(from_edge) > 20)
     inside = places[good & (from_edge < 0)][: n // 2]
     return np.concatenate([inside, places[good & (from_edge > 0)][: n - len(inside)]])
 

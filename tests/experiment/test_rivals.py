@@ -272,7 +272,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
 
     run = Exploration(doubting, tuple(found))
     claimed = with_arm_error(run, geometry, levels=(10.0, 60.0), rng=np.random.default_rng(1)).arm.slopes
-    np.testing.assert_allclose(claimed, slopes(last.kinds.wary))
+    np.testing.assert_allclose(claimed, slopes(last.kinds.with_warier_odds))
     assert not np.allclose(claimed, slopes(last.kinds))
 
 

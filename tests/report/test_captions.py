@@ -12,7 +12,15 @@ from PIL import Image
 
 from probewise.arm import SimulatedArm
 from probewise.calibration import FittedSensor, OrderEvidence, predict
-from probewise.experiment import Experiment, Exploration, chance_off, explore, found_shape, result_json, samples_csv
+from probewise.experiment import (
+    Experiment,
+    Exploration,
+    explore,
+    found_shape,
+    probability_of_length_off,
+    result_json,
+    samples_csv,
+)
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc, Instrumentation, read_recording, shipped
 from probewise.report import calibration as calibration_report
@@ -145,7 +153,7 @@ def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run
         assert weight[(values >= low) & (values <= high)].sum() == pytest.approx(0.95, abs=0.02)
         off |= np.abs(values - mean) > 12.0
     assert document["chance_off_12mm"] == pytest.approx(weight[off].sum(), abs=1e-3)
-    assert chance_off(run.experiment, run.posterior, 1e6) == 0.0
+    assert probability_of_length_off(run.experiment, run.posterior, 1e6) == 0.0
 
 
 def hand_made_sensor():

@@ -170,7 +170,7 @@ def test_marks_and_targets_are_at_their_places_of_the_field():
     geometry = read_geometry(shipped_geometry())
     sheet = marks_sheet(geometry)
     assert len(sheet.crosses_mm) == 8
-    assert geometry.holds(sheet.crosses_mm).all()
+    assert geometry.contains(sheet.crosses_mm).all()
     tiles = tiles_of(sheet, "a4")
     pages = pages_of(sheets_pdf([sheet], paper="a4", title="t"))[1:]
     found = set()

@@ -61,8 +61,8 @@ def test_the_bound_stands_beside_what_was_measured(study):
     """Bits over capacity, of the rows whose robot knows its sensor."""
     least = least_readings(experiment_of(REFERENCE), rng=np.random.default_rng(0))
     shown = str(report.table_of_bounds(study))
-    assert f"{least.search:.1f} = " in shown
-    assert f"{least.refinement:.1f} = " in shown
+    assert f"{least.readings_of_search:.1f} = " in shown
+    assert f"{least.readings_of_refinement:.1f} = " in shown
     assert ROWS[1].name not in shown
 
 

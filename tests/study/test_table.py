@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binomtest, poisson
 
 from probewise.errors import ParameterError
-from probewise.study import POPULATIONS, Row, noise_of_run, share_within, standard_rows, summarise
+from probewise.study import POPULATIONS, Row, noise_of_run, share_with_interval, standard_rows, summarise
 
 
 def trial(readings: int, *, reached: bool = True, first_white: int | None = 3, error_mm: float = 1.0) -> dict:
@@ -30,7 +30,7 @@ def trial(readings: int, *, reached: bool = True, first_white: int | None = 3, e
 @pytest.mark.parametrize(("k", "n"), [(0, 50), (1, 7), (89, 100), (200, 200)])
 def test_a_share_has_wilsons_interval(k, n):
     wanted = binomtest(k, n).proportion_ci(0.95, method="wilson")
-    found = share_within(k, n)
+    found = share_with_interval(k, n)
     assert (found.value, found.low, found.high) == pytest.approx((k / n, wanted.low, wanted.high), abs=1e-12)
 
 

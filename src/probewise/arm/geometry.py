@@ -285,7 +285,7 @@ class Geometry:
         """Places all over the field at which the sensor can read, (n, 2)."""
         sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
         places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
-        return places[self.holds(places)]
+        return places[self.contains(places)]
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
         """Compute place and height of the sensor's face in the lab frame from joint angles, both (n, 3)."""
@@ -337,11 +337,14 @@ class Geometry:
         angles[~self.are_within_joint_limits(angles)] = np.nan
         return angles
 
-    def holds(self, places_mm: FloatArray) -> BoolArray:
+    def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n, 2), are on the field with room for the motors to approach: shape (n,)."""
         places = _checked_rows(places_mm, 2)
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
         return np.asarray(on_field & self._leaves_room_to_approach(places))
+
+    holds = contains
+    """The old name of `contains`."""
 
     def are_within_joint_limits(self, angles_rad: FloatArray) -> BoolArray:
         """Return which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""

@@ -111,7 +111,7 @@ class LegoArm:
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
-        return self.geometry.holds(places_mm)
+        return self.geometry.contains(places_mm)
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Estimate the seconds to move from `start` to each place and read, shape (n_places,); NaN out of reach."""

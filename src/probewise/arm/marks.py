@@ -36,7 +36,7 @@ def places_of_marks(geometry: Geometry) -> FloatArray:
         if (row + column) % 2 == 0
     ]
     marks = np.round(np.array(grid) / _STEP_MM) * _STEP_MM
-    marks = marks[geometry.holds(marks)]
+    marks = marks[geometry.contains(marks)]
     if len(marks) < LEAST_MARKS:
         raise ReachError("marks", f"{len(marks)} within reach", f"{LEAST_MARKS} or more on {geometry.sentence()}")
     return marks

@@ -142,9 +142,12 @@ class OwnInstrument:
                 raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
             return held.astype(np.bool_)
 
-    def holds(self, places_mm: FloatArray) -> BoolArray:
+    def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, (n_places, 2), are reachable, as `reachable` does: shape (n_places,)."""
         return self.reachable(places_mm)
+
+    holds = contains
+    """The old name of `contains`."""
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2), by default 0: shape (n_places,)."""

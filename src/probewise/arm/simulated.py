@@ -101,7 +101,7 @@ class SimulatedArm:
         ShapeError
             If the places are not pairs.
         """
-        return self.reach.holds(_checked_places(places_mm))
+        return self.reach.contains(_checked_places(places_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,).

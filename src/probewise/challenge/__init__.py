@@ -8,7 +8,7 @@ from probewise.challenge.case import RunCaseInRounds, Task, run_case
 from probewise.challenge.confusion import confusion_counts
 from probewise.challenge.estimates import Estimate
 from probewise.challenge.null_refit import NullRefit
-from probewise.challenge.reliability import Bin, calibration_error, reliability
+from probewise.challenge.reliability import Bin, calibration_error, reliability_bins
 from probewise.challenge.rounds import score_rounds
 from probewise.challenge.run import run_challenge
 from probewise.challenge.table import Decision, Row, detected_and_named_by_effect, score
@@ -24,7 +24,7 @@ __all__ = [
     "calibration_error",
     "confusion_counts",
     "detected_and_named_by_effect",
-    "reliability",
+    "reliability_bins",
     "run_case",
     "run_challenge",
     "score",
@@ -39,3 +39,6 @@ by_effect = detected_and_named_by_effect
 
 Investigated = RunCaseInRounds
 """The old name of `RunCaseInRounds`."""
+
+reliability = reliability_bins
+"""The old name of `reliability_bins`."""

@@ -23,7 +23,7 @@ class Bin:
     right: Estimate
 
 
-def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
+def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
     """Bin cases by the probability of their leading hypothesis into ten bins; empty bins are left out."""
     said = [leading_probability(result) for result in results]
     of_case = _bin_numbers(np.array([p for p, _ in said]))

@@ -52,7 +52,7 @@ class Bench:
         self._table = Tabletop(parse_scene(scene))
         self._stand: Callable[[], Stand] | None = None
 
-    def simulated(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
+    def open_simulated_arm(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
         """Return the simulated arm over the table; its sensor takes any orientation."""
         number = itertools.count(self._n_taken)
 
@@ -65,7 +65,7 @@ class Bench:
         rest = make().pose
         return make(last=Reading(math.nan, rest, start_s))
 
-    def emulated(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
+    def open_emulated_arm(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
         """Return the LEGO arm over the table, on an emulated brick."""
         surface, seed = self._table.surface, self._seed + self._n_taken
         arm, bench = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
@@ -145,8 +145,8 @@ def open_arm(
     scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
     bench = Bench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
     if chosen.is_lego:
-        return bench.emulated(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
-    return bench.simulated(None if geometry_file is None else geometry, start_s=start_s), bench
+        return bench.open_emulated_arm(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
+    return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
 
 
 def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:

@@ -92,7 +92,7 @@ class PersonAtBench:
         bounds, origin = reach_of(self._arm), np.array(self._origin)
         values = {}
         for is_white, place in self._sheet_check.places_to_check(
-            name, lambda places: bounds.holds(places + origin)
+            name, lambda places: bounds.contains(places + origin)
         ).items():
             x_mm, y_mm = (np.array(place) + origin).tolist()
             standing = float(self._arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])

@@ -220,7 +220,7 @@ def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
     port = None if arguments.arm is None else _nxt_port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
-    held = geometry.holds(places)
+    held = geometry.contains(places)
     print_result(f"reach        {geometry.sentence()}", quiet=arguments.quiet)
     print_result(f"field        {held.mean():.1%} of it within reach", quiet=arguments.quiet)
     for name, joint in zip(JOINTS, geometry.joints, strict=True):

@@ -105,7 +105,7 @@ class Output:
         asked = (s.power, s.mode, s.regulation, s.turn_ratio, self.run_state, s.tacho_limit)
         return (*asked, self.tacho_count, self.block_count, self.rotation_count)
 
-    def tick(self, battery_mv: float) -> None:
+    def simulate_millisecond(self, battery_mv: float) -> None:
         """Simulate a millisecond of motor and firmware."""
         self.motor.step(1e-3, self.power, brake=self._brake, battery_mv=battery_mv)
         seen = self._shown_deg

@@ -80,7 +80,7 @@ class Outputs:
     def _simulate_millisecond(self, moving: Sequence[Output], battery_mv: float) -> None:
         """Simulate a millisecond of the moving ports; a synchronised pair stops when one of them reaches its limit."""
         for port in moving:
-            port.tick(battery_mv)
+            port.simulate_millisecond(battery_mv)
         pair = [port for port in moving if port.is_synchronised][:2]
         if len(pair) == 2 and any(port.is_at_limit for port in pair):
             for port in pair:

@@ -28,7 +28,7 @@ from probewise.experiment.paper import (
     paper_experiment,
     student_t_bounds,
 )
-from probewise.experiment.sensor_update import AdjustedMixture, Change, sensor_prior
+from probewise.experiment.sensor_update import AdjustedMixture, SensorChangeSds, sensor_prior
 from probewise.experiment.shadow import shadow_run
 from probewise.experiment.simulation import (
     TRUST,
@@ -47,7 +47,7 @@ from probewise.experiment.simulation import (
 )
 from probewise.experiment.start import run_from_place
 from probewise.experiment.state import PAPER_BITS, ArmError, Exploration, ExplorationState, Step
-from probewise.experiment.stopping_rule import chance_off
+from probewise.experiment.stopping_rule import probability_of_length_off
 
 __all__ = [
     "CLEAN",
@@ -57,7 +57,6 @@ __all__ = [
     "AdjustedMixture",
     "ArmError",
     "ArmOverGrid",
-    "Change",
     "Entry",
     "Experiment",
     "Exploration",
@@ -76,12 +75,12 @@ __all__ = [
     "OneScan",
     "PosteriorSummary",
     "RandomStreams",
+    "SensorChangeSds",
     "SequentialMonteCarlo",
     "Step",
     "Truth",
     "arm_over",
     "begin",
-    "chance_off",
     "default_trust",
     "experiment_for",
     "experiment_from_names",
@@ -93,6 +92,7 @@ __all__ = [
     "naive_levels_from_recording",
     "naive_levels_from_world",
     "paper_experiment",
+    "probability_of_length_off",
     "read_journal",
     "recording_of",
     "repaired_sensor",
@@ -154,3 +154,9 @@ Streams = RandomStreams
 
 run_from = run_from_place
 """The old name of `run_from_place`."""
+
+Change = SensorChangeSds
+"""The old name of `SensorChangeSds`."""
+
+chance_off = probability_of_length_off
+"""The old name of `probability_of_length_off`."""

@@ -290,8 +290,9 @@ class Experiment:
         sd, shapes
             Posterior sds of the shape's parameters, and the shapes' probabilities.
         chance_off
-            Probability that a length is off by three times the target sd, see `stopping_rule.chance_off`; it counts if
-            the sensor is doubted, since the posterior then has tails that sds do not show.
+            Probability that a length is off by three times the target sd, see
+            `stopping_rule.probability_of_length_off`; it counts if the sensor is doubted, since the posterior then has
+            tails that sds do not show.
         """
         likely = max(shapes.values(), default=1.0)
         sure = self.trust == 1 or chance_off < MOST_OFF

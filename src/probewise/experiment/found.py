@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise.experiment.left_out import left_out_of
 from probewise.experiment.state import Exploration, require_exploration
-from probewise.experiment.stopping_rule import chance_off
+from probewise.experiment.stopping_rule import probability_of_length_off
 from probewise.nested.weights import weighted_quantiles
 from probewise.scene.albedo import Shape
 from probewise.scene.shapes import AnyOf, RegularPolygon
@@ -79,7 +79,7 @@ def result_json(run: Exploration) -> str:
         "stop_reason": run.stop_reason,
         "known": run.reached,
         "shape": asdict(found_shape(run)),
-        "chance_off_12mm": chance_off(run.experiment, run.posterior, OFF_MM),
+        "chance_off_12mm": probability_of_length_off(run.experiment, run.posterior, OFF_MM),
         "left_out": left_out_of(run.last, run.experiment.trust).as_json(),
         "bits": run.last.bits,
         "seconds": run.seconds,

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, floats, frozen
 from probewise._kinds import require_finite_number, require_rng
 from probewise.errors import ParameterError
-from probewise.experiment.simulation import surface_under
+from probewise.experiment.simulation import surface_of_region
 from probewise.priors import Prior
 from probewise.scene import SHAPES, AnyOf, Field, Shape, outlines
 from probewise.world import Surface
@@ -93,7 +93,7 @@ class HiddenShape:
     @property
     def surface(self) -> Surface:
         """Its surface in the simulated world, which shares only geometry with the models."""
-        return surface_under(self.shape.region(self.theta[None, :]), self.name)
+        return surface_of_region(self.shape.region(self.theta[None, :]), self.name)
 
     @property
     def outline_mm(self) -> FloatArray:

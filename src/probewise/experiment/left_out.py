@@ -64,7 +64,7 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
     """Summarise the probabilities after a step, in a run with this prior trust in its sensor."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     probability = {name: p for p, name in shares}
-    wary = {name or CLEAN: p for name, p in last.kinds.wary.left_out.items()}
+    wary = {name or CLEAN: p for name, p in last.kinds.with_warier_odds.left_out.items()}
     if trust == 1:
         return LeftOut(probability, wary, "The sensor model was taken for complete, as it was told to be.")
     name, p = next(iter(probability.items()))

@@ -33,18 +33,18 @@ from probewise.experiment.journal import (
 )
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import prior_posterior
-from probewise.experiment.settling import utility_near_end
 from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
 from probewise.experiment.stopping_rule import (
     OFF_SDS,
-    chance_off,
     doubt_message,
     goodness_of_fit,
     information_nats,
+    probability_of_length_off,
     sensor_moments,
     shape_moments,
     stop_reason,
 )
+from probewise.experiment.utility_near_end import utility_near_end
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
@@ -124,11 +124,11 @@ def step(
         # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
-    wary = carried.wary
+    wary = carried.with_warier_odds
     posterior = wary.joined(rng=rng)
     if experiment.trust < 1 and _stopping_rule_met(experiment, posterior, None, "", rng)[0]:
         carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
-        wary = carried.wary
+        wary = carried.with_warier_odds
         posterior = wary.joined(rng=rng)
     mean, sd, shapes = shape_moments(experiment, posterior)
     leader = carried.kinds[carried.leader]
@@ -212,7 +212,7 @@ def _stopping_rule_met(
         own = theta[:, experiment.shape_columns]
         theta[:, experiment.shape_columns] = own + shifts_by_arm_error(experiment, arm.slopes, own, likely, rng=rng)
         posterior = dataclasses.replace(posterior, theta=theta)
-    off = chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
+    off = probability_of_length_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
     return experiment.may_stop(sd, shapes, off), off
 
 

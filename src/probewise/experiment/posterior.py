@@ -109,7 +109,7 @@ class Posterior:
         return replace(self, kinds=kinds)
 
     @property
-    def wary(self) -> Posterior:
+    def with_warier_odds(self) -> Posterior:
         """The posterior with the odds of an incomplete model multiplied by `WARY`; itself if no kind has an effect."""
         return self.with_fault_odds_times(WARY) if any(kind.left_out for kind in self.kinds) else self
 

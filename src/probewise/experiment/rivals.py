@@ -124,7 +124,7 @@ def _effects_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, floa
         return [EffectLargeEnoughForRun(effect, field_mm), FromRest(EffectLargeEnoughForRun(effect, field_mm))]
     if effect.name not in _IN_TIME:
         return [EffectLargeEnoughForRun(effect, field_mm)]
-    ways = [effect, GainLoss.like(effect)] if isinstance(effect, GainDrift) else [effect]
+    ways = [effect, GainLoss.with_scales_of(effect)] if isinstance(effect, GainDrift) else [effect]
     return [EffectInRunTime(EffectLargeEnoughForRun(way, field_mm)) for way in ways]
 
 
@@ -133,7 +133,7 @@ class GainLoss(GainDrift):
     """A lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
 
     @classmethod
-    def like(cls, drift: GainDrift) -> Self:
+    def with_scales_of(cls, drift: GainDrift) -> Self:
         """Take the scales of `drift`, whose signal ends as calibrated."""
         return cls(drift.typical, drift.shortest_s, drift.longest_s)
 

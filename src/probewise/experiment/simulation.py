@@ -306,10 +306,10 @@ def world_like(sensor: FittedSensor) -> World:
 
 def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
     """Return the world's surface of a shape; only geometry is shared with the models."""
-    return surface_under(SHAPES[name](field).region(theta[None, :]), name)
+    return surface_of_region(SHAPES[name](field).region(theta[None, :]), name)
 
 
-def surface_under(region: Region, name: str) -> Surface:
+def surface_of_region(region: Region, name: str) -> Surface:
     """Return the world's surface of the region of one hypothesis.
 
     Raises

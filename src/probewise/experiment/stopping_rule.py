@@ -46,7 +46,7 @@ def shape_moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArr
     return mean, sd, dict(zip(experiment.shape.labels, (float(p) for p in share / share.sum()), strict=True))
 
 
-def chance_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
+def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
     """Return the probability that a length differs by more than `off_mm` from its posterior mean.
 
     For a set of shapes: from the mean given the most probable shape, and other shapes count as wrong.

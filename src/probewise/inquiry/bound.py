@@ -36,19 +36,22 @@ class Bound:
     capacity_bits: float
 
     @property
-    def search(self) -> float:
+    def readings_of_search(self) -> float:
         """Number of readings until the shape is found."""
         return self.search_bits / self.search_capacity_bits
 
     @property
-    def refinement(self) -> float:
+    def readings_of_refinement(self) -> float:
         """Number of readings from there until the target precision."""
         return self.refinement_bits / self.capacity_bits
 
     @property
     def readings(self) -> float:
         """Total number of readings."""
-        return self.search + self.refinement
+        return self.readings_of_search + self.readings_of_refinement
+
+    # Old names.
+    search, refinement = readings_of_search, readings_of_refinement
 
 
 def fewest_readings(

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from probewise.challenge import Estimate, Row, confusion_counts, detected_and_named_by_effect, reliability
+from probewise.challenge import Estimate, Row, confusion_counts, detected_and_named_by_effect, reliability_bins
 from probewise.challenge.scoring import effects_to_name, leading_hypothesis, leading_name_right, names_match
 from probewise.challenge.systems import name_without_target
 from probewise.challenge.systems.table import gains_on_held_out_runs
@@ -91,7 +91,7 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
         sections.append(Section("Cases that failed", (definition_list(failures),)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
     honest = figure(
-        png(reliability_diagram(reliability(done))),
+        png(reliability_diagram(reliability_bins(done))),
         "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
     )
     known: set[str] = set()

@@ -9,7 +9,16 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise.effects import spoken_name
-from probewise.experiment import CLEAN, OFF_MM, Experiment, Exploration, Step, chance_off, found_shape, left_out_of
+from probewise.experiment import (
+    CLEAN,
+    OFF_MM,
+    Experiment,
+    Exploration,
+    Step,
+    found_shape,
+    left_out_of,
+    probability_of_length_off,
+)
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
     effect_probabilities_by_reading,
@@ -238,7 +247,7 @@ def write_page(
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
     spent = f"{count(len(run.steps), 'reading')}, {number(run.seconds, 0)} s of arm time"
     gained = f"{number(run.last.bits, 1)} bits, {number(run.bits_per_reading, 2)} per reading"
-    off = probability(chance_off(run.experiment, run.posterior, OFF_MM))
+    off = probability(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
     facts = [
         ("sensor model", MODEL_NAMES.get(model, model)),
         ("inference", run.experiment.inference_method.label),

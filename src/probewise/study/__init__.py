@@ -16,7 +16,7 @@ from probewise.study.concealed import (
 )
 from probewise.study.rows import REFERENCE, Row, paper_rows, standard_rows
 from probewise.study.run import Study, read_study, run_study
-from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_within, summarise
+from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_with_interval, summarise
 from probewise.study.trial import Trial, arm_of, experiment_of, run_trial
 
 __all__ = [
@@ -43,10 +43,13 @@ __all__ = [
     "run_concealed_trial",
     "run_study",
     "run_trial",
-    "share_within",
+    "share_with_interval",
     "standard_rows",
     "summarise",
 ]
 
 noise_of = noise_of_run
 """The old name of `noise_of_run`."""
+
+share_within = share_with_interval
+"""The old name of `share_with_interval`."""

@@ -16,13 +16,13 @@ from probewise._arrays import FloatArray
 from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm
 from probewise.experiment import (
     AdjustedMixture,
-    Change,
     Experiment,
     NestedSampling,
+    SensorChangeSds,
     Step,
-    chance_off,
     explore,
     naive_levels_from_world,
+    probability_of_length_off,
     student_t_bounds,
 )
 from probewise.inference import GaussianKnown, Naive
@@ -92,7 +92,7 @@ def experiment_of(row: Row) -> Experiment:
             return Experiment(shape, chain, student_t_bounds(levels, None), **common)
         return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
     free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
-    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_sensor_changes())
+    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_prior_of_sensor_changes())
 
 
 def experiment_for_trial(trial: Trial) -> Experiment:
@@ -100,7 +100,7 @@ def experiment_for_trial(trial: Trial) -> Experiment:
     posed = experiment_of(trial.row)
     if (trial.row.method, trial.row.model) != ("paper", "naive"):
         return posed
-    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=trial.row.noise_sd)
+    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=trial.row.noise_sd)
     naive = naive_levels_from_world(world, _UNROUNDED, rng=np.random.default_rng([SEED, trial.circle, 1]))
     model = NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), HypothesisScene(posed.shape))
     return replace(posed, model=model, likelihood=naive)
@@ -126,7 +126,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         if first_white is None and step.reading.value > _ON_WHITE:
             first_white, bits_at_white = step.number, round(step.bits, 3)
     return {
-        "reached": reached(last, experiment),
+        "reached": has_reached_target(last, experiment),
         "readings": last.number,
         "first_white": first_white,
         "bits": round(last.bits, 3),
@@ -154,7 +154,7 @@ def timed_steps(
             yield step, time.process_time() - before
 
 
-def reached(last: Step, experiment: Experiment) -> bool:
+def has_reached_target(last: Step, experiment: Experiment) -> bool:
     """Return whether a run reached the target precision with a posterior that fits its readings."""
     known = experiment.may_stop(last.sd, last.shapes, last.chance_off)
     return bool(last.p_value >= experiment.doubt_p and known)
@@ -170,14 +170,14 @@ def accuracy_of(last: Step, experiment: Experiment, truth: FloatArray) -> dict[s
         held.append(bool(0.025 <= below <= 0.975))
     return {
         "error_mm": round(float(np.abs(last.mean - truth).max()), 3),
-        "chance_wrong": chance_off(experiment, last.posterior, WRONG_MM),
+        "chance_wrong": probability_of_length_off(experiment, last.posterior, WRONG_MM),
         "held": held,
     }
 
 
 def arm_of(trial: Trial) -> SimulatedArm:
     """Return an arm that reaches the whole grid over the circle, with the noise that all rows share."""
-    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=0.0)
+    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
     noise, number = noise_of_run(trial.circle, trial.max_readings), itertools.count()
@@ -191,14 +191,14 @@ def arm_of(trial: Trial) -> SimulatedArm:
 
 
 @lru_cache(maxsize=1)
-def spot_of() -> Spot:
+def footprint_pixels() -> Spot:
     """Return the footprint of the study's sensor as pixels."""
     return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
 
 
-def _sensor_changes() -> Product:
+def _prior_of_sensor_changes() -> Product:
     """Return the prior of changes of the sensor, the default of `experiment.sensor_prior`."""
-    change = Change()
+    change = SensorChangeSds()
     level = change.level * (BRIGHT - DARK)
     size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)
     return Product(

@@ -107,7 +107,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
     moves = np.concatenate([np.diff(values[rows]) for rows in true.rows.by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
-        yield _nonlinear_form(f"backlash:{column}", "width", play, column, sizes, ("previous", column))
+        yield _nonlinear_form(f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column))
     if len(np.unique(values)) > 20:
         waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
 
@@ -148,7 +148,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
 
 
-def play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+def behind_gear_play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
     """Return a column behind gear play: it rests until the play is taken up.
 
     At the start of each run, the play is taken up in the direction of the first motion.

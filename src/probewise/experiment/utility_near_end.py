@@ -94,7 +94,7 @@ def utility_near_end(
         ), True
     order = np.argsort(-utility, kind="stable")
     best = np.unique(np.concatenate([order[:_ENDING], order[seen[order]][:_ENDING]]))
-    chance = _probability_of_knowing(
+    chance = _probability_of_meeting_rule(
         lengths, weight, answers[:, best], utility_input, goal.sd, OFF_SDS * experiment.stop_sd_mm
     )
     if chance.max() < _LEAST_CHANCE:
@@ -192,7 +192,7 @@ def _expected_bits(weight: FloatArray, answers: FloatArray, utility_input: Utili
     return np.maximum(entropy_bits(given.weight_by_cell) - of_noise, 0.0)
 
 
-def _probability_of_knowing(
+def _probability_of_meeting_rule(
     lengths: FloatArray,
     weight: FloatArray,
     answers: FloatArray,

@@ -67,7 +67,7 @@ class HiddenShape:
     def of(
         cls, truth: Truth | None, members: Mapping[str, Shape], field: Field, *, rng: np.random.Generator
     ) -> HiddenShape:
-        """Build from a given truth, of the first member or of a named shape; if None, draw it.
+        """Build from given parameters, of the first member or as {shape: parameters}; if `truth` is None, draw a shape.
 
         Raises
         ------

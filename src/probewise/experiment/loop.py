@@ -50,7 +50,7 @@ from probewise.nested.importance import Weighted
 
 
 def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generator) -> ExplorationState:
-    """Return the state before the first reading: draws from the prior, and the pose that promises most by them.
+    """Return the state before the first reading: draws from the prior, and the pose with the largest utility.
 
     Parameters
     ----------

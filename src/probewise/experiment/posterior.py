@@ -302,7 +302,7 @@ def _sample_near_other_kinds(
     hopeless: float,
     rng: np.random.Generator,
 ) -> _SamplesNearOtherKinds:
-    """Sample a kind's posterior with what others believe: refits of it, or the samples themselves for a noise law.
+    """Sample a kind's posterior from samples of other kinds: by refits or, for a noise model, from these directly.
 
     No samples are drawn if the fits promise less than `hopeless`.
     """

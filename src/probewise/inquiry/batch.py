@@ -20,8 +20,8 @@ def choose_several(utility_input: UtilityInput, n: int, *, rng: np.random.Genera
     """Choose readings with large joint information, greedily one after another.
 
     Greedy on the joint information I(y_1 ... y_n) = I(y_1) + I(y_2 | y_1) + ..., within 1 - 1/e of the
-    best set (Nemhauser, Wolsey & Fisher 1978). The condition is averaged over simulated outcomes: each is a draw from
-    the predictive distribution, with its own posterior.
+    best set (Nemhauser, Wolsey & Fisher 1978). The conditional information is averaged over simulated
+    outcomes: each is a draw from the predictive distribution, with its own posterior.
 
     Parameters
     ----------

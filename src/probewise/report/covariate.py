@@ -70,8 +70,8 @@ def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
 def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
     """Return the covariate of each place in `diagnosis.where`, (n_points,), by the name of the place's figure.
 
-    Rows that a place does not cover are NaN. The values are those by which the diagnosis found the place. Computed
-    from another estimate of the sensor, a slope, for instance, could lie on the other side of an interval's end.
+    Rows that a place does not cover are NaN. The values are those by which the diagnosis found the place. If they
+    were recomputed from another estimate of the sensor, a slope near an interval's end could fall on its other side.
     """
     usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:

@@ -25,3 +25,6 @@ __all__ = [
     "truth_of",
     "write_system_case",
 ]
+
+Drawn = DrawnSystem
+"""The old name of `DrawnSystem`."""

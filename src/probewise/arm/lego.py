@@ -239,7 +239,10 @@ class LegoArm:
                 self._arrived[joint] = side
                 stopped.append(joint)
         self.rise()
-        goals = [Goal(0, side) for side in self._sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))]
+        goals = [
+            Goal(0, side)
+            for side in self._approach_sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))
+        ]
         self._turn_joint_to(BASE, goals[BASE])
         for joint in self._link_order(goals):
             self._turn_joint_to(joint, goals[joint])
@@ -293,10 +296,12 @@ class LegoArm:
     def _goals_at_angles(self, angles_rad: FloatArray) -> list[Goal]:
         return [
             Goal(joint.counts_at(float(angle), side), side)
-            for joint, angle, side in zip(self.geometry.joints, angles_rad, self._sides_of(angles_rad), strict=True)
+            for joint, angle, side in zip(
+                self.geometry.joints, angles_rad, self._approach_sides_of(angles_rad), strict=True
+            )
         ]
 
-    def _sides_of(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
+    def _approach_sides_of(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
         """Choose the direction from which each joint approaches these angles, (3,).
 
         The links approach a place from above, so that their weight and their motors take up the play in the same
@@ -332,7 +337,7 @@ class LegoArm:
     def _single_link_rise(self, joint: int) -> tuple[int, int, int] | None:
         """Find how one link alone can raise the sensor: counts to turn, joint, target count; None if it cannot."""
         mechanics, stand = self.geometry.joints[joint], self.angles_rad
-        up = mechanics.low_rad if self._sides_of(stand)[joint] > 0 else mechanics.high_rad
+        up = mechanics.low_rad if self._approach_sides_of(stand)[joint] > 0 else mechanics.high_rad
         angles = np.tile(stand, (N_TRIED, 1))
         angles[:, joint] = np.linspace(stand[joint], up, N_TRIED)
         high_enough = np.flatnonzero(self.geometry.position_mm(angles)[:, 2] >= self.geometry.travel_height_mm)

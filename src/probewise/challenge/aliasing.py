@@ -55,7 +55,7 @@ def cosines_with_vocabulary(
         effect = kind.for_extent(extent)
         if effect is None or effect.stage is Stage.NOISE:
             continue
-        templates, explained = _explained_by_entry(problem, found, effect, usable)
+        templates, explained = _templates_and_explained_squares(problem, found, effect, usable)
         best = int(np.argmax(explained))
         rho = float(np.sqrt(min(explained[best] / float(problem.residual @ problem.residual), 1.0)))
         if rho > _WORTH_A_REFIT:
@@ -94,7 +94,7 @@ def residual_with_one_named(
         effect = VOCABULARY[name].for_extent(Extent.of(clean))
         fits = [found]
         if effect is not None:
-            templates, explained = _explained_by_entry(problem, found, effect, usable)
+            templates, explained = _templates_and_explained_squares(problem, found, effect, usable)
             best = {
                 int(templates.choice[k]): int(k) for k in np.argsort(explained)
             }  # fits of each variant, the best last
@@ -104,7 +104,7 @@ def residual_with_one_named(
     return out
 
 
-def _explained_by_entry(
+def _templates_and_explained_squares(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
 ) -> tuple[EffectTemplates, FloatArray]:
     """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""

@@ -263,7 +263,7 @@ def _ratio_of_gains(gains: FloatArray) -> float:
 def _pair_rows(done: list[Result]) -> list[Row]:
     pairs = [r for r in done if r["kind"] == "pair"]
     both = [leading_name_right(r) for r in pairs]
-    shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_its_size(r)]
+    shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_size_beside_other(r)]
     more = [bool(count_extras(_named_effects_on_mean(r), effects_to_name(r, merged=True, noise=False))) for r in pairs]
     return [
         Row("two effects: both named", share(both), 0.95),
@@ -272,7 +272,7 @@ def _pair_rows(done: list[Result]) -> list[Row]:
     ]
 
 
-def _each_keeps_its_size(result: Result) -> bool:
+def _each_keeps_size_beside_other(result: Result) -> bool:
     """Return whether each of two effects keeps at least `_BESIDE` of its size when the other is in the model."""
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 

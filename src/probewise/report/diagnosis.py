@@ -399,7 +399,8 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
     rows = (
-        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value(p)) for p in noise.parameters
+        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value_and_interval(p))
+        for p in noise.parameters
     )
     return (
         paragraph(typeset(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")),
@@ -428,7 +429,7 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
             probability(effect.probability) if k == 0 else "",
             number(effect.size_lambda, 1) if k == 0 else "",
             p.name.removesuffix(f"_{p.unit}").replace("_", " "),
-            *(_value(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
+            *(_value_and_interval(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
         )
         for effect in effects
         for k, p in enumerate(effect.parameters)
@@ -442,7 +443,7 @@ def _words_and_name(name: str) -> str:
     return f"{said} ({name})" if said != name else name
 
 
-def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
+def _value_and_interval(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Write a parameter with its sd (and unit, if asked), and its interval."""
     low, high = found.interval95
     own = _unit_text(found) if unit else ""

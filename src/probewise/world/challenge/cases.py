@@ -166,7 +166,7 @@ def _draw_effects(
     """
 
     def of_size(name: str) -> HiddenEffect:
-        return _hidden_of_size(name, stratum.size, setup, sizer, rng)
+        return _effect_of_size(name, stratum.size, setup, sizer, rng)
 
     match stratum.kind:
         case "single":
@@ -189,7 +189,7 @@ def _draw_effects(
             return _ConcealedEffects((of_size(stratum.kind),))
 
 
-def _hidden_of_size(
+def _effect_of_size(
     name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
 ) -> HiddenEffect:
     sampler = INSIDE.get(name) or OUTSIDE[name]

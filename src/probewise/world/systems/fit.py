@@ -62,7 +62,7 @@ class Model:
         return [int(self.rows.run[own[0]]) for own in self.rows.by_run]
 
     @property
-    def n_nominal(self) -> int:
+    def n_nominal_coordinates(self) -> int:
         """Number of coordinates of the nominal model."""
         return len(self.kind.shared) + len(self.kind.per_run) * len(self._runs)
 
@@ -87,7 +87,7 @@ class Model:
     def effects(self, x: FloatArray) -> list[Placed]:
         """Return forms with their parameters at coordinates."""
         out: list[Placed] = []
-        n = self.n_nominal
+        n = self.n_nominal_coordinates
         for b in self.added:
             numbers: dict[str, FloatArray] = {name: np.full((len(x), 1), value) for name, value in b.start.items()}
             for name in b.free:
@@ -109,8 +109,8 @@ class Model:
         moves = [np.eye(len(x))[k] for k in range(n_shared)]
         for j in range(len(self.kind.per_run)):
             moves.append(np.isin(np.arange(len(x)), n_shared + j * n_runs + np.arange(n_runs)).astype(float))
-        moves += [np.eye(len(x))[k] for k in range(self.n_nominal, len(x))]
-        sizes = np.where([np.flatnonzero(m)[0] >= self.n_nominal for m in moves], 1.0, _STEP)
+        moves += [np.eye(len(x))[k] for k in range(self.n_nominal_coordinates, len(x))]
+        sizes = np.where([np.flatnonzero(m)[0] >= self.n_nominal_coordinates for m in moves], 1.0, _STEP)
         steps = np.array(moves) * sizes[:, None]
         found = self.predict(np.concatenate([x[None], x + steps, x - steps]))
         n = len(moves)
@@ -118,7 +118,7 @@ class Model:
         out = np.zeros((len(self.rows), len(x)))
         for move, slope in zip(moves, slopes, strict=True):
             columns = np.flatnonzero(move)
-            if len(columns) == 1 and not n_shared <= columns[0] < self.n_nominal:
+            if len(columns) == 1 and not n_shared <= columns[0] < self.n_nominal_coordinates:
                 out[:, columns[0]] = slope
             else:
                 for column, run in zip(columns, self._runs, strict=True):

@@ -163,7 +163,7 @@ class _Integration:
                 out[form.target] = out[form.target] + form.act(s, now, numbers)
         return out
 
-    def breaks(self, k: int) -> list[float]:
+    def discontinuity_shares(self, k: int) -> list[float]:
         """Return the shares of the gap from position k to the next with discontinuities, with 0 and 1."""
         here, there = self.places[k], self.places[k + 1]
         begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
@@ -202,7 +202,7 @@ class _Integration:
             p, now = at(share)
             return self.rates(dict(zip(names, y, strict=True)), p, now)
 
-        edges, begun = self.breaks(k), s
+        edges, begun = self.discontinuity_shares(k), s
         again = np.zeros(s.shape[1:], dtype=bool)
         for low, high in _intervals_between(edges):
             # Slightly inside: a discontinuity at an end belongs to the other side.
@@ -298,7 +298,7 @@ class _Integration:
             found = self.rates(dict(zip(names, y, strict=True)), p, now)
             return {name: float(np.ravel(v)[0]) for name, v in found.items()}
 
-        edges = self.breaks(k)
+        edges = self.discontinuity_shares(k)
         for low, high in _intervals_between(edges):
             share, forced = low, dict[int, int]()
             for _ in range(_MOST_EVENTS):

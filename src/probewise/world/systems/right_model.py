@@ -35,7 +35,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     x = fitted.coordinates + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
     for k, name in enumerate(name for b in beside for name in b.free):
         if name == "tau_s" and kind.law is not None:
-            x[:, model.n_nominal + k] = _rounded_to_quantiles(x[:, model.n_nominal + k])
+            x[:, model.n_nominal_coordinates + k] = _rounded_to_quantiles(x[:, model.n_nominal_coordinates + k])
     later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
     ahead = Model(kind, later, beside)
     n_shared = len(kind.shared)
@@ -50,7 +50,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
         )
         for name in kind.per_run
     ]
-    parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
+    parts = [x[:, :n_shared], *own, x[:, model.n_nominal_coordinates :]]
     there = np.concatenate(parts, axis=1)
     effects = [
         (form, _numbers_of_unseen_run(numbers, b.free))

@@ -87,7 +87,7 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
 
 
 def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
-    """Build the shape named in the first line, from those of the command line."""
+    """Build the shape that the journal's first line names; it must be one that `explore` offers, or a set of these."""
     from probewise.experiment import shape_named
     from probewise.scene import SHAPES, Field
 

@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 class _Listener:
-    """Executes commands typed at the emulator: a scene, `turn DEGREES`, `where`; reports a sensor in the table."""
+    """Executes typed commands (a scene, `turn DEGREES`, `where`); warns if the sensor is below the table top."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None

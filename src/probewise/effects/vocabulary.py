@@ -185,7 +185,7 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
         return None
 
     def change(self, predicted: FloatArray) -> FloatArray:
-        """Return its change of readings predicted without it, same shape; zeros unless it `changes_the_mean`."""
+        """Return by how much it changes readings predicted without it, same shape; 0 unless it `changes_the_mean`."""
         return np.zeros_like(predicted)
 
     def bank(self) -> FloatArray:

@@ -67,7 +67,7 @@ class OneScan:
             )
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,); see `inference.StudentT`."""
+        """Return the log likelihood of each hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         one = np.zeros(readings.size, dtype=np.int64)
         return StudentT(one, self.sd_floor, self.sd_ceiling).log_prob(readings, predicted)
 

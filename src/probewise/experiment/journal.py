@@ -353,7 +353,7 @@ class JournalWriter:
         self._write_to_disk(json.dumps(line, allow_nan=False)[:-1])
 
     def write_summary(self, summary: PosteriorSummary) -> None:
-        """Write the summary after that reading, the rest of its line."""
+        """Write the summary after the last reading written: the rest of its line."""
         line = {
             "mean": dict(summary.mean),
             "sd": dict(summary.sd),

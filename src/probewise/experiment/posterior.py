@@ -269,8 +269,8 @@ def _with_rivals_sampled_again(
         n = max(len(own.ancestor), _n_samples_of_kind(kind, 0.0, n_particles))
         anew = _sample_near_other_kinds(kind, problem, own.weighted, donors, n, hopeless, rng)
         found = anew.samples
-        if anew.promised < hopeless:
-            particles[k] = replace(own, log_z_limit=max(anew.promised, own.log_z) + _RULED_OUT)
+        if anew.highest_log_z < hopeless:
+            particles[k] = replace(own, log_z_limit=max(anew.highest_log_z, own.log_z) + _RULED_OUT)
             continue
         if found is None or found.n_eff < _FEWEST:
             particles[k] = replace(own, strained=own.strained or own.hurried)
@@ -287,10 +287,10 @@ def _with_rivals_sampled_again(
 
 @dataclass(frozen=True, eq=False)
 class _SamplesNearOtherKinds:
-    """Samples of a kind, None if none was found, and the log evidence that fits promise, infinite without fits."""
+    """Samples of a kind, None if none was found, and the largest log evidence by fits, infinite without fits."""
 
     samples: Weighted | None
-    promised: float = math.inf
+    highest_log_z: float = math.inf
 
 
 def _sample_near_other_kinds(
@@ -304,7 +304,7 @@ def _sample_near_other_kinds(
 ) -> _SamplesNearOtherKinds:
     """Sample a kind's posterior from samples of other kinds: by refits or, for a noise model, from these directly.
 
-    No samples are drawn if the fits promise less than `hopeless`.
+    No samples are drawn if the largest log evidence by fits is below `hopeless`.
     """
     noise = declared_noise(kind.likelihood)
     if kind.effect is not None:

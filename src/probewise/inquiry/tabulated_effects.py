@@ -18,7 +18,7 @@ from probewise.sensor.stages import SensorModel, Stage, View
 
 @dataclass(frozen=True, eq=False)
 class TabulatedChain:
-    """A chain over one disc whose effects change neither the disc nor, but for what the table holds, the footprint."""
+    """A chain over one disc. No effect changes the disc; effects on the footprint must be those of the table."""
 
     chain: Chain
     table: DiscTable

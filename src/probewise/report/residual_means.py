@@ -34,7 +34,7 @@ class ResidualMeans:
 
     @property
     def largest_in_sds(self) -> float:
-        """Largest absolute mean of the calibrated model's residuals, in sds of that mean by chance."""
+        """Largest absolute mean of the calibrated model's residuals, in sds of that mean under chance."""
         return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
 
 

@@ -34,7 +34,7 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
 
 
 def owners_file(case: SystemCase) -> str:
-    """Return the text of the owner's file."""
+    """Return the text of simulator.py: the nominal simulator as its owner would hand it in."""
     return case.drawn.kind.text.replace("{noise}\n", f"{case.noise_text}\n" if case.noise_text else "")
 
 

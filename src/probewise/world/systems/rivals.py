@@ -28,7 +28,7 @@ _NEUTRAL = {"level": np.inf, "period": 1.0}
 
 
 def short_name(form: Form) -> str:
-    """Return the name in the vocabulary, where a saturation from below has no name of its own."""
+    """Return the vocabulary's name of a form: a saturation from below is `saturation` too."""
     return form.name.removesuffix(" (floor)")
 
 

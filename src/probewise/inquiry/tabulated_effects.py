@@ -49,5 +49,5 @@ class TabulatedChain:
         level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
         seen = (level - table.dark) / (table.bright - table.dark)
         if self.cards is not None:
-            seen = seen_with_cards(seen, self.cards.cards, self.cards.share_on_cards(poses, plan))
-        return self.chain.read(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)
+            seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.share_on_cards(poses, plan))
+        return self.chain.readings_of_view(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)

@@ -47,7 +47,7 @@ class SearchState:
     progress
         Progress function.
     is_over
-        Function that returns whether a share of the budget of refits is spent.
+        Function that returns whether a share of this search's budget of refits is spent.
     share
         Share of it that may be spent by now.
     """

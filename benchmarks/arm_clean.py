@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from probewise.arm import LegoScale, carry_out, read_geometry, recording_of, shipped_geometry
+from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of, shipped_geometry
 from probewise.cli._bench import Bench
 from probewise.cli._plans import for_lego_arm
 from probewise.diagnosis import diagnose
@@ -32,12 +32,14 @@ def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.nda
     geometry = read_geometry(file)
     plan = for_lego_arm(paper_plan(), geometry)
     origin_mm = (524 + 0.37 * seed, 260 + 0.61 * seed)
-    bench = Bench(truth("paper"), "600,250,80", scale=LegoScale(), seed=seed)
-    arm = bench.emulated(geometry, file)
+    bench = Bench(truth("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
+    arm = bench.open_emulated_arm(geometry, file)
     stands, read = [], arm.read_here
     arm.read_here = lambda: (stands.append(bench._stand()), read())[1]  # type: ignore[method-assign,misc]
     with arm:
-        readings = list(carry_out(arm, plan, origin_mm=origin_mm, ask=partial(bench.lay, plan.patterns, origin_mm)))
+        readings = list(
+            carry_out(arm, plan, origin_mm=origin_mm, ask=partial(bench.carry_out_request, plan.patterns, origin_mm))
+        )
     found = recording_of(plan, readings)
     off = np.array(
         [

@@ -27,7 +27,7 @@ from tqdm import tqdm
 from probewise.arm import LegoArm, Pose, Reading, read_geometry, shipped_geometry
 from probewise.arm.nxt import Brick, BrickMachine, Link, Timing
 from probewise.calibration import FittedSensor
-from probewise.emulator import Bench, Faults, SensorPose, VirtualClock, VirtualLine, set_up
+from probewise.emulator import Bench, Faults, SensorPose, VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
 from probewise.experiment import Experiment, Step, experiment_for, explore, read_journal, world_like
@@ -198,7 +198,9 @@ def bench_with(faults: Faults, clock: VirtualClock, *, seed: int) -> tuple[Bench
     """Set up the arm over the circle, and the brick's record."""
     log = BrickLog()
     circle = Disc(TRUTH[:2], TRUTH[2])
-    log.bench = set_up(read_numbers(shipped_geometry()), WORLD, circle, clock, seed=seed, faults=faults, trace=log)
+    log.bench = set_up_bench(
+        read_numbers(shipped_geometry()), WORLD, circle, clock, seed=seed, faults=faults, trace=log
+    )
     return log.bench, log
 
 

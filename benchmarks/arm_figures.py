@@ -18,7 +18,7 @@ import numpy as np
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
 from probewise.arm.geometry import JOINTS
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.emulator import VirtualClock, VirtualLine, set_up
+from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.recordings import Disc
 from probewise.world.shipped import truth
@@ -38,7 +38,7 @@ class AnySide(BrickMachine):
 def run(machine_type: type[BrickMachine], places_mm: np.ndarray, *, seed: int) -> dict[str, float]:
     """Measure at every place; return means over the measurements, errors as root mean squares."""
     clock = VirtualClock()
-    bench = set_up(read_numbers(shipped_geometry()), truth("paper"), Disc((524.0, 260.0), 80.0), clock, seed=seed)
+    bench = set_up_bench(read_numbers(shipped_geometry()), truth("paper"), Disc((524.0, 260.0), 80.0), clock, seed=seed)
     geometry = read_geometry(shipped_geometry())
     if machine_type is AnySide:
         rigid = {name: replace(joint, play_rad=0.0) for name, joint in zip(JOINTS, geometry.joints, strict=True)}
@@ -86,7 +86,7 @@ def main() -> None:
     rng = np.random.default_rng(arguments.seed)
     geometry = read_geometry(shipped_geometry())
     anywhere = rng.uniform((0.0, 0.0), geometry.field_mm, (20 * arguments.readings, 2))
-    places = anywhere[geometry.holds(anywhere)][: arguments.readings]
+    places = anywhere[geometry.contains(anywhere)][: arguments.readings]
     line = np.column_stack([np.linspace(474.0, 574.0, arguments.readings), np.full(arguments.readings, 260.0)])
     figures = {
         "seed": arguments.seed,

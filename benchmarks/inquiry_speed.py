@@ -30,8 +30,8 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.experiment import ArmOverGrid, Experiment, Step, explore
-from probewise.experiment.acquisition import inquire
-from probewise.experiment.method import from_scratch
+from probewise.experiment.acquisition import predict_and_rate_readings
+from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.particles import Particles, update
 from probewise.inquiry import Grid
 from probewise.scene import SHAPES, HypothesisScene
@@ -62,13 +62,13 @@ def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str
     """Run once, and time every step again by itself."""
     rows = []
     with arm:
-        field = ArmOverGrid.under(arm, experiment.grid)
+        field = ArmOverGrid.of(arm, experiment.grid)
         steps = list(explore(arm, experiment, rng=np.random.default_rng(run)))
     for number, (before, after) in enumerate(pairwise(steps)):
         problem = experiment.problem([step.reading for step in steps[: number + 2]])
         rng = np.random.default_rng([run, number])
-        scratch = partial(from_scratch, problem, experiment, rng)
-        ask = partial(inquire, experiment, after.posterior, field, at=after.reading, rng=rng)
+        scratch = partial(nested_sampling_from_scratch, problem, experiment, rng)
+        ask = partial(predict_and_rate_readings, experiment, after.posterior, field, at=after.reading, rng=rng)
         before_it = Particles(before.posterior, np.arange(len(before.posterior.theta)))
         infer = partial(update, before_it, problem, rng=rng, fall_back=scratch)
         row = {"map_s": seconds(ask), "inference_s": seconds(infer)}

@@ -67,7 +67,7 @@ def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
     one = default_sensor(extent, 1)
     found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law)
     if free_form:
-        wanted = FreeForm.about(one)
+        wanted = FreeForm.from_one_gaussian(one)
         starts = wanted.start_from(found.z)
     else:
         wanted = default_sensor(extent, 2)

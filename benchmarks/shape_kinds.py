@@ -20,7 +20,7 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.errors import DoubtfulResultWarning
-from probewise.experiment import Experiment, Hidden, Streams, explore, members_of, shape_named
+from probewise.experiment import Experiment, HiddenShape, RandomStreams, explore, members_of, shape_named
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.nested import refine
@@ -60,8 +60,8 @@ def follow(number: int) -> dict:
     """Run once, and weigh the kinds again at some readings."""
     field = Field()
     experiment = experiment_of(field)
-    streams = Streams.of(np.random.default_rng(number))
-    hidden = Hidden.of(None, members_of(experiment.shape), field, rng=streams.truth)
+    streams = RandomStreams.of(np.random.default_rng(number))
+    hidden = HiddenShape.of(None, members_of(experiment.shape), field, rng=streams.truth)
     spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.2)])
     world = World(spot, black=10.0, white=60.0, noise_sd=1.0)
     noise = np.random.default_rng(streams.noise)

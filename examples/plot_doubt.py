@@ -66,5 +66,5 @@ for ax, (trust, (experiment, found)) in zip(axes, runs.items(), strict=True):
 # What the second robot believes about its sensor, reading by reading.
 _, doubting = runs[0.9]
 beliefs = [left_out_of(step, 0.9).probability for step in doubting.steps]
-plots.belief_in_the_sensor(beliefs)
+plots.effect_probabilities_by_reading(beliefs)
 plt.show()

@@ -13,8 +13,8 @@ import numpy as np
 from probewise import nested
 from probewise.priors import Uniform
 from probewise.recordings import paper_plan
-from probewise.sensor import FixedMixture, Poses, field_of, seen_discrete
-from probewise.sensor.gaussian import seen
+from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels
+from probewise.sensor.gaussian import mean_albedo_under_gaussians
 from probewise.systems import Noise, RunTable, Simulator, System, read_simulator
 from probewise.systems.forms import About
 from probewise.world.systems import draw_system
@@ -55,8 +55,10 @@ def test_a_region_with_its_closed_form():
     ssf = FixedMixture([1.0], [[0.0, 0.0]], [np.array([[16.0, 3.0], [3.0, 9.0]])])
     field = field_of(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
     x, y = np.array([[-6.0, 0.0, 2.0, 12.0]]), np.array([[3.0, -2.0, 8.0, 4.0]])
-    closed = seen(region, x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0)))
-    by_pixels = seen_discrete(region, field, Poses(x, y, np.zeros((1, 4))))
+    closed = mean_albedo_under_gaussians(
+        region, x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0))
+    )
+    by_pixels = mean_albedo_by_pixels(region, field, Poses(x, y, np.zeros((1, 4))))
     np.testing.assert_allclose(closed[:, :, 0], by_pixels, atol=2.5e-4)
 
 

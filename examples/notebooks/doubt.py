@@ -59,13 +59,13 @@ for ax, name, found in zip(axes[0], ("trust 1", "trust 0.9"), (trusting, doubtin
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
     title = f"{name}, after {len(places)} readings"
     exploration.view(found.last, found.experiment, places, levels=(10.0, 60.0), truth_mm=outline_mm, title=title, ax=ax)
-plots.explain_field(axes)
+plots.field_legend(axes)
 
 # %%
 # What the second robot believes about its sensor after each reading. A dashed line marks a reading that changed the
 # most probable effect.
 beliefs = [left_out_of(step, 0.9).probability for step in doubting.steps]
-plots.belief_in_the_sensor(beliefs)
+plots.effect_probabilities_by_reading(beliefs)
 
 # %%
 # The same in a sentence, with the size of the effect.

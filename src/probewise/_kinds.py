@@ -79,7 +79,7 @@ def require_one_of(name: str, value: object, known: Sequence[str]) -> None:
     raise ParameterError(name, value, listed + did_you_mean(value, known))
 
 
-def radians_meant(name: str, values: float | NDArray[np.float64]) -> None:
+def warn_of_likely_degrees(name: str, values: float | NDArray[np.float64]) -> None:
     """Warn of angles (radians) beyond a full turn either way, which somebody may have given in degrees."""
     widest = abs(values) if isinstance(values, float) else float(np.abs(values).max(initial=0.0))
     if _FULL_TURN_RAD < widest < math.inf:
@@ -130,12 +130,12 @@ def require_callable(name: str, value: object, allowed: str) -> None:
         raise ParameterError(name, value, allowed)
 
 
-def require_takes(name: str, value: object, arguments: Sequence[str], allowed: str) -> None:
+def require_accepts_named(name: str, value: object, arguments: Sequence[str], allowed: str) -> None:
     """Raise ParameterError unless `value` can be called with these arguments, by their names."""
     _require_accepts_call(name, value, f"{allowed} {name}({', '.join(arguments)})", (), dict.fromkeys(arguments))
 
 
-def require_takes_places(name: str, value: object, n_arguments: int, allowed: str) -> None:
+def require_accepts_positional(name: str, value: object, n_arguments: int, allowed: str) -> None:
     """Raise ParameterError unless `value` can be called with `n_arguments` arguments by position."""
     _require_accepts_call(name, value, allowed, (None,) * n_arguments, {})
 
@@ -155,7 +155,7 @@ def _require_accepts_call(
 
 def require_progress(value: object, allowed: str = "a function") -> None:
     """Raise ParameterError unless `value` takes what a `Progress` is called with."""
-    require_takes("progress", value, ("stage", "done", "total", "note"), allowed)
+    require_accepts_named("progress", value, ("stage", "done", "total", "note"), allowed)
 
 
 def require_text(name: str, value: object, allowed: str = "a text") -> str:

@@ -71,7 +71,7 @@ def require_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
     return samples, noise_sd
 
 
-def require_absent(absent: Mapping[str, BoolArray], effects: tuple[str, ...], n_samples: int) -> None:
+def require_masks_of_absent_effects(absent: Mapping[str, BoolArray], effects: tuple[str, ...], n_samples: int) -> None:
     """Raise ParameterError unless `absent` holds truth values, (n_samples,), by names of the model's effects."""
     for name, without in absent.items():
         if name not in effects or without.shape != (n_samples,):

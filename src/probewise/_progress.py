@@ -16,7 +16,7 @@ from probewise.nested import RoundSummary
 from probewise.progress import Progress, silent
 
 if TYPE_CHECKING:
-    from probewise.calibration import Rung
+    from probewise.calibration import TemperatureSummary
 
 _PATIENCE_S = 2.0  # shorter work shows no bar
 _BETWEEN_LINES_S = 5.0
@@ -48,7 +48,7 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
 
     def keep_beating() -> None:
         while not stopped.wait(_BEAT_S):
-            shown.beat()
+            shown.refresh()
 
     heart = threading.Thread(target=keep_beating, daemon=True)
     if beat:
@@ -81,10 +81,10 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
         yield progress
 
 
-def nested_progress(progress: Progress) -> Callable[[int | str, RoundSummary | Rung], None]:
-    """Adapt a progress function to reports of nested sampling and climbs, each by its name or number of Gaussians."""
+def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary | TemperatureSummary], None]:
+    """Adapt a progress function to reports of nested sampling and SMC runs, by a name or a number of Gaussians."""
 
-    def tell(what: int | str, state: RoundSummary | Rung) -> None:
+    def tell(what: int | str, state: RoundSummary | TemperatureSummary) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
         if not isinstance(state, RoundSummary):
             progress(stage, note=f"temperature {state.temperature:.3f} of 1, ln Z {state.log_z:.1f}")
@@ -122,7 +122,7 @@ class _Bars:
             self._now = _LastReport(stage, done, total, note)
             self._update_bar()
 
-    def beat(self) -> None:
+    def refresh(self) -> None:
         """Update the elapsed time."""
         with self._lock:
             self._update_bar()
@@ -163,9 +163,9 @@ class _TextProgress:
 
     def __call__(self, stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
         self._now = _LastReport(stage, done, total, note)
-        self.beat()
+        self.refresh()
 
-    def beat(self) -> None:
+    def refresh(self) -> None:
         """Write a line if it is time for one."""
         now = time.monotonic()
         wait = max(_BETWEEN_LINES_S, _SHARE_OF_ALL * (now - self._began)) if self._said else _PATIENCE_S

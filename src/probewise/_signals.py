@@ -18,7 +18,7 @@ SAME_S: Final = 1.0
 
 
 @contextlib.contextmanager
-def deferred() -> Iterator[None]:
+def defer_signals() -> Iterator[None]:
     """Defer signals that end the program until the block ends; a repeated signal acts at once.
 
     For blocks that must not be interrupted: stopping motors, putting files in place. Outside the main

@@ -18,10 +18,10 @@ from typing import Any, Self, TypeVar
 
 from probewise.errors import FileError, NotConvergedError, ParameterError, shown
 from probewise.progress import Progress, silent
-from probewise.recordings import json_of, locked, read_bytes, write_text_atomically
+from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
 from probewise.recordings.atomic import write_to_disk
 
-__all__ = ["FORMAT", "Finished", "read_campaign", "run_campaign"]
+__all__ = ["FORMAT", "CampaignContents", "Finished", "read_campaign", "run_campaign"]
 
 FORMAT = "campaign/1"
 T = TypeVar("T")
@@ -29,11 +29,14 @@ Result = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Finished:
+class CampaignContents:
     """Contents of a campaign's file: its settings, and the results by key in order of completion."""
 
     settings: Mapping[str, Any]
     results: Mapping[str, Result]
+
+
+Finished = CampaignContents  # its earlier name
 
 
 def run_campaign(
@@ -78,13 +81,16 @@ def run_campaign(
     """
     path = Path(path)
     wanted = json.loads(json.dumps(dict(settings)))
-    with locked(path):
+    with hold_lock(path):
         before = read_campaign(path) if path.exists() else None
         if before is not None and before.settings != wanted:
             raise FileError(path, "it belongs to a campaign with other settings", f"{wanted}; or another file")
         done = {} if before is None else {key: before.results[key] for key in tasks if key in before.results}
         left = {key: task for key, task in tasks.items() if key not in done}
-        with _ResultLog(path, wanted, fresh=before is None) as lines, _ended_tasks(work, left, executor) as ended:
+        with (
+            _ResultLog(path, wanted, fresh=before is None) as lines,
+            _results_as_tasks_end(work, left, executor) as ended,
+        ):
             progress(noun, len(done), len(tasks))
             for key, result in ended:
                 line = json.loads(lines.add(key, result))  # as a later reader will see it
@@ -93,7 +99,7 @@ def run_campaign(
     return {key: done[key] for key in tasks}
 
 
-def read_campaign(path: str | os.PathLike[str]) -> Finished:
+def read_campaign(path: str | os.PathLike[str]) -> CampaignContents:
     """Read a campaign's file; an incomplete last line is ignored.
 
     Raises
@@ -114,11 +120,11 @@ def read_campaign(path: str | os.PathLike[str]) -> Finished:
         if key in results:
             raise FileError(path, f"task {shown(key)} a second time", "every task once", row=number)
         results[key] = result
-    return Finished(rows[0]["settings"], results)
+    return CampaignContents(rows[0]["settings"], results)
 
 
 def _parsed_line(path: str | os.PathLike[str], number: int, line: bytes) -> dict[str, Any]:
-    row = json_of(path, line, "one JSON object per line", row=number)
+    row = parse_json_file_text(path, line, "one JSON object per line", row=number)
     if not isinstance(row, dict):
         raise FileError(path, "not an object", "one JSON object per line", row=number)
     return row
@@ -154,7 +160,7 @@ class _ResultLog:
 
 
 @contextlib.contextmanager
-def _ended_tasks(
+def _results_as_tasks_end(
     work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
 ) -> Iterator[Iterator[tuple[str, Result]]]:
     """Yield (key, result) as tasks end; on leaving, cancel the tasks that have not begun."""
@@ -163,13 +169,13 @@ def _ended_tasks(
         return
     futures: dict[Future[Result], str] = {executor.submit(work, task): key for key, task in tasks.items()}
     try:
-        yield ((futures[future], _result_of(future)) for future in as_completed(futures))
+        yield ((futures[future], _result_of_future(future)) for future in as_completed(futures))
     finally:
         for future in futures:
             future.cancel()
 
 
-def _result_of(future: Future[Result]) -> Result:
+def _result_of_future(future: Future[Result]) -> Result:
     """Return a task's result; raise NotConvergedError if its worker died."""
     try:
         return future.result()

@@ -79,7 +79,7 @@ def calibrate(
     method
         "quick" (the default): widths evenly probable over orders of magnitude; each number of Gaussians is reached by
         sequential Monte Carlo, from the peak of its likelihood or from the number below. One search of the whole prior
-        with few live points vouches for the chosen number; what is doubtful is searched in full.
+        with few live points checks the chosen number; a number in doubt is searched in full.
         "full": the same priors; every number is searched by nested sampling, and its evidence refined by importance
         sampling. Takes two to ten times as long. "refined" is its former name.
         "paper": uniform priors, and the evidence of nested sampling alone. All have the Student-t likelihood.
@@ -116,7 +116,7 @@ def calibrate(
     1
     """
     from probewise import calibration
-    from probewise._progress import nested_progress, progress_or_bar
+    from probewise._progress import progress_or_bar, sampler_progress
     from probewise.errors import ParameterError
     from probewise.nested import NESTED_STOP
 
@@ -136,7 +136,7 @@ def calibrate(
             stop=NESTED_STOP[nested_stop or "change"] if paper else None,
             refined=not paper,
             rng=rng,
-            progress=nested_progress(told),
+            progress=sampler_progress(told),
         )
 
 
@@ -310,9 +310,9 @@ def explore(
     require_sensor(sensor, "in the order explore(sensor, ...)")
     require_flag("learn_sensor", learn_sensor)
     lies = posing.shape_of(shape, field)
-    streams, hidden = posing.Streams.of(rng), None
+    streams, hidden = posing.RandomStreams.of(rng), None
     naive = _naive_levels(sensor, levels, method=method, model=model, has_arm=arm is not None, rng=streams.levels)
-    asked = posing.pose_experiment(
+    asked = posing.experiment_from_names(
         sensor,
         lies,
         field,
@@ -333,10 +333,10 @@ def explore(
         asked = replace(asked, fitted_arm=posing.FittedArm.of(arm.geometry, sensor))
     path = None if journal is None else require_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
-    about = {**posing.sensor_named(sensor), "arm": "simulated" if arm is None else type(arm).__name__}
+    about = {**posing.sensor_entry(sensor), "arm": "simulated" if arm is None else type(arm).__name__}
     taken = () if before is None else before.readings
     if arm is None:
-        hidden = posing.Hidden.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
+        hidden = posing.HiddenShape.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
         world, scale = posing.world_like(sensor), posing.scale_of(sensor.instrumentation)
         arm = posing.arm_over(
             world, posing.with_cards(hidden.surface, asked.cards), field, seed=streams.noise, taken=taken, scale=scale
@@ -381,10 +381,10 @@ def _naive_levels(
         allowed = "a recording with readings over black and over white" if wanted else "None"
         raise ParameterError("levels", levels, f'{allowed} with the method "{method}" and the model "{model}"')
     if levels is not None:
-        return posing.levels_from(levels, sensor)
+        return posing.naive_levels_from_recording(levels, sensor)
     if not wanted:
         return None
-    return posing.levels_in(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
+    return posing.naive_levels_from_world(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
 
 
 def audit(plan: Plan | Recording, *, sensor: FittedSensor | None = None, progress: bool | Progress = True) -> PlanAudit:

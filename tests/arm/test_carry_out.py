@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import LegoArm, Pose, Reading, Rehearsal, carry_out, read_geometry, recording_of, shipped_geometry
+from probewise.arm import DryRun, LegoArm, Pose, Reading, carry_out, read_geometry, recording_of, shipped_geometry
 from probewise.errors import ParameterError, ReachError
 from probewise.recordings import paper_plan, read_recording, two_way_plan, write_recording
 
@@ -19,7 +19,7 @@ class Told:
 
     def __init__(self):
         self.asked = []
-        self.arm = LegoArm(Rehearsal(GEOMETRY, lambda text: None), GEOMETRY)
+        self.arm = LegoArm(DryRun(GEOMETRY, lambda text: None), GEOMETRY)
 
     def take(self, plan, **options):
         with self.arm:

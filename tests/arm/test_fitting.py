@@ -10,7 +10,7 @@ from probewise.arm import read_geometry, shipped_geometry
 from probewise.arm.fitting import MarksDisagreeError, fit_geometry
 from probewise.arm.geometry_file import with_fitted
 from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
-from probewise.arm.marks import marks_of
+from probewise.arm.marks import places_of_marks
 from probewise.errors import FileError, ParameterError, ShapeError
 
 GEOMETRY = read_geometry(shipped_geometry())
@@ -38,7 +38,7 @@ def homes(geometry):
 
 
 def touched(true, *, noise_mm=0.0, rng=None, marks=None):
-    marks = marks_of(GEOMETRY) if marks is None else marks
+    marks = places_of_marks(GEOMETRY) if marks is None else marks
     turned = true.angles_rad(marks, BLOCK_MM) - homes(true)
     places = np.column_stack([marks, np.full(len(marks), BLOCK_MM)])
     if noise_mm:
@@ -49,7 +49,7 @@ def touched(true, *, noise_mm=0.0, rng=None, marks=None):
 def errors_mm(fitted, true):
     """Where the sensor really is, less where it is sent, all over the field: (n, 3)."""
     places = GEOMETRY.places_over_field_mm
-    places = places[fitted.holds(places)]
+    places = places[fitted.contains(places)]
     angles = fitted.angles_rad(places, GEOMETRY.read_height_mm) - homes(fitted) + homes(true)
     return true.position_mm(angles) - np.column_stack([places, np.full(len(places), GEOMETRY.read_height_mm)])
 
@@ -126,7 +126,7 @@ def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
     (tmp_path / "arm.toml").write_text(with_fitted(text, fitted), encoding="utf-8")
     back = read_geometry(tmp_path / "arm.toml")
     assert "# shoulder to elbow" in (tmp_path / "arm.toml").read_text(encoding="utf-8")
-    assert back.accuracy.marks == len(marks_of(GEOMETRY))
+    assert back.accuracy.marks == len(places_of_marks(GEOMETRY))
     np.testing.assert_allclose(homes(back), homes(fitted), atol=1e-6)
     np.testing.assert_allclose(
         [*back.links_mm, *back.axis_mm, *back.shoulder_mm],

@@ -82,12 +82,12 @@ def test_what_cannot_be_reached_is_nan_in_its_row_only():
     places = np.array([[524.0, 200.0], [524.0, 579.0], [-400.0, 0.0], [np.nan, 1.0]])
     angles = SHIPPED.angles_rad(places, 14.0)
     np.testing.assert_array_equal(np.isnan(angles).all(axis=-1), [False, True, True, True])
-    np.testing.assert_array_equal(SHIPPED.holds(places), [True, False, False, False])
+    np.testing.assert_array_equal(SHIPPED.contains(places), [True, False, False, False])
 
 
 def test_the_shipped_arm_holds_nearly_the_whole_field_and_nothing_off_it():
-    assert 0.95 < SHIPPED.holds(GRID).mean() < 1.0
-    assert not SHIPPED.holds(np.array([[524.0, 521.0], [-1.0, 300.0], [1049.0, 300.0]])).any()
+    assert 0.95 < SHIPPED.contains(GRID).mean() < 1.0
+    assert not SHIPPED.contains(np.array([[524.0, 521.0], [-1.0, 300.0], [1049.0, 300.0]])).any()
     assert "126 to 755 mm from the arm's axis at (524, 580) mm" in SHIPPED.sentence()
 
 
@@ -123,7 +123,7 @@ def test_the_play_lies_behind_the_motor():
 
 def test_rows_must_have_the_right_length():
     with pytest.raises(ShapeError, match=r"allowed: \(n, 2\)"):
-        SHIPPED.holds(np.zeros(2))
+        SHIPPED.contains(np.zeros(2))
     with pytest.raises(ShapeError, match=r"allowed: \(n, 3\)"):
         SHIPPED.position_mm(np.zeros((4, 2)))
 

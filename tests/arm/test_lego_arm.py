@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from probewise.arm import (
+    DryRun,
     Geometry,
     Instrument,
     LegoArm,
     Pose,
-    Rehearsal,
     SimulatedArm,
     SoftLimits,
     read_geometry,
@@ -113,7 +113,7 @@ def test_every_place_that_the_arm_holds_can_be_taken(bench):
     rng = np.random.default_rng(3)
     places = rng.uniform((0, 0), (1048, 520), (200, 2))
     with bench.arm as arm:
-        for x_mm, y_mm in places[bench.geometry.holds(places)]:
+        for x_mm, y_mm in places[bench.geometry.contains(places)]:
             arm.measure(bench.pose(float(x_mm), float(y_mm)))
             assert bench.sensor_mm[2] > bench.geometry.lowest_mm
 
@@ -189,7 +189,7 @@ def test_a_rehearsal_of_homing_goes_to_the_stops_first():
         SHIPPED, **{n: dataclasses.replace(getattr(SHIPPED, n), stop_rad=math.radians(a)) for n, a in stops.items()}
     )
     said = []
-    with LegoArm(Rehearsal(geometry, said.append), geometry) as arm:
+    with LegoArm(DryRun(geometry, said.append), geometry) as arm:
         arm.home()
     assert [line.split()[:4] for line in said[:3]] == [
         ["elbow", "up", "to", "its"],
@@ -315,7 +315,7 @@ def test_the_guard_lets_a_joint_that_is_outside_come_back():
 
 def test_a_rehearsal_says_the_moves_and_makes_none():
     said = []
-    arm: Instrument = LegoArm(Rehearsal(SHIPPED, said.append), SHIPPED)
+    arm: Instrument = LegoArm(DryRun(SHIPPED, said.append), SHIPPED)
     with arm:
         reading = arm.measure(Pose(300.0, 200.0, float(arm.orientation_rad(np.array([[300.0, 200.0]]))[0])))
     assert math.isnan(reading.value)
@@ -338,7 +338,7 @@ def test_a_simulated_arm_takes_the_geometry_of_a_real_one():
     """Same reach, same orientation: a run on either asks for the same places."""
     arm = SimulatedArm(lambda pose, time_s, height_mm: 50.0, reach=SHIPPED)
     places = np.array(PLACES)
-    np.testing.assert_array_equal(arm.reachable(places), SHIPPED.holds(places))
+    np.testing.assert_array_equal(arm.reachable(places), SHIPPED.contains(places))
     np.testing.assert_array_equal(arm.orientation_rad(places), SHIPPED.orientation_rad(places))
     assert arm.measure(Pose(*PLACES[0])).value == 50
     with pytest.raises(ReachError, match="126 to 755 mm"):

@@ -7,10 +7,10 @@ import pytest
 
 from probewise.arm import (
     Instrument,
-    LegoScale,
     Pose,
     Reach,
     Reading,
+    ReadingScale,
     SimulatedArm,
     Speed,
     read_geometry,
@@ -28,7 +28,7 @@ def flat(value):
 
 def test_the_arm_reaches_all_but_the_two_far_corners_and_what_is_too_near():
     """Paper, Fig. entropy-map: dark jagged edges at the bottom, where the arm does not reach."""
-    held = Reach().holds(GRID)
+    held = Reach().contains(GRID)
     assert 0.95 < held.mean() < 0.99
     missed = GRID[~held]
     far, near = missed[missed[:, 1] < 260], missed[missed[:, 1] >= 260]
@@ -42,12 +42,12 @@ def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
     shipped, ring = read_geometry(shipped_geometry()), Reach()
     away = np.hypot(*(GRID - ring.axis_mm).T)
     apart = (abs(away - ring.nearest_mm) > 1) & (abs(away - ring.farthest_mm) > 1)
-    np.testing.assert_array_equal(ring.holds(GRID[apart]), shipped.holds(GRID[apart]))
+    np.testing.assert_array_equal(ring.contains(GRID[apart]), shipped.contains(GRID[apart]))
     assert shipped.sentence().startswith(Reach().sentence())
 
 
 def test_a_longer_arm_reaches_everywhere():
-    assert Reach.everywhere().holds(GRID).all()
+    assert Reach.everywhere().contains(GRID).all()
 
 
 def test_reach_agrees_with_trigonometry():
@@ -56,7 +56,7 @@ def test_reach_agrees_with_trigonometry():
         for away, expected in ((149.9, False), (150.1, True), (399.9, True), (400.1, False)):
             place = np.array([[524 + away * math.cos(angle), 620 + away * math.sin(angle)]])
             on_field = 0 <= place[0, 1] <= 520
-            assert reach.holds(place)[0] == (expected and on_field)
+            assert reach.contains(place)[0] == (expected and on_field)
 
 
 def test_places_off_the_field_are_out_of_reach():
@@ -137,12 +137,12 @@ def test_readings_are_whole_lego_units_from_1_to_100(value, expected):
 
 
 def test_the_scale_can_be_finer_or_none():
-    assert SimulatedArm(flat(33.37), scale=LegoScale(step=0.25)).measure(HERE).value == 33.25
-    assert SimulatedArm(flat(133.37), scale=LegoScale(step=None)).measure(HERE).value == 100
+    assert SimulatedArm(flat(33.37), scale=ReadingScale(step=0.25)).measure(HERE).value == 33.25
+    assert SimulatedArm(flat(133.37), scale=ReadingScale(step=None)).measure(HERE).value == 100
     assert SimulatedArm(flat(133.37), scale=None).measure(HERE).value == 133.37
     assert math.isnan(SimulatedArm(flat(math.nan)).measure(HERE).value)
-    assert LegoScale(0.0, 10.0, 3.0).convert(10.0) == 9.0
-    assert LegoScale(0.0, 11.0, 3.0).convert(11.0) == 11.0
+    assert ReadingScale(0.0, 10.0, 3.0).convert(10.0) == 9.0
+    assert ReadingScale(0.0, 11.0, 3.0).convert(11.0) == 11.0
 
 
 def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
@@ -168,8 +168,8 @@ def test_leaving_the_block_brings_the_arm_to_rest_after_an_exception_too():
     [
         lambda: Speed(move_mm_s=0.0),
         lambda: Speed(read_s=-1.0),
-        lambda: LegoScale(low=100.0),
-        lambda: LegoScale(step=0.0),
+        lambda: ReadingScale(low=100.0),
+        lambda: ReadingScale(step=0.0),
         lambda: SimulatedArm(flat(1.0), height_mm=0.0),
     ],
     ids=["no speed", "negative time", "no range", "no step", "no height"],

@@ -187,8 +187,8 @@ def test_garbage_behind_the_end_of_a_text_is_left_out():
 
 def test_only_a_move_may_not_be_sent_twice():
     """Limits add up; all else does no more when it is sent twice."""
-    assert t.SetOutputState(0, 50, 7, 1, 0, 0x20, 0).repeatable
-    assert {vector[0] for vector in VECTORS if not vector[0].repeatable} == {
+    assert t.SetOutputState(0, 50, 7, 1, 0, 0x20, 0).is_repeatable
+    assert {vector[0] for vector in VECTORS if not vector[0].is_repeatable} == {
         t.SetOutputState(2, 75, 7, 1, 0, 0x20, 90),
         t.SetOutputState(2, -40, 5, 1, 0, 0x20, 1000),
     }

@@ -83,7 +83,7 @@ def make_compensation(recording: Recording) -> Callable[..., Compensation]:
         theta *= 1.0 + spread * rng.standard_normal(theta.shape)
         rest = below.coordinates.leave(below.coordinates.enter(theta))[0]
         problems = OrderProblems(recording, default_prior)
-        return Compensation.of(
+        return Compensation.from_samples(
             problems.problem(n - 1), below.coordinates, problems.problem(1), rest, rng=rng, n_pool=n_pool
         )
 

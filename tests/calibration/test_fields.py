@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.calibration import choose_pixel_mm, mean_field, mixture_moments
-from probewise.calibration.fields import by_mass
+from probewise.calibration.fields import sorted_by_mass
 from probewise.errors import ParameterError, ShapeError
 
 ONE = np.array([[1.0, 0.5, 1.5, 0.03, 0.08, -0.01]])
@@ -61,7 +61,7 @@ def test_moments_of_a_mixture_are_those_of_its_field() -> None:
 
 
 def test_numbering_by_mass_puts_the_heavier_gaussian_first_and_keeps_the_field() -> None:
-    sorted_ = by_mass(np.concatenate([TWO, [[7.0]]], axis=1), 2)
+    sorted_ = sorted_by_mass(np.concatenate([TWO, [[7.0]]], axis=1), 2)
     np.testing.assert_array_equal(sorted_, np.concatenate([TWO[:, 6:], TWO[:, :6], [[7.0]]], axis=1))
     np.testing.assert_allclose(mean_field(sorted_, 2).values, mean_field(TWO, 2).values, rtol=1e-9)
 

@@ -10,8 +10,8 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
-from probewise.calibration.coverage import Coverage, coverage, draw_truth, order_lead, simulate_truth
-from probewise.calibration.distinct_rows import DistinctRows
+from probewise.calibration.coverage import Coverage, coverage, draw_truth, log_z_lead_of_one_gaussian, simulate_truth
+from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import EvidenceChange, RoundSummary
@@ -90,7 +90,7 @@ def test_the_order_of_the_gaussians_does_not_matter(recording: Recording) -> Non
 def test_rows_predicted_once_are_those_predicted_one_by_one(recording: Recording, truth: FloatArray) -> None:
     plan = recording.plan.take(np.array([5, 40, 5, 100, 40, 7]))
     chain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
-    wrapped = DistinctRows(chain, plan)
+    wrapped = DeduplicatedModel(chain, plan)
     np.testing.assert_allclose(wrapped.predict(truth[None], plan), chain.predict(truth[None], plan), rtol=1e-12)
     with pytest.raises(ParameterError, match="plan"):
         wrapped.predict(truth[None], recording.plan)
@@ -159,7 +159,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 @pytest.mark.slow
 def test_evidence_prefers_one_gaussian_where_there_is_one() -> None:
     rng = np.random.default_rng(20)
-    assert order_lead(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
+    assert log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from probewise._arrays import FloatArray
 from probewise.calibration import default_prior
 from probewise.calibration.peak_coordinates import PeakCoordinates
-from probewise.calibration.peak_density import PeakDensity, StudentTDensity, share_missed_about
+from probewise.calibration.peak_density import PeakDensity, StudentTDensity, share_missed_about_peak
 from probewise.inference import SensorProblem
 from probewise.recordings import Recording
 
@@ -40,8 +40,8 @@ def test_a_change_of_labels_changes_neither_density_nor_readings(recording: Reco
     space = PeakCoordinates(prior)
     y = space.enter(prior.from_unit_cube(np.random.default_rng(2).uniform(0.02, 0.98, (20, 20))))
     theta, log_density = space.leave(y)
-    assert len(space.relabelled) == 6
-    for change in space.relabelled:
+    assert len(space.label_permutations) == 6
+    for change in space.label_permutations:
         other, log_other = space.leave(space.relabel(y, change))
         np.testing.assert_allclose(log_other, log_density, rtol=1e-9)
         np.testing.assert_allclose(np.sort(other[:, 1:-2:6]), np.sort(theta[:, 1:-2:6]), rtol=1e-9)
@@ -55,7 +55,7 @@ def test_the_prior_integrates_to_one_in_these_coordinates(recording: Recording, 
     space, rng = PeakCoordinates(prior), np.random.default_rng(3)
     y = space.enter(prior.from_unit_cube(rng.random((4000, 6 * n + 2))))
     density = PeakDensity(space, StudentTDensity(y.mean(axis=0), np.linalg.cholesky(np.cov(y, rowvar=False))))
-    _, _, log_density = density.drawn(40_000, rng=rng)
+    _, _, log_density = density.draw_within_prior(40_000, rng=rng)
     error = np.exp(-log_density).std() * np.sqrt(len(log_density)) / 40_000
     assert abs(np.exp(-log_density).sum() / 40_000 - 1.0) < 5 * error < 0.15
 
@@ -69,7 +69,7 @@ def test_a_peak_is_missed_where_its_part_of_the_evidence_has_no_samples(recordin
     y = space.enter(theta[theta[:, 1] > 0.0])
     density = PeakDensity(space, StudentTDensity(y.mean(axis=0), 0.8 * np.linalg.cholesky(np.cov(y, rowvar=False))))
     asked = {
-        name: share_missed_about(silent, density, some, np.log(z), n_draws=4000, rng=rng)
+        name: share_missed_about_peak(silent, density, some, np.log(z), n_draws=4000, rng=rng)
         for name, some, z in (("all", theta, 1.0), ("half", half, 0.5))
     }
     assert asked["all"] < 0.05

@@ -13,7 +13,7 @@ from probewise.calibration.mixed_reference import MixedReference
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.peak_density import PeakDensity, StudentTDensity
-from probewise.calibration.reference import Reference, has_reference
+from probewise.calibration.reference import FaintGaussianReference, has_uniform_light
 from probewise.calibration.whole_coordinates import FAINT, count_bright
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
@@ -43,14 +43,17 @@ PARTS = [(2, 1), (3, 1), (3, 2)]
 @pytest.fixture
 def references(
     recording: Recording, make_compensation: Callable[..., Compensation]
-) -> dict[tuple[int, int], Reference]:
+) -> dict[tuple[int, int], FaintGaussianReference]:
     silent, rng = cast("SensorProblem", _Silent()), np.random.default_rng(30)
-    return {(n, m): Reference(default_prior(recording, n), silent, make_compensation(n, rng), m) for n, m in PARTS}
+    return {
+        (n, m): FaintGaussianReference(default_prior(recording, n), silent, make_compensation(n, rng), m)
+        for n, m in PARTS
+    }
 
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
-    references: dict[tuple[int, int], Reference], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording, n: int, m: int
 ) -> None:
     """Mean weight the prior's share, and moments of its own draws; four standard errors: one false alarm in 16 000."""
     rng = np.random.default_rng(31)
@@ -62,7 +65,7 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
     alive = alive[np.isfinite(reference.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == m)]
     coordinates = reference.prior.coordinates
     drawn[alive] = coordinates.leave(coordinates.enter(drawn[alive]))[0]
-    weight[alive] = below * np.exp(-reference.log_over_prior(drawn[alive]))
+    weight[alive] = below * np.exp(-reference.log_density_over_prior(drawn[alive]))
     assert 0.2 < len(alive) / len(drawn) < 1.0
     plain, share = _sorted_draws(reference.prior, 20_000, m, rng)
     assert abs(weight.mean() - share) < 4 * np.hypot(weight.std(), np.sqrt(share / 40)) / np.sqrt(len(weight))
@@ -78,7 +81,7 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
 
 
 def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
-    references: dict[tuple[int, int], Reference], recording: Recording
+    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording
 ) -> None:
     """Where the recording says nothing: mean weight the share of the prior with one bright Gaussian, four errors."""
     rng, space = np.random.default_rng(36), PeakCoordinates(references[2, 1].prior)
@@ -93,7 +96,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
     alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
     alive = alive[np.isfinite(seeded.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == 1)]
     coordinates = seeded.prior.coordinates
-    weight[alive] = np.exp(-seeded.log_over_prior(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
+    weight[alive] = np.exp(-seeded.log_density_over_prior(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
     # The lighter of two uniform numbers is below a tenth of the other.
     assert abs(weight.mean() - FAINT) < 4 * weight.std() / np.sqrt(len(weight)) < 0.04
     there, log_drawn = seeded.propose(drawn[alive], rng=rng)
@@ -104,15 +107,15 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_undoing_a_compensated_gaussian_gives_the_others_back(
-    references: dict[tuple[int, int], Reference], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(33)
     reference = references[n, m]
     rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
-    drawn = reference.with_compensated(rest, rng=rng)
+    drawn = reference.with_compensated_gaussian(rest, rng=rng)
     possible = np.isfinite(drawn).all(axis=1)
     drawn, rest = drawn[possible], rest[possible]
-    back, log_density = reference.uncompensated(drawn)
+    back, log_density = reference.without_compensated_gaussian(drawn)
     alive = np.isfinite(log_density)
     assert alive.sum() > 20
     assert not np.allclose(drawn[alive, 1], rest[alive, 1], rtol=1e-6)
@@ -136,14 +139,14 @@ def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth:
     covariance = noise_sd**2 * np.linalg.inv(slope @ slope.T)
     x = np.tile(centre, (4000, 1))
     x[:, told] += rng.standard_normal((4000, 6)) @ np.linalg.cholesky(covariance).T
-    compensation = Compensation.of(problem, space, problem, space.leave(x)[0], rng=rng, n_pool=10)
+    compensation = Compensation.from_samples(problem, space, problem, space.leave(x)[0], rng=rng, n_pool=10)
     other = np.array([[1.0, 4.0, -3.0, 0.02, 0.05, 0.0]])
     lone = np.concatenate([other, truth[None, -2:]], axis=1)
     change = problem.model.predict(lone, recording.plan)[0] - predicted(centre)[0]
     refit = -np.linalg.solve(slope @ slope.T, slope @ change)
-    shift = compensation.linear.answer(other).shift[0]
+    shift = compensation.linear.compensating_shift(other).shift[0]
     assert shift[0] == 0.0
-    assert compensation.linear.answer(other[:0]).shift.shape == (0, 8)
+    assert compensation.linear.compensating_shift(other[:0]).shift.shape == (0, 8)
     sds = np.sqrt(np.diag(covariance))
     apart = np.linalg.norm((shift[told] - refit) / sds)
     assert apart < 0.15 * np.linalg.norm(refit / sds)
@@ -153,7 +156,7 @@ def test_the_pool_grows_until_enough_of_its_shapes_are_effective(
     make_compensation: Callable[..., Compensation],
 ) -> None:
     compensation = make_compensation(2, np.random.default_rng(33), n_pool=60_000)
-    log_asked = 0.8 * compensation.answers.log_evidence(compensation.most)
+    log_asked = 0.8 * compensation.answers.log_bayes_factor(compensation.most)
     n = len(log_asked)
     assert len(compensation.pool) == n
     assert n == 60_000 or n_effective(log_asked) >= 4000
@@ -163,28 +166,28 @@ def test_the_pool_grows_until_enough_of_its_shapes_are_effective(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_a_split_keeps_light_centre_and_covariance(
-    references: dict[tuple[int, int], Reference], recording: Recording, n: int, m: int
+    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording, n: int, m: int
 ) -> None:
     rng = np.random.default_rng(32)
     rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
     for label in range(m):
-        split = references[n, m].split(rest, label, rng=rng)
+        split = references[n, m].split_bright_gaussian(rest, label, rng=rng)
         alive = np.isfinite(split).all(axis=1)
         assert alive.sum() > 50
-        merged, log_density = references[n, m].merged(split[alive], label)
+        merged, log_density = references[n, m].merge_into_bright_gaussian(split[alive], label)
         np.testing.assert_allclose(merged, rest[alive], rtol=1e-6)
         assert np.isfinite(log_density).mean() > 0.5
 
 
 def test_only_a_uniform_prior_of_light_has_a_reference(
-    references: dict[tuple[int, int], Reference], recording: Recording
+    references: dict[tuple[int, int], FaintGaussianReference], recording: Recording
 ) -> None:
     usual = default_prior(recording, 2)
     paper = SSFPrior(2, usual.offset_mm, LogUniform(0.001, 1.0), usual.i_min, Uniform(50.0, 60.0))
-    assert has_reference(usual)
-    assert not has_reference(paper)
+    assert has_uniform_light(usual)
+    assert not has_uniform_light(paper)
     with pytest.raises(ParameterError, match="prior"):
-        Reference(paper, cast("SensorProblem", _Silent()), references[2, 1].compensation, 1)
+        FaintGaussianReference(paper, cast("SensorProblem", _Silent()), references[2, 1].compensation, 1)
 
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
@@ -196,7 +199,9 @@ def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
     The last Gaussian is drawn from a pool, which differs from the prior by the scatter of 4,000 shapes.
     """
     rng, prior = np.random.default_rng(35), default_prior(recording, n)
-    reference = Reference(prior, cast("SensorProblem", _Silent()), make_compensation(n, rng, spread=2e-3), m)
+    reference = FaintGaussianReference(
+        prior, cast("SensorProblem", _Silent()), make_compensation(n, rng, spread=2e-3), m
+    )
     here, _ = _sorted_draws(prior, 3000, m, rng)
     start = here
     for _ in range(12):

@@ -51,10 +51,10 @@ def test_an_effect_of_some_patterns_is_so_after_the_file_too(sensor: FittedSenso
     write_sensor(shaded, tmp_path / "sensor.json")
     back = read_sensor(tmp_path / "sensor.json")
     assert back.patterns == shaded.patterns
-    (effect,) = back.carried_effects
+    (effect,) = back.effects_on_new_scans
     assert isinstance(effect, EdgeShadow)
     assert effect.patterns == ("boundary",)
-    (everywhere,) = replace(shaded, patterns={}).carried_effects
+    (everywhere,) = replace(shaded, patterns={}).effects_on_new_scans
     assert everywhere == EdgeShadow()
     for stray in ({"edge_blur": ("boundary",)}, {"lag": ("boundary",)}):
         with pytest.raises(ParameterError, match="effects of the model among"):

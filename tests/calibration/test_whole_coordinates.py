@@ -97,12 +97,12 @@ def test_a_sharing_density_keeps_the_whole_of_the_gaussians_below() -> None:
     asked, one = space(2, n_bright=2), space(1)
     rng = np.random.default_rng(5)
     below = one.enter(np.array([1.0, 0.5, 1.0, 0.05, 0.06, 0.01, 10.0, 60.0]) * (1 + 0.01 * rng.random((4000, 8))))
-    density = SharedLightDensity.of(asked, below)
+    density = SharedLightDensity.from_samples_below(asked, below)
     theta = density.draw(np.empty((4000, 0)), rng=rng)
     possible = theta[np.isfinite(theta).all(axis=1)]
     assert len(possible) > 400
     assert (count_bright(possible) == 2).all()
-    assert np.isfinite(density.log_over_prior(possible)).all()
+    assert np.isfinite(density.log_density_over_prior(possible)).all()
     x = asked.enter(possible)
     for own, other in ((1, 1), (2, 2), (-2, -2), (-1, -1)):
         sd = below[:, other].std()

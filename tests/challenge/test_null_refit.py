@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.challenge import NullRefit, score
-from probewise.challenge.aliasing import cosines, residual_with_one_named
+from probewise.challenge.aliasing import cosines_with_vocabulary, residual_with_one_named
 from probewise.effects import VOCABULARY
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan
@@ -69,7 +69,7 @@ def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):
     at_s = float(np.quantile(plan.time_s, 0.4))
     step = replace(world, concealed=(AmbientStep(1.0, at_s),)).simulate(plan, rng=None)
     few = {name: VOCABULARY[name] for name in ("ambient_step", "offset_drift", "backlash", "correlated_noise")}
-    found = cosines(refit, clean, step, vocabulary=few)
+    found = cosines_with_vocabulary(refit, clean, step, vocabulary=few)
     assert found["ambient_step"] == pytest.approx(1.0, abs=1e-3)
     assert 0.3 < found["offset_drift"] < 0.95
     assert found["backlash"] < 0.3
@@ -80,9 +80,9 @@ def test_an_effect_is_like_itself_and_like_no_other(refit, world, plan, clean):
 def test_a_skirt_about_a_gaussian_spot_is_one_gaussian_more(refit, world, plan, clean):
     """And a change of the light is not: it is not even asked."""
     skirt = replace(world, concealed=(Halo(0.08, 12.0),)).simulate(plan, rng=None)
-    assert cosines(refit, clean, skirt)["ssf_order"] > 0.99
+    assert cosines_with_vocabulary(refit, clean, skirt)["ssf_order"] > 0.99
     step = replace(world, concealed=(AmbientStep(0.4, 300.0),)).simulate(plan, rng=None)
-    assert "ssf_order" not in cosines(refit, clean, step)
+    assert "ssf_order" not in cosines_with_vocabulary(refit, clean, step)
 
 
 def test_of_two_effects_what_is_left_beside_one_is_the_other(refit, world, plan, clean):

@@ -9,7 +9,7 @@ from probewise.challenge.oracle_baseline import (
     oracle_covariate_rate,
     oracle_name_rate,
     oracle_set_size,
-    readings_by_repeating,
+    readings_to_separate_alias,
 )
 
 
@@ -64,5 +64,5 @@ def test_two_names_three_nats_apart_are_held_together_as_often_as_the_normal_law
 
 def test_no_number_of_repeated_plans_parts_two_that_agree(make):
     alias = make.case("alias", 12.0, truth=["lag"], hides=[make.hidden("lag", 12.0)], cosine=-1.0)
-    assert readings_by_repeating(alias) == math.inf
-    assert readings_by_repeating(alias | {"cosine": 0.5}) == pytest.approx(408 * 3 / 54)
+    assert readings_to_separate_alias(alias) == math.inf
+    assert readings_to_separate_alias(alias | {"cosine": 0.5}) == pytest.approx(408 * 3 / 54)

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from probewise.challenge import Task, confusion, reliability, score
+from probewise.challenge import Task, confusion_counts, reliability_bins, score
 from probewise.cli import main
 from probewise.report import challenge as report
 from probewise.report import plots
@@ -20,10 +20,10 @@ def results(make):
 
 def test_the_answer_counts_targets(results):
     rows = score(results)
-    assert report.answer(rows, 6).startswith("6 cases of concealed physics: ")
+    assert report.summary_sentence(rows, 6).startswith("6 cases of concealed physics: ")
     open_rows = sum(row.decision == "open" for row in rows)
-    assert f"{open_rows} undecided by so few cases" in report.answer(rows, 6)
-    assert len(report.answer(rows, 6).split()) <= 20
+    assert f"{open_rows} undecided by so few cases" in report.summary_sentence(rows, 6)
+    assert len(report.summary_sentence(rows, 6).split()) <= 20
 
 
 def test_the_csv_leaves_out_what_is_not_there(results):
@@ -47,7 +47,7 @@ def test_nothing_but_failures_still_makes_a_page(results):
 
 
 def test_the_matrix_writes_every_count(results):
-    truths, said, counts = confusion([r for r in results if "failed" not in r])
+    truths, said, counts = confusion_counts([r for r in results if "failed" not in r])
     ax = plots.confusion_matrix(truths, said, counts)
     assert sorted(t.get_text() for t in ax.texts) == ["1", "1", "1", "2"]
     assert [t.get_text() for t in ax.get_yticklabels()] == list(truths)
@@ -55,7 +55,7 @@ def test_the_matrix_writes_every_count(results):
 
 @pytest.mark.slow
 def test_the_diagram_says_of_how_many(results):
-    ax = plots.reliability_diagram(reliability(results[:-1]))
+    ax = plots.reliability_diagram(reliability_bins(results[:-1]))
     assert [t.get_text() for t in ax.texts] == ["1", "4"]
 
 

@@ -5,8 +5,8 @@ import pytest
 from probewise.challenge.scoring import (
     count_extras,
     effects_to_name,
+    is_distinguishable_from_ssf,
     is_out_of_vocabulary,
-    is_physics,
     leading_name_right,
     leading_probability,
     names_match,
@@ -79,7 +79,7 @@ def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
     like, unlike = (make.hidden("halo", cosines={"halo": 1.0, "ssf_order": rho}) for rho in (0.999, 0.9))
     for hide, free in ((like, True), (unlike, False)):
         found = make.single("halo", hide=hide)
-        assert is_physics(found) != free
+        assert is_distinguishable_from_ssf(found) != free
         assert names_match((), effects_to_name(found, merged=True)) == free
         assert names_match(("halo",), effects_to_name(found, merged=True))
         assert not names_match((), effects_to_name(found, merged=False))
@@ -90,6 +90,6 @@ def test_what_one_gaussian_more_takes_up_need_not_be_named(make):
     assert not leading_name_right(make.single("halo", hide=like, said=["lag"], hypotheses=[[["lag"], 0.9], [[], 0.1]]))
     both = make.case("pair", 12.0, truth=["halo", "lag"], hides=[like, make.hidden("lag", 12.0)], said=["lag"])
     assert leading_name_right(both)
-    assert is_physics(both)
+    assert is_distinguishable_from_ssf(both)
     assert not names_match(("halo",), effects_to_name(both, merged=True))
     assert not names_match(("lag", "glint"), effects_to_name(both, merged=True))

@@ -5,7 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from probewise.challenge import Estimate, Row, by_effect, calibration_error, confusion, reliability, score
+from probewise.challenge import (
+    Estimate,
+    Row,
+    calibration_error,
+    confusion_counts,
+    detected_and_named_by_effect,
+    reliability_bins,
+    score,
+)
 from probewise.challenge.estimates import bootstrapped, mean, share
 
 
@@ -74,7 +82,7 @@ def test_detection_is_of_effects_on_the_mean(make):
     results = [make.single(), make.single(p_value=0.02), make.single("halo"), noisy]
     assert row(results, "detection, alpha .01, lambda 8").found.value == pytest.approx(2 / 3)
     assert row(results, "detection, lambda 8, least of all effects").found.value == 0.5
-    detected, named = by_effect(results)["lag"]
+    detected, named = detected_and_named_by_effect(results)["lag"]
     assert (detected.value, named.value) == (0.5, 1.0)
 
 
@@ -115,9 +123,9 @@ def test_the_calibration_error_of_hand_made_bins(make):
     """Half stated .8, one of two right; half stated .95, both right: (.3 + .05) / 2."""
     results = [make.case(p=0.8), make.case(p=0.8, said=["lag"]), make.case(p=0.95), make.case(p=0.95)]
     assert calibration_error(results).value == pytest.approx(0.175)
-    bins = reliability(results)
+    bins = reliability_bins(results)
     assert [(round(b.stated, 3), b.right.value, b.right.n) for b in bins] == [(0.8, 0.5, 2), (0.95, 1.0, 2)]
-    assert reliability([]) == ()
+    assert reliability_bins([]) == ()
 
 
 def test_the_place_counts_where_there_is_one(make):
@@ -225,7 +233,7 @@ def test_an_alias_is_no_confusion(make):
         make.case(said=["outliers"]),
         make.outside(said=["halo"]),
     ]
-    truths, said, counts = confusion(results)
+    truths, said, counts = confusion_counts(results)
     assert truths == ("clean", "lag", "outside")
     assert said == ("clean", "lag", "halo", "several")
     assert counts.tolist() == [[1, 0, 0, 0], [0, 1, 0, 1], [0, 0, 1, 0]]

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from probewise.arm import LegoScale, Request
+from probewise.arm import ReadingScale, Request
 from probewise.calibration import predict, read_sensor
 from probewise.cli import main
 from probewise.cli._bench import Bench, moved_pattern, world_of
@@ -58,13 +58,13 @@ def test_a_ramp_stays_where_it_is():
 
 def test_a_bench_does_what_a_person_would_be_asked_for():
     world = dataclasses.replace(world_of(None)[0], noise_sd=0.0)
-    bench = Bench(world, "uniform:1", scale=LegoScale(), seed=1)
-    with bench.simulated(None) as arm:
+    bench = Bench(world, "uniform:1", scale=ReadingScale(), seed=1)
+    with bench.open_simulated_arm(None) as arm:
         place = type(arm.pose)(*ORIGIN)
         white = arm.measure(place).value
-        bench.lay({"dark": Uniform(0.0)}, ORIGIN, Request("put it there", pattern="dark"))
+        bench.carry_out_request({"dark": Uniform(0.0)}, ORIGIN, Request("put it there", pattern="dark"))
         assert arm.measure(place).value < white
-    assert bench.simulated(None, start_s=70.0).time_s == 70.0
+    assert bench.open_simulated_arm(None, start_s=70.0).time_s == 70.0
 
 
 def test_what_the_simulated_arm_records_is_what_its_sensor_predicts(sensor_file, tmp_path):

@@ -8,13 +8,13 @@ import re
 import numpy as np
 import pytest
 
-from probewise.arm import LegoArm, Rehearsal, Request, read_geometry, shipped_geometry
+from probewise.arm import DryRun, LegoArm, Request, read_geometry, shipped_geometry
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._arm import warn_of_place_sd
 from probewise.cli._marks import _place_after, bring_to_mark
 from probewise.cli._person import PersonAtBench
-from probewise.cli._sheet_check import SheetCheck, shades
+from probewise.cli._sheet_check import SheetCheck, shades_at_places
 from probewise.emulator import parse_scene
 from probewise.emulator.scenes import scene_text
 from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
@@ -98,7 +98,7 @@ def test_fitting_needs_an_arm_or_marks_and_keeps_what_stands_there(tmp_path, cap
 
 def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     geometry = read_geometry(shipped_geometry())
-    arm = LegoArm(Rehearsal(geometry, lambda text: None), geometry)
+    arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
     said, answers = [], iter(["", "x 4 y -2", "sideways", "down 55", "up 3", "ok"])
     with arm:
         met = bring_to_mark(arm, (520.0, 260.0), 32.0, lambda look: next(answers), said.append, named="mark 1")
@@ -127,8 +127,8 @@ def test_an_answer_is_a_move_or_nothing(answer, moved):
 
 def test_shades_are_those_that_fill_the_sensors_view():
     places = np.array([[-20.0, 0.0], [-10.0, 0.0], [20.0, 0.0]])
-    np.testing.assert_array_equal(shades(HalfPlane(0.0, 0.0), places), [0, np.nan, 1])
-    np.testing.assert_array_equal(shades(Uniform(0.5), places), [np.nan] * 3)
+    np.testing.assert_array_equal(shades_at_places(HalfPlane(0.0, 0.0), places), [0, np.nan, 1])
+    np.testing.assert_array_equal(shades_at_places(Uniform(0.5), places), [np.nan] * 3)
 
 
 def edge(n=101):
@@ -165,7 +165,7 @@ def test_a_sheet_is_looked_at_over_its_white_and_its_black():
         places = watch.places_to_check(name, everywhere)
         assert set(places) == {True, False}
         for is_white, place in places.items():
-            assert shades(pattern, np.array([place]))[0] == is_white
+            assert shades_at_places(pattern, np.array([place]))[0] == is_white
     assert watch.check_levels("boundary", {True: 55.0, False: 15.0}) is None
     assert "reads 15 where it should be white and 55 where black" in watch.check_levels(
         "quadrant_a", {True: 15.0, False: 55.0}
@@ -179,7 +179,7 @@ def test_a_scene_is_typed_as_it_is_read(scene):
 
 def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet(monkeypatch, capsys):
     geometry = read_geometry(shipped_geometry())
-    arm = LegoArm(Rehearsal(geometry, lambda text: None), geometry)
+    arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
     values = iter([12.0, 57.0])
     monkeypatch.setattr(arm, "measure", lambda pose: dataclasses.replace(_reading(pose), value=next(values)))
     monkeypatch.setattr("sys.stdin", io.StringIO("\n\n\n"))

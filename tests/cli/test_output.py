@@ -10,7 +10,7 @@ import pytest
 
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.cli._output import staged
+from probewise.cli._output import staged_output
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_recording, write_text_atomically
 
@@ -18,7 +18,7 @@ from probewise.recordings import read_recording, write_recording, write_text_ato
 def test_what_an_earlier_run_left_behind_goes_and_what_is_not_ours_stays(tmp_path):
     for name in ("witness_time.svg", "witness_level.svg", "notes.txt"):
         (tmp_path / name).write_text("old")
-    with staged(tmp_path, outdated=("witness_*.svg",)) as stage:
+    with staged_output(tmp_path, outdated=("witness_*.svg",)) as stage:
         (stage / "witness_level.svg").write_text("new")
     assert {p.name: p.read_text() for p in tmp_path.iterdir()} == {"witness_level.svg": "new", "notes.txt": "old"}
 
@@ -28,7 +28,7 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
     for round_ in ("first", "second"):
         csv.write_text(round_)
         json.write_text(round_)
-        with staged(tmp_path, inputs=(csv, json), outdated=("plan.*",)) as stage:
+        with staged_output(tmp_path, inputs=(csv, json), outdated=("plan.*",)) as stage:
             (stage / "plan.csv").write_text("new")
             (stage / "plan.json").write_text("new")
         assert csv.read_text() == json.read_text() == "new"
@@ -44,7 +44,7 @@ def test_an_input_that_would_be_replaced_is_set_aside_with_its_description(tmp_p
 def test_an_input_that_nothing_replaces_stays_where_it_is(tmp_path):
     csv = tmp_path / "next_plan.csv"
     csv.write_text("readings")
-    with staged(tmp_path, inputs=(csv,), outdated=("next_plan.*",)):
+    with staged_output(tmp_path, inputs=(csv,), outdated=("next_plan.*",)):
         pass
     assert csv.read_text() == "readings"
 
@@ -53,7 +53,7 @@ def test_a_directory_in_the_way_leaves_everything_as_it_was(tmp_path):
     (tmp_path / "b").mkdir()
 
     def write():
-        with staged(tmp_path) as stage:
+        with staged_output(tmp_path) as stage:
             (stage / "a").write_text("new")
             (stage / "b").write_text("new")
 
@@ -107,20 +107,20 @@ def contents(folder):
 
 
 def write_new(out):
-    with staged(out, inputs=(out / "plan.csv", out / "plan.json"), outdated=("witness_*.svg",)) as stage:
+    with staged_output(out, inputs=(out / "plan.csv", out / "plan.json"), outdated=("witness_*.svg",)) as stage:
         (stage / "sub").mkdir()
         for name, text in NEW.items():
             write_text_atomically(stage / name, text)
 
 
 def write_abc(out):
-    with staged(out) as stage:
+    with staged_output(out) as stage:
         for name in "abc":
             (stage / name).write_text("new")
 
 
 def write_much(out):
-    with staged(out) as stage:
+    with staged_output(out) as stage:
         write_text_atomically(stage / "small", "x")
         write_text_atomically(stage / "run.gif", "x" * 20_000)
 
@@ -153,7 +153,7 @@ def test_wherever_a_command_is_killed_the_next_one_finds_all_of_its_files_or_non
             (out / name).write_text(text)
         if not killed_at(n, write_new, out):
             break
-        with pytest.raises(ZeroDivisionError), staged(out):
+        with pytest.raises(ZeroDivisionError), staged_output(out):
             raise ZeroDivisionError
         assert contents(out) in (OLD, DONE), n
         settled.append(contents(out) == DONE)
@@ -175,7 +175,7 @@ def test_a_file_that_cannot_be_replaced_is_put_in_place_by_the_next_command(tmp_
         write_abc(tmp_path)
     assert (tmp_path / "a").exists()
     monkeypatch.undo()
-    with staged(tmp_path):
+    with staged_output(tmp_path):
         pass
     assert contents(tmp_path) == dict.fromkeys("abc", "new")
 

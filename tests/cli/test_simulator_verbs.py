@@ -10,7 +10,7 @@ from heater import FILE, runs
 
 from probewise.cli import main
 from probewise.diagnosis import diagnosis_schema
-from probewise.recordings import strict_json
+from probewise.recordings import parse_strict_json
 from probewise.systems import write_run_table
 
 
@@ -36,7 +36,7 @@ def fit(folder):
 
 @pytest.mark.slow
 def test_a_fit_finds_what_the_readings_were_made_with(fit):
-    document = strict_json((fit / "fit.json").read_text())
+    document = parse_strict_json((fit / "fit.json").read_text())
     found = {p["name"]: p["interval95"] for p in document["parameters"]}
     assert found["tau_s"][0] < 15.0 < found["tau_s"][1]
     assert found["gain"][0] < 3.0 < found["gain"][1]
@@ -80,7 +80,7 @@ def test_an_audit_needs_no_readings(folder):
     lines = (folder / "data.csv").read_text().splitlines()
     (folder / "plan.csv").write_text("\n".join(line.rpartition(",")[0] for line in lines) + "\n")
     run(folder, "audit", "plan.csv", "--out", str(folder / "audit"))
-    document = strict_json((folder / "audit" / "audit.json").read_text())
+    document = parse_strict_json((folder / "audit" / "audit.json").read_text())
     found = {effect["name"]: effect for effect in document["effects"]}
     assert found["sensitivity:room_c"]["sight"] == "invisible"
     assert found["offset_step"]["rows"] > 64
@@ -91,7 +91,7 @@ def test_an_audit_needs_no_readings(folder):
 def test_a_diagnosis_writes_what_the_contract_promises(folder):
     out = folder / "diagnosis"
     run(folder, "diagnose", "data.csv", "new.csv", "--out", str(out))
-    document = strict_json((out / "diagnosis.json").read_text())
+    document = parse_strict_json((out / "diagnosis.json").read_text())
     jsonschema.validate(document, diagnosis_schema())
     assert document["verdict"] == "clean"
     for name in ("repaired.json", "calibrated.json"):

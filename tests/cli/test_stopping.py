@@ -10,12 +10,12 @@ import time
 import numpy as np
 import pytest
 
-from probewise._signals import ENDING, SAME_S, deferred
+from probewise._signals import ENDING, SAME_S, defer_signals
 from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
 from probewise.cli._stopping import Stopped, raise_if_stopped, reporting_what_is_kept, stoppable
-from probewise.emulator import VirtualClock, VirtualLine, set_up
+from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
 from probewise.emulator import read_geometry as read_numbers
 from probewise.errors import LinkError
 from probewise.recordings import Uniform
@@ -92,7 +92,7 @@ def test_deferred_lines_are_finished_first():
 
     def lines():
         with stoppable():
-            with deferred(), deferred():
+            with defer_signals(), defer_signals():
                 signal.raise_signal(signal.SIGTERM)
                 done.append("finished")
             done.append("gone on")
@@ -108,7 +108,7 @@ def test_a_repeated_signal_cuts_deferred_lines_short(monkeypatch):
     done = []
 
     def lines():
-        with stoppable(), deferred():
+        with stoppable(), defer_signals():
             signal.raise_signal(signal.SIGTERM)
             now_s[0] += 2 * SAME_S
             done.append("still here")
@@ -131,7 +131,7 @@ def strike(number, frame):
 def struck_session(n):
     """Measure once, struck at the n-th telegram; return the emulated brick, and how many telegrams came."""
     clock = VirtualClock()
-    bench = set_up(read_numbers(shipped_geometry()), truth("paper"), Uniform(0.5), clock, seed=1)
+    bench = set_up_bench(read_numbers(shipped_geometry()), truth("paper"), Uniform(0.5), clock, seed=1)
     send, sent = bench.radio.send, []
 
     def struck(data):
@@ -239,7 +239,7 @@ def test_pictures_of_a_run_whose_journal_is_gone_do_not_mix_with_those_of_the_ne
 def test_a_full_disk_names_the_picture_and_the_journal(sensor_file, tmp_path, quick_frames, monkeypatch, capsys):
     import resource
 
-    monkeypatch.setattr("probewise.cli._explore_pictures.gif", lambda _: bytes(5_000_000))
+    monkeypatch.setattr("probewise.cli._explore_pictures.animated_gif", lambda _: bytes(5_000_000))
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, limits[1]))
     out = tmp_path / "out"

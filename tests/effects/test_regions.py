@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.effects.albedo import GradedRegion, PatchedRegion
+from probewise.effects.albedo import RegionWithGradient, RegionWithPatch
 from probewise.scene import edge_distance
 from probewise.scene.regions import (
     EllipseRegion,
@@ -18,17 +18,17 @@ from probewise.scene.regions import (
     UniformRegion,
     disc_region,
 )
-from probewise.sensor import FixedMixture, Poses, field_of, seen, seen_discrete
+from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels, mean_albedo_under_gaussians
 
 EDGE = HalfPlaneRegion([0.5], [1.0], 0.9, 0.1)
 CHANGED = {
     "graded": (
-        GradedRegion(EDGE, np.array([[0.004, -0.006], [0.0, 0.01]])),
+        RegionWithGradient(EDGE, np.array([[0.004, -0.006], [0.0, 0.01]])),
         lambda x, y: np.stack([1 + 0.004 * x - 0.006 * y, 1 + 0.01 * y]),
         lambda s, change: s * change,
     ),
     "patched": (
-        PatchedRegion(EDGE, np.array([[0.3, 2.0, -1.0, 4.0], [-0.2, 0.0, 0.0, 9.0]])),
+        RegionWithPatch(EDGE, np.array([[0.3, 2.0, -1.0, 4.0], [-0.2, 0.0, 0.0, 9.0]])),
         lambda x, y: np.stack([0.3 * np.exp(-((x - 2) ** 2 + (y + 1) ** 2) / 32), -0.2 * np.exp(-(x**2 + y**2) / 162)]),
         lambda s, change: s + change,
     ),
@@ -54,8 +54,10 @@ def test_a_changed_surface_is_seen_alike_by_closed_form_and_by_the_papers_sum(ki
     grid = np.arange(-25.0, 25.25, 0.5)
     field = field_of(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
     x, y = np.array([[-6.0, 0.0, 2.0, 7.0]]), np.array([[3.0, -2.0, 1.0, 0.0]])
-    discrete = seen_discrete(region, field, Poses(x, y, np.zeros((1, 4))))
-    closed = seen(region, x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0)))
+    discrete = mean_albedo_by_pixels(region, field, Poses(x, y, np.zeros((1, 4))))
+    closed = mean_albedo_under_gaussians(
+        region, x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0))
+    )
     np.testing.assert_allclose(closed[:, :, 0], discrete, atol=2e-4)
 
 
@@ -81,7 +83,7 @@ def test_the_distance_is_that_to_where_the_albedo_changes(name):
         albedo = region.albedo(rays.reshape(-1, 2)).reshape(len(radii), -1)
         changed = np.flatnonzero((albedo != albedo[0, 0]).any(axis=1))
         assert distance == pytest.approx(radii[changed[0]], abs=0.1)
-    changed_surface = GradedRegion(PatchedRegion(region, np.ones((1, 4))), np.zeros((1, 2)))
+    changed_surface = RegionWithGradient(RegionWithPatch(region, np.ones((1, 4))), np.zeros((1, 2)))
     np.testing.assert_array_equal(edge_distance(changed_surface, places[None, :, 0], places[None, :, 1])[0], found)
 
 

@@ -17,11 +17,11 @@ from probewise.emulator import (
     Geometry,
     LightModel,
     SensorPose,
-    Table,
+    Tabletop,
     VirtualClock,
     parse_scene,
     read_geometry,
-    set_up,
+    set_up_bench,
     shipped_geometry,
 )
 from probewise.errors import FileError, ParameterError
@@ -79,7 +79,7 @@ def test_play_leaves_the_joint_behind_on_the_side_it_came_from(geometry: Geometr
 
 
 def test_the_brick_counts_what_a_hand_turns(geometry: Geometry, clock: VirtualClock) -> None:
-    bench = set_up(geometry, WORLD, CIRCLE, clock, seed=1)
+    bench = set_up_bench(geometry, WORLD, CIRCLE, clock, seed=1)
     shoulder = bench.arm.joints[1]
     shoulder.bring_to(shoulder.numbers.home_deg + 10)
     clock.sleep(0.01)
@@ -100,7 +100,7 @@ def test_a_joint_stops_beyond_its_limits(geometry: Geometry) -> None:
 
 def sight(stand: SensorPose, clock: VirtualClock, *, albedo: float = 1.0) -> LightModel:
     world = replace(WORLD, noise_sd=0.0)
-    return LightModel(world, Table(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
+    return LightModel(world, Tabletop(Uniform(albedo)), lambda: stand, read_height_mm=14.0, seed=3, clock=clock)
 
 
 def test_at_the_reading_height_the_brick_shows_what_the_world_reads(clock: VirtualClock) -> None:
@@ -124,7 +124,7 @@ def test_the_led_s_light_peaks_at_some_millimetres_and_is_gone_at_some_centimetr
 def test_the_first_reading_at_the_nth_stand_has_the_nth_noise(clock: VirtualClock) -> None:
     """As on the simulated arm with the same seed, however often it is read at one stand."""
     at = [SensorPose(0, 0, 14.0, 0)]
-    look = LightModel(WORLD, Table(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
+    look = LightModel(WORLD, Tabletop(Uniform(1.0)), lambda: at[0], read_height_mm=14.0, seed=7, clock=clock)
     for number in range(4):
         at[0] = SensorPose(10.0 * number, 0, 14.0, 0)
         expected = 60.5 + 0.6 * np.random.default_rng([7, number]).standard_normal()
@@ -145,7 +145,7 @@ def read_light(bench: Bench, clock: VirtualClock, port: int) -> int:
 
 def test_a_brick_over_a_circle_reads_white_inside_and_black_outside(geometry: Geometry, clock: VirtualClock) -> None:
     """The arm is put at reading height by inverse kinematics, worked out here with the law of cosines."""
-    bench = set_up(geometry, WORLD, CIRCLE, clock, seed=1)
+    bench = set_up_bench(geometry, WORLD, CIRCLE, clock, seed=1)
     upper, lower = geometry.links_mm
     readings = []
     for y_mm in (300.0, 450.0):
@@ -166,7 +166,7 @@ def test_a_brick_over_a_circle_reads_white_inside_and_black_outside(geometry: Ge
 
 def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClock) -> None:
     """Over an edge the spot's centre, 6 mm along v, is on the white side, then on the black one."""
-    table = Table(HalfPlane(math.pi / 2, 0.0))
+    table = Tabletop(HalfPlane(math.pi / 2, 0.0))
     world = World(gaussian_spot([Blob(1.0, (0.0, 6.0), (1.0, 1.0))]), noise_sd=0.0)
     look = LightModel(world, table, lambda: SensorPose(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
     assert look(True) == pytest.approx(60.5)
@@ -177,11 +177,11 @@ def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClo
 
 
 def test_what_a_person_cannot_do_changes_nothing() -> None:
-    table = Table(CIRCLE)
+    table = Tabletop(CIRCLE)
     for wish in ("turn", "turn round", "turn nan", "hexagon", ""):
         with pytest.raises(ParameterError, match="turn DEGREES"):
             table.carry_out(wish)
-    assert table == Table(CIRCLE)
+    assert table == Tabletop(CIRCLE)
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def test_a_geometry_that_cannot_be_used_says_where(tmp_path: Path, old: str, new
 @pytest.mark.parametrize(("name", "sleep_min"), [("", 10), ("fifteen letters", 10), ("a\tb", 10), ("NXT", 7)])
 def test_a_brick_that_cannot_be_is_refused(geometry: Geometry, clock: VirtualClock, name: str, sleep_min: int) -> None:
     with pytest.raises(ParameterError):
-        set_up(geometry, WORLD, CIRCLE, clock, seed=1, name=name, sleep_min=sleep_min)
+        set_up_bench(geometry, WORLD, CIRCLE, clock, seed=1, name=name, sleep_min=sleep_min)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.emulator import Bench, Faults, VirtualClock, VirtualLine, read_geometry, set_up, shipped_geometry
+from probewise.emulator import Bench, Faults, VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry
 from probewise.errors import LinkError
 from probewise.recordings import Disc
 from probewise.world.shipped import truth
@@ -41,13 +41,13 @@ def some_places(n: int) -> np.ndarray:
     # Half of them over the circle, which is small.
     places[: 10 * n] = [600, 250] + (places[: 10 * n] - [525, 265]) / 12
     from_edge = np.hypot(places[:, 0] - 600, places[:, 1] - 250) - 80
-    good = geometry.holds(places) & (abs(from_edge) > 20)
+    good = geometry.contains(places) & (abs(from_edge) > 20)
     inside = places[good & (from_edge < 0)][: n // 2]
     return np.concatenate([inside, places[good & (from_edge > 0)][: n - len(inside)]])
 
 
 def bench_over_circle(clock: VirtualClock) -> Bench:
-    return set_up(read_geometry(shipped_geometry()), WORLD, CIRCLE, clock, seed=SEED)
+    return set_up_bench(read_geometry(shipped_geometry()), WORLD, CIRCLE, clock, seed=SEED)
 
 
 @pytest.mark.slow
@@ -77,7 +77,7 @@ def test_joints_stand_where_their_counters_say_but_for_half_a_count(
     text = arm.shipped_geometry().read_text(encoding="utf-8")
     file = tmp_path / "arm.toml"
     file.write_text(text if play else re.sub(r"play_deg = [\d.]+", "play_deg = 0", text), encoding="utf-8")
-    bench = set_up(read_geometry(file), WORLD, CIRCLE, clock, seed=SEED)
+    bench = set_up_bench(read_geometry(file), WORLD, CIRCLE, clock, seed=SEED)
     geometry = arm.read_geometry(file)
     machine = BrickMachine(Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock), geometry)
     off = []

@@ -10,7 +10,7 @@ import pytest
 
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
-from probewise.emulator import Bench, Faults, VirtualClock, VirtualLine, read_geometry, set_up, shipped_geometry
+from probewise.emulator import Bench, Faults, VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry
 from probewise.recordings import Disc
 from probewise.world.shipped import truth
 
@@ -28,7 +28,7 @@ def with_stops(*names: str) -> arm.Geometry:
 
 def lost(clock: VirtualClock, **turned_deg: float) -> Bench:
     """Set up an arm whose joints were turned by hand while its counters showed 0."""
-    bench = set_up(read_geometry(shipped_geometry()), truth("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1)
+    bench = set_up_bench(read_geometry(shipped_geometry()), truth("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1)
     names = ("base", "shoulder", "elbow")
     for joint, name in zip(bench.arm.joints, names, strict=True):
         joint.bring_to(joint.numbers.home_deg + turned_deg.get(name, 0.0))

@@ -11,8 +11,8 @@ from scipy.special import ndtr
 from probewise.arm import read_geometry, shipped_geometry
 from probewise.arm.fitting import fit_geometry
 from probewise.arm.geometry import Accuracy
-from probewise.arm.marks import marks_of
-from probewise.arm.uncertainty import FITTED, RULER_SDS, places_of, slopes_mm, values_of
+from probewise.arm.marks import places_of_marks
+from probewise.arm.uncertainty import FITTED, RULER_SDS, places_at_values, slopes_mm, values_of_fitted
 from probewise.errors import FileError, ParameterError
 from probewise.experiment import FittedArm, explore, found_shape, result_json, run, samples_csv, with_arm_error
 
@@ -171,10 +171,10 @@ def test_a_journal_is_not_continued_with_an_arm_that_is_known_otherwise(small_fo
 
 def built_and_fitted(rng):
     """Build an arm as a ruler leaves it, touch marks with it to 1 mm, fit it: the geometry, and what is true."""
-    marks = marks_of(ARM)
-    turned = ARM.angles_rad(marks, 32.0) - values_of(ARM)[:3]
-    true = values_of(ARM) + RULER_SDS * rng.standard_normal(9)
-    met = places_of(ARM, true, turned) + rng.standard_normal((len(marks), 3))
+    marks = places_of_marks(ARM)
+    turned = ARM.angles_rad(marks, 32.0) - values_of_fitted(ARM)[:3]
+    true = values_of_fitted(ARM) + RULER_SDS * rng.standard_normal(9)
+    met = places_at_values(ARM, true, turned) + rng.standard_normal((len(marks), 3))
     return fit_geometry(ARM, turned, met).geometry, true
 
 
@@ -200,8 +200,8 @@ def test_two_hundred_fitted_arms_miss_the_circle_by_what_is_claimed(found):
     with_arm, without = [], []
     for _ in range(200):
         fitted, true = built_and_fitted(rng)
-        turned = fitted.angles_rad(np.concatenate([told, middle]), 14.0) - values_of(fitted)[:3]
-        stands = places_of(ARM, true, turned)
+        turned = fitted.angles_rad(np.concatenate([told, middle]), 14.0) - values_of_fitted(fitted)[:3]
+        stands = places_at_values(ARM, true, turned)
         height_mm = 14.0 + stands[:-1, 2] - stands[-1, 2]
         seen = ndtr((TRUE[2] - np.hypot(*(stands[:-1, :2] - TRUE[:2]).T)) / 8.0)
         values = DARK + 50.0 * (14.0 / height_mm) ** 2 * seen + rng.standard_normal(len(told))

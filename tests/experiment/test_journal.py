@@ -10,7 +10,7 @@ import pytest
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, ParameterError
 from probewise.experiment import (
-    Hidden,
+    HiddenShape,
     JournalWriter,
     PosteriorSummary,
     read_journal,
@@ -37,8 +37,8 @@ def summary(k):
 def write(path, n):
     with JournalWriter.begin(path, SETTINGS) as writer:
         for k in range(1, n + 1):
-            writer.reading(k, reading(k))
-            writer.summary(summary(k))
+            writer.write_reading(k, reading(k))
+            writer.write_summary(summary(k))
 
 
 def test_a_journal_reads_back_every_bit_of_what_was_written(tmp_path):
@@ -87,15 +87,15 @@ def test_resuming_goes_on_behind_the_last_reading_which_stays_in_the_file(tmp_pa
         with JournalWriter.resume(read_journal(path)) as writer:
             assert path.read_bytes() == whole[: reading_done if n_bytes >= reading_done else last]
             if n_bytes < reading_done:
-                writer.reading(3, reading(3))
-            writer.summary(summary(3))
+                writer.write_reading(3, reading(3))
+            writer.write_summary(summary(3))
         assert path.read_bytes() == whole
 
 
 def test_a_missing_reading_is_null_and_comes_back_as_nan(tmp_path):
     with JournalWriter.begin(tmp_path / "j", SETTINGS) as writer:
-        writer.reading(1, Reading(math.nan, Pose(1.0, 2.0), 0.0))
-        writer.summary(summary(1))
+        writer.write_reading(1, Reading(math.nan, Pose(1.0, 2.0), 0.0))
+        writer.write_summary(summary(1))
     assert "NaN" not in (tmp_path / "j").read_text()
     assert math.isnan(read_journal(tmp_path / "j").readings[0].value)
 
@@ -189,7 +189,7 @@ def test_a_value_that_cannot_be_recognised_again_is_refused():
 def test_a_run_over_another_hidden_shape_does_not_go_on_from_a_journal(small, tmp_path):
     """The readings that it holds are of what lay there, whatever the caller believes now."""
     path = tmp_path / "new" / "folder" / "journal.jsonl"
-    here, there = (Hidden("circle", Circle(), np.array([x_mm, 140.0, 60.0])) for x_mm in (250.0, 300.0))
+    here, there = (HiddenShape("circle", Circle(), np.array([x_mm, 140.0, 60.0])) for x_mm in (250.0, 300.0))
 
     def go_on(hidden):
         rng = np.random.default_rng(5)
@@ -248,6 +248,6 @@ def test_the_clock_of_ones_own_instrument_goes_on_where_an_earlier_run_ended(sma
 )
 def test_what_lies_there_may_be_said_in_order_or_by_name(truth, name, theta):
     members = {"circle": Circle()}
-    hidden = Hidden.of(truth, members, Circle().field, rng=np.random.default_rng(0))
+    hidden = HiddenShape.of(truth, members, Circle().field, rng=np.random.default_rng(0))
     assert (hidden.name, hidden.theta.tolist()) == (name, theta)
-    assert hidden.document["shape"] == name
+    assert hidden.journal_entry["shape"] == name

@@ -106,7 +106,7 @@ def test_the_naive_model_asks_yes_or_no_and_needs_more_readings(found, small):
 def test_a_step_by_hand_is_a_step_of_the_loop(small):
     experiment, arm = small.experiment(), small.arm()
     first = next(iter(explore(arm, experiment, rng=rng())))
-    field = FieldOf.under(arm, experiment.grid)
+    field = FieldOf.of(arm, experiment.grid)
     # explore() takes the first child of the generator's seed, and of that a child for each reading.
     child = np.random.SeedSequence(2013).spawn(1)[0]
     start, then = (
@@ -424,9 +424,9 @@ def test_a_set_of_shapes_stops_on_the_lengths_of_the_most_probable(small):
     assert np.isfinite(info.mean).nonzero()[0].tolist() == sorted(shape.prior.columns[likely].tolist())
     assert sum(info.shapes.values()) == pytest.approx(1.0)
     known = np.where(np.isfinite(info.sd), 1.0, np.nan)
-    assert experiment.is_known(known, {"circle": 0.99, "rectangle": 0.01})
-    assert not experiment.is_known(known, {"circle": 0.6, "rectangle": 0.4})
-    assert not experiment.is_known(known * 5, {"circle": 0.99, "rectangle": 0.01})
+    assert experiment.may_stop(known, {"circle": 0.99, "rectangle": 0.01})
+    assert not experiment.may_stop(known, {"circle": 0.6, "rectangle": 0.4})
+    assert not experiment.may_stop(known * 5, {"circle": 0.99, "rectangle": 0.01})
 
 
 def test_the_naive_sensor_of_the_package_runs_in_the_loop(small):
@@ -449,7 +449,7 @@ def test_a_run_that_nothing_explains_does_not_call_itself_known(small):
     said = [info.number for info in result.steps if any("no hypothesis explains" in note for note in info.notes)]
     assert said
     assert not result.reached
-    assert result.experiment.is_known(result.last.sd, result.last.shapes)
+    assert result.experiment.may_stop(result.last.sd, result.last.shapes)
     assert "is not to be trusted" in result.stop_reason
     assert f"p = {result.last.p_value:.1g}" in result.stop_reason
 

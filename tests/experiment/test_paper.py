@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.arm import LegoScale
+from probewise.arm import ReadingScale
 from probewise.arm.instrument import Pose, Reading
 from probewise.calibration import FittedSensor
 from probewise.errors import FileError, NotConvergedError, ParameterError
 from probewise.experiment import (
     NestedSampling,
     OneScan,
+    experiment_from_names,
     explore,
-    levels_from,
-    levels_in,
+    naive_levels_from_recording,
+    naive_levels_from_world,
     paper_experiment,
-    pose_experiment,
     read_journal,
     run,
     student_t_bounds,
@@ -89,7 +89,7 @@ def infer(experiment, readings, previous=None, seed=1):
     from probewise.experiment.posterior import prior_posterior
 
     start = prior_posterior(experiment.kinds, 200, rng=rng()) if previous is None else previous
-    return experiment.learning.updated(start, experiment.problem(readings).recording, rng=rng(seed))
+    return experiment.inference_method.updated(start, experiment.problem(readings).recording, rng=rng(seed))
 
 
 def test_samples_that_repeat_are_walked_apart_and_stay_in_the_posterior(small):
@@ -98,7 +98,7 @@ def test_samples_that_repeat_are_walked_apart_and_stay_in_the_posterior(small):
     readings = readings_at(small.arm(), PLACES)
     found = infer(experiment, readings)
     weighted, recording = found.joined(rng=rng()), experiment.problem(readings).recording
-    drawn = experiment.learning.drawn(found, weighted, recording, 400, rng=rng(2))
+    drawn = experiment.inference_method.drawn(found, weighted, recording, 400, rng=rng(2))
     assert len(np.unique(weighted.samples(400, rng=rng(2)), axis=0)) < 400
     assert len(np.unique(drawn, axis=0)) == 400
     assert (np.abs(drawn.mean(axis=0) - weighted.mean()) < 5 * weighted.sd() / math.sqrt(60)).all()
@@ -166,7 +166,7 @@ def test_of_two_shapes_each_has_a_run_of_its_own_and_the_right_one_wins():
     found = infer(experiment, readings)
     probability = dict(zip(("circle", "rectangle"), found.probability, strict=True))
     assert probability["circle"] > 0.5
-    drawn = experiment.learning.drawn(
+    drawn = experiment.inference_method.drawn(
         found, found.joined(rng=rng()), experiment.problem(readings).recording, 50, rng=rng()
     )
     assert drawn.shape == (50, len(shape.prior.names))
@@ -230,7 +230,7 @@ def test_the_paper_experiment_is_posed_as_the_paper_says():
 )
 def test_what_does_not_go_with_the_method_is_refused_by_name(options, named):
     with pytest.raises(ParameterError) as caught:
-        pose_experiment(sensor(), Circle(), Field(), **{"method": "paper", **options})
+        experiment_from_names(sensor(), Circle(), Field(), **{"method": "paper", **options})
     assert caught.value.name == named
 
 
@@ -242,7 +242,7 @@ def test_levels_and_sds_come_from_readings_over_black_and_white():
     readings[-4:] = 12.0, 8.0, math.nan, 11.0
     patterns = {"edge": HalfPlane(0.0, 0.0), "black": UniformPattern(0.0)}
     plan = Plan.from_arrays(x_mm=x_mm, y_mm=0.0, pattern=["edge"] * n + ["black"] * 4, patterns=patterns, unit="LEGO")
-    found = levels_from(Recording(plan, readings), sensor())
+    found = naive_levels_from_recording(Recording(plan, readings), sensor())
     far = np.abs(x_mm[:n]) > 4 * 4.0  # sd along x' is 4 mm: a thousandth of it reaches as far as 3.1 sds
     black = np.concatenate([readings[:n][far & (x_mm[:n] < 0)], [12.0, 8.0, 11.0]])
     white = readings[:n][far & (x_mm[:n] > 0)]
@@ -251,18 +251,18 @@ def test_levels_and_sds_come_from_readings_over_black_and_white():
     assert found.mu_white == pytest.approx(white.mean(), abs=0.15)
     assert found.sd_white == pytest.approx(white.std(ddof=1), rel=0.15)
     with pytest.raises(ParameterError, match="0 readings over black and 0 over white"):
-        levels_from(Recording(plan.take(np.arange(19, 22)), readings[19:22]), sensor())
+        naive_levels_from_recording(Recording(plan.take(np.arange(19, 22)), readings[19:22]), sensor())
 
 
 def test_a_simulated_sensor_reads_its_levels_on_its_own_scale():
     """Twenty readings of a known world: mean within five standard errors, no sd below that of rounding."""
     spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5))])
     world = World(spot, black=10.3, white=60.0, noise_sd=1.0)
-    found = levels_in(world, LegoScale(), rng=rng())
+    found = naive_levels_from_world(world, ReadingScale(), rng=rng())
     assert found.mu_black == pytest.approx(10.3, abs=5 * 1.1 / math.sqrt(20))
     assert found.mu_white == pytest.approx(60.0, abs=5 * 1.1 / math.sqrt(20))
     assert 0.5 < found.sd_black < 2
-    quiet = levels_in(replace(world, noise_sd=0.0), LegoScale(), rng=rng())
+    quiet = naive_levels_from_world(replace(world, noise_sd=0.0), ReadingScale(), rng=rng())
     assert (quiet.mu_black, quiet.sd_white) == (10.0, 1 / math.sqrt(12))
 
 

@@ -21,7 +21,7 @@ from probewise.experiment.particles import (
     resample_and_move,
     update,
 )
-from probewise.experiment.stopping_rule import information
+from probewise.experiment.stopping_rule import information_nats
 from probewise.nested import run
 from probewise.priors import Product, Uniform
 
@@ -156,7 +156,7 @@ def test_hypotheses_that_are_ruled_out_stay_so(small):
     theta = experiment.prior.from_unit_cube(rng(2).random((200_000, 3)))
     left = np.isfinite(experiment.problem(readings).log_likelihood(theta)).mean()
     assert math.exp(posterior.log_z) == pytest.approx(left, rel=5 * posterior.log_z_error + 0.02)
-    assert information(posterior) == pytest.approx(-posterior.log_z)
+    assert information_nats(posterior) == pytest.approx(-posterior.log_z)
 
 
 def test_a_missing_reading_changes_nothing(small):
@@ -223,7 +223,7 @@ def test_a_prior_without_mass_is_refused():
 def test_kernels_have_the_density_of_the_gaussians_they_draw_from():
     """Two routes to the density: the product of features, and scipy's for each kernel."""
     points = rng().normal(size=(400, 3)) * [30.0, 1.0, 8.0] + [500.0, 200.0, 80.0]
-    kernels = LocalKernels.about(points, rng=rng(1))
+    kernels = LocalKernels.fitted_to(points, rng=rng(1))
     at = kernels.draw(50, rng=rng(2))
     each = [
         multivariate_normal(kernels.origin + centre, root @ root.T).pdf(at)
@@ -237,7 +237,7 @@ def test_kernels_follow_a_bent_shell():
     angle = rng().uniform(0, 2 * np.pi, 3000)
     radius = 100.0 + 0.2 * rng(1).standard_normal(3000)
     points = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
-    away = np.hypot(*LocalKernels.about(points, rng=rng(2)).draw(2000, rng=rng(3)).T) - 100.0
+    away = np.hypot(*LocalKernels.fitted_to(points, rng=rng(2)).draw(2000, rng=rng(3)).T) - 100.0
     assert np.quantile(np.abs(away), 0.9) < 0.8
 
 

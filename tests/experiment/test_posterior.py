@@ -8,7 +8,7 @@ from scipy.special import logsumexp
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import NotConvergedError
-from probewise.experiment.method import from_scratch
+from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.posterior import prior_posterior, updated
 from probewise.scene import AnyOf
 
@@ -64,7 +64,7 @@ def followed(experiment, n, *, seed=0):
             experiment.problem(readings(k)).recording,
             experiment.n_particles,
             rng=random,
-            from_scratch=lambda problem: from_scratch(problem, experiment.n_live, random),
+            from_scratch=lambda problem: nested_sampling_from_scratch(problem, experiment.n_live, random),
         )
         yield now
 
@@ -104,7 +104,7 @@ def test_samples_of_all_kinds_are_one_posterior_of_the_whole(small):
     joined = now.joined(rng=rng())
     assert joined.names == experiment.names
     assert joined.weight.sum() == pytest.approx(1.0)
-    which = experiment.shape.which(joined.theta)
+    which = experiment.shape.shape_index(joined.theta)
     np.testing.assert_allclose(np.bincount(which, weights=joined.weight), now.probability)
     assert np.isfinite(experiment.prior.log_prob(joined.theta)).all()
     np.testing.assert_allclose(
@@ -131,7 +131,7 @@ def test_a_kind_that_cannot_be_is_impossible_and_the_others_go_on(small):
             experiment.problem(taken[:k]).recording,
             1500,
             rng=random,
-            from_scratch=lambda problem: from_scratch(problem, experiment.n_live, random),
+            from_scratch=lambda problem: nested_sampling_from_scratch(problem, experiment.n_live, random),
         )
     np.testing.assert_array_equal(now.probability, [0.0, 1.0])
 
@@ -146,5 +146,5 @@ def test_readings_that_no_kind_allows_are_refused(small):
             experiment.problem([Reading(200.0, Pose(150.0, 140.0), 0.0)]).recording,
             300,
             rng=random,
-            from_scratch=lambda problem: from_scratch(problem, experiment.n_live, random),
+            from_scratch=lambda problem: nested_sampling_from_scratch(problem, experiment.n_live, random),
         )

@@ -24,22 +24,22 @@ from probewise.experiment import (
     experiment_for,
     left_out_of,
     posterior,
-    repaired,
+    repaired_sensor,
     result_json,
     step,
     with_arm_error,
 )
-from probewise.experiment.acquisition import ArmOverGrid, inquire
+from probewise.experiment.acquisition import ArmOverGrid, predict_and_rate_readings
 from probewise.experiment.arm_error import arm_error
-from probewise.experiment.checking import ENOUGH_BITS, NAMES, Outline, bits_of_names
-from probewise.experiment.method import from_scratch
+from probewise.experiment.checking import ENOUGH_BITS, NAMES, Outline, bits_about_name
+from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.noise_rivals import (
-    CorrelatedLaw,
-    FlickerLaw,
-    LatticeLaw,
-    LostReadingLaw,
-    OutlierLaw,
-    SignalDependentLaw,
+    CorrelatedLikelihood,
+    FlickerLikelihood,
+    LatticeLikelihood,
+    LostReadingLikelihood,
+    OutlierLikelihood,
+    SignalDependentLikelihood,
 )
 from probewise.experiment.posterior import prior_posterior, reconsidered, updated
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
@@ -64,7 +64,7 @@ def stepped(doubting):
     """Two steps of a run that doubts, both of the prior's first places."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmOverGrid.under(arm, doubting.grid)
+        field = ArmOverGrid.of(arm, doubting.grid)
         state = begin(doubting, field, rng=rng)
         prior_bits = prior_entropy(doubting.prior, rng=rng)
         found = []
@@ -136,7 +136,7 @@ def laws(*kinds):
     return [rival.likelihood for rival in rivals() if isinstance(rival.likelihood, kinds)]
 
 
-@pytest.mark.parametrize("law", laws(OutlierLaw, CorrelatedLaw, FlickerLaw))
+@pytest.mark.parametrize("law", laws(OutlierLikelihood, CorrelatedLikelihood, FlickerLikelihood))
 def test_laws_of_the_residual_alone_are_densities(law):
     """As the level goes over all levels, so does the residual; its density is one."""
     level = np.linspace(-600.0, 670.0, 60_001)
@@ -144,7 +144,7 @@ def test_laws_of_the_residual_alone_are_densities(law):
     assert np.trapezoid(density, level) == pytest.approx(1.0, abs=1e-3)
 
 
-@pytest.mark.parametrize("law", laws(LostReadingLaw, SignalDependentLaw, LatticeLaw))
+@pytest.mark.parametrize("law", laws(LostReadingLikelihood, SignalDependentLikelihood, LatticeLikelihood))
 def test_laws_of_the_noise_are_densities(law):
     """The density of one reading over all readings is one."""
 
@@ -160,7 +160,7 @@ def test_laws_of_the_noise_are_densities(law):
 def test_rounded_laws_of_the_noise_are_probabilities_of_cells():
     cells = np.arange(-200.0, 271.0)
     shares, sizes = np.array([0.1]), np.array([3.0])
-    for law in (OutlierLaw(1.5, 1.0, shares, sizes), LostReadingLaw(1.5, 1.0, 10.0, 10.0, 60.0)):
+    for law in (OutlierLikelihood(1.5, 1.0, shares, sizes), LostReadingLikelihood(1.5, 1.0, 10.0, 10.0, 60.0)):
         total = sum(math.exp(law.log_prob(np.array([cell]), np.array([[35.3]]))[0]) for cell in cells)
         assert total == pytest.approx(1.0, abs=1e-3)
 
@@ -224,7 +224,7 @@ def test_a_reading_tells_names_by_what_they_predict():
     alike = np.tile(20.0 + 3.0 * even, 2)
     apart = np.concatenate([20.0 + 3.0 * even, 90.0 + 3.0 * even])
     near = np.concatenate([20.0 + 0.5 * even, 23.0 + 2.0 * even])
-    bits = bits_of_names(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
+    bits = bits_about_name(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
     at = np.linspace(-20.0, 60.0, 20_001)
     given = [norm.pdf(at, mean, math.hypot(sd, 1.0)) for mean, sd in ((20.0, 0.5), (23.0, 2.0))]
     both = 0.5 * (given[0] + given[1])
@@ -240,7 +240,7 @@ def test_a_few_stragglers_of_a_name_promise_nothing():
     even = 20.0 + 0.5 * norm.ppf((np.arange(n) + 0.5) / n)
     weight, names = np.full(2 * n, 0.5 / n), np.repeat(["", "halo"], n)
     straggling = np.concatenate([even, np.append(even[:-1], 60.0)])
-    bits = bits_of_names(weight, straggling[:, None], names, Readout(1.0))
+    bits = bits_about_name(weight, straggling[:, None], names, Readout(1.0))
     at = np.linspace(0.0, 80.0, 20_001)
     given = [norm.pdf(at[:, None], own, 1.0).mean(axis=1) for own in np.split(straggling, 2)]
     both = np.maximum(0.5 * (given[0] + given[1]), 1e-300)
@@ -253,7 +253,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
     """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as simulated:
-        field = ArmOverGrid.under(simulated, doubting.grid)
+        field = ArmOverGrid.of(simulated, doubting.grid)
     state, found = begin(doubting, field, rng=rng), []
     for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
         reading = Reading(value, Pose(x, y), 8.0 * k)
@@ -272,7 +272,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
 
     run = Exploration(doubting, tuple(found))
     claimed = with_arm_error(run, geometry, levels=(10.0, 60.0), rng=np.random.default_rng(1)).arm.slopes
-    np.testing.assert_allclose(claimed, slopes(last.kinds.wary))
+    np.testing.assert_allclose(claimed, slopes(last.kinds.with_warier_odds))
     assert not np.allclose(claimed, slopes(last.kinds))
 
 
@@ -286,9 +286,9 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     inside = Reading(60.0, Pose(x - 0.6 * radius, y), 0.0)
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmOverGrid.under(arm, doubting.grid)
-    prospect, _ = inquire(doubting, joined, joined.theta[:20], field, at=inside)
-    outline = Outline.of(prospect, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
+        field = ArmOverGrid.of(arm, doubting.grid)
+    utility_input, _ = predict_and_rate_readings(doubting, joined, joined.theta[:20], field, at=inside)
+    outline = Outline.of(utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
     assert outline is not None
     far = outline.far_side
     opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])
@@ -297,7 +297,7 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     if asked_deg is None:
         assert far is None
         return
-    place = doubting.grid.places_mm[prospect.rows[far] % doubting.grid.n_places]
+    place = doubting.grid.places_mm[utility_input.rows[far] % doubting.grid.n_places]
     asked = x + radius * math.cos(math.radians(asked_deg)), y + radius * math.sin(math.radians(asked_deg))
     assert np.hypot(*(place - asked)) < 12.0
 
@@ -313,12 +313,12 @@ def test_a_patch_may_lie_anywhere_on_the_field():
 
 def test_a_repaired_sensor_holds_the_effect_that_leads(sensor, stepped):
     rng = np.random.default_rng(1)
-    assert repaired(sensor, stepped[-1], rng=rng) is sensor
-    mended = repaired(sensor, leading(stepped[-1], "saturation"), rng=rng)
+    assert repaired_sensor(sensor, stepped[-1], rng=rng) is sensor
+    mended = repaired_sensor(sensor, leading(stepped[-1], "saturation"), rng=rng)
     assert mended.effects == ("saturation",)
     again = type(sensor).from_json(mended.to_json())
     assert again.mean()["saturation.level"] == pytest.approx(mended.mean()["saturation.level"])
-    told = repaired(sensor, leading(stepped[-1], "dropouts"), rng=rng)
+    told = repaired_sensor(sensor, leading(stepped[-1], "dropouts"), rng=rng)
     assert told.effects == ()
     assert any("dropouts" in note for note in told.notes)
 
@@ -371,7 +371,7 @@ def test_rows_of_the_study_are_summed_up():
 
 def test_a_memory_of_the_noise_is_heard():
     """Errors that repeat each other are likelier under it, errors that do not under the plain noise."""
-    law, level = CorrelatedLaw(1.0, 0.0), np.full((1, 12), 35.0)
+    law, level = CorrelatedLikelihood(1.0, 0.0), np.full((1, 12), 35.0)
     alike, apart = 35.0 + np.full(12, 1.5), 35.0 + 1.5 * np.tile([1.0, -1.0, -1.0, 1.0], 3)
     plain = experiment_of(REFERENCE).likelihood
     gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (alike, apart)]
@@ -380,7 +380,7 @@ def test_a_memory_of_the_noise_is_heard():
 
 
 def test_readings_on_a_lattice_are_no_chance():
-    law, level = LatticeLaw(1.0, 0.0), np.full((1, 8), 35.0)
+    law, level = LatticeLikelihood(1.0, 0.0), np.full((1, 8), 35.0)
     level[0, 4:] = 12.0
     plain = experiment_of(REFERENCE).likelihood
     coarse = np.array([35.0, 35.0, 40.0, 30.0, 10.0, 15.0, 10.0, 10.0])
@@ -393,7 +393,7 @@ def test_readings_on_a_lattice_are_no_chance():
 def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
     """Before a shape is seen all is black: readings of 10.0 and 5.0 are no lost ones, and places without a shape."""
     readings, level = np.array(read), np.full((1, len(read)), 9.0)
-    rounded, lost = LatticeLaw(1.0, 0.0), laws(LostReadingLaw)[0]
+    rounded, lost = LatticeLikelihood(1.0, 0.0), laws(LostReadingLikelihood)[0]
     assert rounded.log_prob(readings, level)[0] > lost.log_prob(readings, level)[0] + 2.0
     shared = np.array([10.0, 9.31, 10.72, 8.4, 10.0])  # two were lost, the others were read
     level = np.full((1, 5), 9.6)
@@ -401,7 +401,7 @@ def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
 
 
 def test_readings_that_are_rounded_as_declared_recur_by_nature():
-    law, level = LatticeLaw(0.6, 1.0), np.full((1, 6), 10.2)
+    law, level = LatticeLikelihood(0.6, 1.0), np.full((1, 6), 10.2)
     plain = Rounded(sd=0.6, step=1.0, low=1.0, high=100.0)
     for read in ([10.0] * 6, [10.0, 11.0, 10.0, 10.0, 11.0, 10.0]):
         assert law.log_prob(np.array(read), level)[0] == pytest.approx(
@@ -410,7 +410,7 @@ def test_readings_that_are_rounded_as_declared_recur_by_nature():
 
 
 def test_noise_that_grows_with_the_light_is_heard():
-    law, level = SignalDependentLaw(1.0, 0.0, 10.0, 60.0), np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12)
+    law, level = SignalDependentLikelihood(1.0, 0.0, 10.0, 60.0), np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12)
     read = level[0] + np.where(level[0] > 50, 4.0, 0.5) * np.tile([1.0, -1.0], 6)
     plain = experiment_of(REFERENCE).likelihood
     assert law.log_prob(read, level)[0] > plain.log_prob(read, level)[0] + 5.0
@@ -419,7 +419,7 @@ def test_noise_that_grows_with_the_light_is_heard():
 def test_a_run_is_the_warier_the_less_it_could_end_wrong(stepped):
     """To doubt ten times as readily multiplies the odds of every rival by ten and leaves evidences as they are."""
     kinds = stepped[-1].kinds
-    wary = kinds.doubting(10.0)
+    wary = kinds.with_fault_odds_times(10.0)
     np.testing.assert_allclose([p.log_z for p in wary.particles], [p.log_z for p in kinds.particles])
     odds = [found.left_out["backlash"] / found.left_out[""] for found in (wary, kinds)]
     assert odds[0] == pytest.approx(10.0 * odds[1])
@@ -427,7 +427,7 @@ def test_a_run_is_the_warier_the_less_it_could_end_wrong(stepped):
 
 def test_readings_lost_to_exactly_black_are_no_chance():
     """Noise never repeats a value; three readings that are black to the last digit were lost."""
-    law = laws(LostReadingLaw)[0]
+    law = laws(LostReadingLikelihood)[0]
     level = np.array([[60.0, 10.0, 10.0, 10.0, 60.0]])
     plain = experiment_of(REFERENCE).likelihood
     exact, noisy = np.array([60.3, 10.0, 10.0, 10.0, 59.1]), np.array([60.3, 10.4, 9.2, 10.9, 59.1])
@@ -455,7 +455,7 @@ def test_a_rival_whose_samples_went_astray_is_found_from_what_others_believe(dou
     rng = np.random.default_rng(seed)
     kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
     problem = kind.problem(played(doubting, kind, 6.0))
-    right = from_scratch(problem, 200, rng)
+    right = nested_sampling_from_scratch(problem, 200, rng)
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     lost = replace(prior_posterior([kind], 500, rng=rng).particles[0].weighted, log_z=-1000.0)
@@ -470,7 +470,7 @@ def test_what_fits_promise_is_the_evidence(doubting):
     """Two routes: Gaussians about fits, and nested sampling. Gear play of 6 mm is known to a few tenths."""
     kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
     problem, rng = kind.problem(played(doubting, kind, 6.0)), np.random.default_rng(5)
-    right = from_scratch(problem, 200, rng)
+    right = nested_sampling_from_scratch(problem, 200, rng)
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     assert fit_kind(kind, problem, [donor], noise_sd=1.0, rng=rng).highest_log_z == pytest.approx(right.log_z, abs=3.0)
@@ -481,7 +481,7 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
     kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "backlash", "nonlinearity")]
     recording, rng = played(doubting, kinds[-1], 12.0), np.random.default_rng(1)
     now = prior_posterior(kinds, 3000, rng=rng)
-    solved = partial(from_scratch, n_live=100, rng=rng)
+    solved = partial(nested_sampling_from_scratch, n_live=100, rng=rng)
     for n in range(1, len(recording) + 1):
         now = updated(now, recording.take(np.arange(n)), 3000, rng=rng, from_scratch=solved)
     once = reconsidered(now, recording, 3000, rng=rng, from_scratch=solved)
@@ -509,7 +509,7 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
 
     def from_nothing(problem):
         solved.append(problem)
-        return from_scratch(problem, 100, rng)
+        return nested_sampling_from_scratch(problem, 100, rng)
 
     def by_few(found, problem, own, *, n_draws, with_own, rng):
         weighted = sampled_about_fits(found, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
@@ -584,5 +584,7 @@ def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
     now = prior_posterior(kinds, 3000, rng=rng)
     for k in range(1, len(read) + 1):
         recording = experiment.problem(read[:k]).recording
-        now = updated(now, recording, 3000, rng=rng, from_scratch=lambda problem: from_scratch(problem, 100, rng))
+        now = updated(
+            now, recording, 3000, rng=rng, from_scratch=lambda problem: nested_sampling_from_scratch(problem, 100, rng)
+        )
     assert now.left_out["ambient_step"] > 0.97

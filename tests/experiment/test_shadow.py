@@ -14,7 +14,7 @@ def steps_of(small, **options):
 
 
 def watched(small, other):
-    field = ArmOverGrid.under(small.arm(), COARSE)
+    field = ArmOverGrid.of(small.arm(), COARSE)
     return list(shadow_run(steps_of(small), other, field, rng=np.random.default_rng(2)))
 
 

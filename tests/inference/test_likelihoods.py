@@ -22,7 +22,7 @@ from probewise.inference import (
     reading_span,
     sd_ceiling,
     sd_floor,
-    student_t,
+    student_t_of,
 )
 from probewise.inference.gaussian import log_prob_gaussian
 from probewise.priors import LogUniform, Product, Uniform
@@ -212,8 +212,8 @@ def test_the_floor_is_that_of_rounding_or_a_thousandth_of_the_span() -> None:
 
 def test_a_data_set_is_a_scan_unless_told_otherwise() -> None:
     rec = recording([1, 2, float("nan"), 4], scan=[0, 0, 1, 1])
-    assert student_t(rec).groups.tolist() == [0, 0, 1]
-    assert student_t(rec, np.array([5, 6, 7, 8])).groups.tolist() == [5, 6, 8]
+    assert student_t_of(rec).groups.tolist() == [0, 0, 1]
+    assert student_t_of(rec, np.array([5, 6, 7, 8])).groups.tolist() == [5, 6, 8]
 
 
 def test_shapes_and_bounds_are_checked() -> None:

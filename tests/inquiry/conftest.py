@@ -1,4 +1,4 @@
-"""Discs under the package's own sensor, and prospects made of numbers."""
+"""Discs under the package's own sensor, and inputs of utilities made of numbers."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.inquiry import Designs, DirectForecast, Grid, Prospect, Readout, forecast_of
+from probewise.inquiry import Designs, DirectForecast, Grid, Readout, UtilityInput, forecast_of
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NaiveSensor
 
@@ -38,13 +38,13 @@ class Listed:
 
 
 def listed(table, *, noise_sd=1.0, step=1.0, weight=None, repeats=(1,), cost_s=None):
-    """Prospect of hypotheses whose readings are given, (n_hypotheses, n_places): a grid of two equal rows."""
+    """Input of utilities: hypotheses whose readings are given, (n_hypotheses, n_places): a grid of two equal rows."""
     table = np.asarray(table, dtype=float)
     n, n_x = table.shape
     designs = Designs(Grid(n_x - 1.0, 1.0, n_x, 2), repeats=repeats)
     theta = np.arange(float(n))[:, None]
     rows = np.flatnonzero(np.arange(len(designs)) % (2 * n_x) < n_x)
-    return Prospect(
+    return UtilityInput(
         DirectForecast(Listed(tuple(map(tuple, table)))),
         Readout(noise_sd, step),
         theta,
@@ -61,7 +61,7 @@ def over_discs(model, theta, *, grid=None, orientations_rad=(0.0,), readout=None
     designs = Designs(grid or Grid(), orientations_rad)
     n = len(theta)
     rows = np.arange(len(designs))
-    return Prospect(
+    return UtilityInput(
         forecast_of(model),
         readout or Readout(1.0),
         theta,

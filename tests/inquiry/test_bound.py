@@ -40,13 +40,13 @@ def test_the_target_is_the_gaussian_of_that_sd():
 def test_search_and_refinement_are_divided_by_what_each_can_carry():
     bound = fewest_readings(25.0, 21.0, 12.0, most_covered=0.11, capacity=3.0)
     yes = -0.11 * log2(0.11) - 0.89 * log2(0.89)
-    assert bound.search == pytest.approx(4.0 / yes)
-    assert bound.refinement == pytest.approx(3.0)
+    assert bound.readings_of_search == pytest.approx(4.0 / yes)
+    assert bound.readings_of_refinement == pytest.approx(3.0)
     assert bound.readings == pytest.approx(4.0 / yes + 3.0)
 
 
 def test_a_search_that_covers_half_carries_one_bit_at_most():
-    assert fewest_readings(25.0, 21.0, 12.0, most_covered=0.8, capacity=3.0).search == pytest.approx(4.0)
+    assert fewest_readings(25.0, 21.0, 12.0, most_covered=0.8, capacity=3.0).readings_of_search == pytest.approx(4.0)
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from probewise.inquiry import (
     DiscTable,
     Grid,
     InformationGain,
-    Prospect,
     Readout,
     TabulatedChain,
+    UtilityInput,
     forecast_of,
     utility_map,
 )
@@ -113,9 +113,11 @@ def test_the_information_of_the_table_is_that_of_asking(made):
 
 def test_the_whole_map_of_3000_hypotheses_is_quick(made):
     """Aim: 0.1 s of one core; three times that leaves room for a busy machine."""
-    prospect = made.over_discs(made.chain(20), made.circles(3000))
-    utility_map(prospect, InformationGain())
-    again = type(prospect)(**{k: v for k, v in vars(prospect).items() if k in prospect.__dataclass_fields__})
+    utility_input = made.over_discs(made.chain(20), made.circles(3000))
+    utility_map(utility_input, InformationGain())
+    again = type(utility_input)(
+        **{k: v for k, v in vars(utility_input).items() if k in utility_input.__dataclass_fields__}
+    )
     start = time.process_time()
     utility_map(again, InformationGain())
     assert time.process_time() - start < 0.3
@@ -130,12 +132,12 @@ def test_a_sensor_of_sixteen_bits_chooses_its_place_as_quickly_as_another():
     bits = []
     for scale, noise_sd in ((1.0, 0.05), (1000.0, 0.5)):
         model = Chain(mixture, FixedLevels(10.0 * scale, 60.0 * scale), HypothesisScene(circle))
-        prospect = Prospect(
+        utility_input = UtilityInput(
             forecast_of(model), Readout(noise_sd), theta, np.full(200, 1 / 200), theta, Designs(grid),
             Designs(grid).plan("field"), np.arange(grid.n_places), np.ones(grid.n_places),
         )  # fmt: skip
-        assert len(prospect.predictive.levels) == MOST_LEVELS
-        bits.append(prospect.information(prospect.weight))
+        assert len(utility_input.predictive.levels) == MOST_LEVELS
+        bits.append(utility_input.information(utility_input.weight))
     # A hundred times less noise tells no less anywhere, and what 200 circles can tell bounds both.
     assert (bits[1] > bits[0] - 0.05).all()
     assert bits[1].max() <= np.log2(200)

@@ -41,10 +41,10 @@ def test_the_entropy_is_that_of_counting_each_place_by_itself(made):
 
 
 def test_wider_bins_hold_more_and_tell_less(made):
-    prospect = made.listed(np.random.default_rng(2).normal(30.0, 8.0, (50, 30)))
-    wide = ReadingEntropy(bin_width=5.0)(prospect)
-    assert (wide <= ReadingEntropy()(prospect) + 1e-12).all()
-    expected = [counted_entropy(np.rint(column / 5.0).tolist()) for column in prospect.predicted.T]
+    utility_input = made.listed(np.random.default_rng(2).normal(30.0, 8.0, (50, 30)))
+    wide = ReadingEntropy(bin_width=5.0)(utility_input)
+    assert (wide <= ReadingEntropy()(utility_input) + 1e-12).all()
+    expected = [counted_entropy(np.rint(column / 5.0).tolist()) for column in utility_input.predicted.T]
     np.testing.assert_allclose(wide, expected, atol=1e-12)
 
 

@@ -15,9 +15,9 @@ from probewise.inquiry import (
     Goal,
     Grid,
     InformationGain,
-    Prospect,
     Readout,
     TabulatedForecast,
+    UtilityInput,
     forecast_of,
     utility_map,
 )
@@ -63,7 +63,7 @@ def prospect_of(forecast, theta, designs, *, instrumentation=None, noise_sd=1.0,
     n, rows = len(theta), np.arange(len(designs))
     weight = np.full(n, 1.0 / n)
     cost = np.ones(len(rows))
-    return Prospect(forecast, Readout(noise_sd, 1.0), theta, weight, theta[:50], designs, plan, rows, cost, goal)
+    return UtilityInput(forecast, Readout(noise_sd, 1.0), theta, weight, theta[:50], designs, plan, rows, cost, goal)
 
 
 @pytest.mark.parametrize("mixture", [ONE, pytest.param(TWO, marks=pytest.mark.slow)], ids=["one", "two"])
@@ -94,7 +94,7 @@ def test_the_weights_of_levels_are_those_of_asking_every_hypothesis(name):
     weight[:40] = 0.0
     plan, rows = designs.plan("field"), np.random.default_rng(6).integers(grid.n_places, size=200)
     predictive = TabulatedForecast.of(model).predictive(theta, weight, designs, plan, np.arange(len(plan)), 1.0)
-    ((_, mass),) = predictive.maps(weight)
+    ((_, mass),) = predictive.level_weights(weight)
     np.testing.assert_allclose(mass.sum(axis=1), weight.sum(), atol=1e-12)
     exact = model.predict(theta, plan.take(rows))
     width = predictive.levels[1] - predictive.levels[0]

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from probewise.errors import ParameterError, ShapeError
-from probewise.inquiry import Grid, Readout, Rival, tell_apart
+from probewise.inquiry import Grid, Readout, Rival, information_about_rivals
 from probewise.recordings import HalfPlane
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
@@ -30,14 +30,14 @@ def places(n):
 
 
 def test_models_that_disagree_by_far_are_told_apart_by_one_reading(made):
-    bits = tell_apart(rivals(made, [10.0, 10.0, 10.0], [10.0, 60.0, 11.0]), places(3), Readout(1.0, 1.0))
+    bits = information_about_rivals(rivals(made, [10.0, 10.0, 10.0], [10.0, 60.0, 11.0]), places(3), Readout(1.0, 1.0))
     assert bits[0] == pytest.approx(0.0, abs=1e-9)
     assert bits[1] == pytest.approx(1.0, abs=1e-6)
     assert 0.1 < bits[2] < 0.3
 
 
 def test_no_reading_tells_more_than_there_is_to_know(made):
-    bits = tell_apart(rivals(made, [0.0, 0.0], [90.0, 0.0], (9.0, 1.0)), places(2), Readout(1.0, 1.0))
+    bits = information_about_rivals(rivals(made, [0.0, 0.0], [90.0, 0.0], (9.0, 1.0)), places(2), Readout(1.0, 1.0))
     assert bits[0] == pytest.approx(-0.9 * log2(0.9) - 0.1 * log2(0.1), abs=1e-6)
 
 
@@ -47,7 +47,7 @@ def test_two_gaussian_predictions_have_the_divergence_of_quadrature(made):
     one, other = norm.pdf(y, 30, 1), norm.pdf(y, 31.5, 1)
     mixed = 0.5 * (one + other)
     exact = sum(0.5 * np.trapezoid(p * np.log2(np.maximum(p, 1e-300) / mixed), y) for p in (one, other))
-    bits = tell_apart(rivals(made, [30.0, 30.0], [31.5, 30.0]), places(2), Readout(1.0))
+    bits = information_about_rivals(rivals(made, [30.0, 30.0], [31.5, 30.0]), places(2), Readout(1.0))
     assert bits[0] == pytest.approx(exact, rel=0.03)
 
 
@@ -56,7 +56,7 @@ def test_what_both_models_are_unsure_of_tells_nothing(made):
     spread = np.linspace(10.0, 60.0, 51)
     one = np.stack([spread, spread], axis=1)
     other = np.stack([spread, np.full(51, 35.0)], axis=1)
-    bits = tell_apart(rivals(made, one, other), places(2), Readout(1.0, 1.0))
+    bits = information_about_rivals(rivals(made, one, other), places(2), Readout(1.0, 1.0))
     assert bits[0] == pytest.approx(0.0, abs=1e-6)
     assert bits[1] > 0.5
 
@@ -74,7 +74,7 @@ def test_one_gaussian_or_two_is_asked_where_the_second_reaches():
         ),
     ]
     grid = Grid(40.0, 1.0, 41, 2)
-    bits = tell_apart(
+    bits = information_about_rivals(
         [Rival(model, np.empty((1, 0)), 1.0) for model in models],
         grid.plan("field").take(np.arange(41)),
         Readout(1.0, 1.0),
@@ -87,9 +87,9 @@ def test_one_gaussian_or_two_is_asked_where_the_second_reaches():
 def test_rivals_that_are_none_are_refused(made):
     one, other = rivals(made, [1.0, 2.0], [1.0, 2.0])
     with pytest.raises(ParameterError, match="two models or more"):
-        tell_apart([one], places(2), Readout(1.0))
+        information_about_rivals([one], places(2), Readout(1.0))
     with pytest.raises(ParameterError, match="probability"):
         Rival(one.model, one.theta, -1.0)
     with pytest.raises(ShapeError, match="one sample or more"):
         Rival(one.model, np.empty((0, 1)), 1.0)
-    assert tell_apart([one, other], places(2), Readout(1.0)) == pytest.approx([0.0, 0.0], abs=1e-9)
+    assert information_about_rivals([one, other], places(2), Readout(1.0)) == pytest.approx([0.0, 0.0], abs=1e-9)

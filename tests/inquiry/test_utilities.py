@@ -61,15 +61,15 @@ def test_rounding_and_noise_lower_the_information(made):
 
 def test_the_papers_entropy_counts_disagreement_that_the_noise_hides(made):
     table = np.random.default_rng(3).normal(0.0, 1.0, (50, 10))
-    prospect = made.listed(table, noise_sd=5.0)
-    assert (ReadingEntropy()(prospect) > 1.5).all()
-    assert (InformationGain()(prospect) < 0.1).all()
+    utility_input = made.listed(table, noise_sd=5.0)
+    assert (ReadingEntropy()(utility_input) > 1.5).all()
+    assert (InformationGain()(utility_input) < 0.1).all()
 
 
 def test_repeats_tell_more_and_never_more_than_all_there_is(made):
     table = np.random.default_rng(4).normal(0.0, 1.0, (30, 6))
-    prospect = made.listed(table, step=None, repeats=(1, 4, 16))
-    once, four, sixteen = InformationGain()(prospect).reshape(3, 6)
+    utility_input = made.listed(table, step=None, repeats=(1, 4, 16))
+    once, four, sixteen = InformationGain()(utility_input).reshape(3, 6)
     assert (once < four).all()
     assert (four < sixteen).all()
     assert (sixteen <= log2(30)).all()
@@ -85,22 +85,22 @@ def test_information_about_a_label_leaves_the_rest_out(made):
 
 def test_information_about_everything_is_the_information(made):
     table = np.random.default_rng(5).normal(0.0, 3.0, (16, 8))
-    prospect = made.listed(table)
-    about = InformationAbout(ParameterValue("row", n_bins=16))(prospect)
-    np.testing.assert_allclose(about, InformationGain()(prospect), atol=1e-3)
+    utility_input = made.listed(table)
+    about = InformationAbout(ParameterValue("row", n_bins=16))(utility_input)
+    np.testing.assert_allclose(about, InformationGain()(utility_input), atol=1e-3)
 
 
 def test_information_about_a_parameter_is_never_more_than_about_all(made):
-    prospect = made.over_discs(made.chain(20), made.circles(400), grid=Grid(n_x=27, n_y=14))
-    about = InformationAbout(ParameterValue("radius_mm"))(prospect)
-    assert (about <= InformationGain()(prospect) + 1e-3).all()
+    utility_input = made.over_discs(made.chain(20), made.circles(400), grid=Grid(n_x=27, n_y=14))
+    about = InformationAbout(ParameterValue("radius_mm"))(utility_input)
+    assert (about <= InformationGain()(utility_input) + 1e-3).all()
     assert about.max() > 0.01
 
 
 def test_worth_a_second_prefers_the_near_place(made):
-    prospect = made.listed(APART, cost_s=[1.0, 1.0, 4.0])
-    np.testing.assert_allclose(PerSecond()(prospect), InformationGain()(prospect) / [1.0, 1.0, 4.0])
-    assert int(np.argmax(PerSecond()(prospect))) == 1
+    utility_input = made.listed(APART, cost_s=[1.0, 1.0, 4.0])
+    np.testing.assert_allclose(PerSecond()(utility_input), InformationGain()(utility_input) / [1.0, 1.0, 4.0])
+    assert int(np.argmax(PerSecond()(utility_input))) == 1
     with pytest.raises(ParameterError, match="cost_s"):
         PerSecond()(made.listed(APART, cost_s=[0.0, 1.0, 1.0]))
 
@@ -148,7 +148,7 @@ class Given:
     values: np.ndarray
     label: str = "given"
 
-    def __call__(self, prospect):
+    def __call__(self, utility_input):
         return self.values
 
 
@@ -184,21 +184,21 @@ def test_unknown_names_list_those_that_are_known(made):
 
 
 def narrow(made, goal, *, sd=6.0, seed=0):
-    """A prospect near the end: a disc known to a few millimetres."""
+    """An input near the end: a disc known to a few millimetres."""
     theta = np.array([500.0, 250.0, 80.0]) + sd * np.random.default_rng(seed).standard_normal((600, 3))
-    prospect = made.over_discs(made.chain(20), theta, grid=Grid(n_x=131, n_y=65))
-    return replace(prospect, goal=goal)
+    utility_input = made.over_discs(made.chain(20), theta, grid=Grid(n_x=131, n_y=65))
+    return replace(utility_input, goal=goal)
 
 
 def test_near_the_end_the_reading_that_may_end_the_run_is_preferred(made):
     """Only the radius is asked for, and it is unknown by little more than allowed."""
     goal = Goal((2,), 5.0)
-    prospect = narrow(made, goal)
-    chance = Finishing()(prospect)
+    utility_input = narrow(made, goal)
+    chance = Finishing()(utility_input)
     assert chance.max() > 0.25
     assert chance.max() <= 1.0
     best = int(chance.argmax())
-    assert chance[best] == pytest.approx(by_importance(made, prospect, goal, best), abs=0.06)
+    assert chance[best] == pytest.approx(by_importance(made, utility_input, goal, best), abs=0.06)
 
 
 def test_the_label_of_a_map_names_the_one_quantity_that_it_shows(made):
@@ -208,14 +208,14 @@ def test_the_label_of_a_map_names_the_one_quantity_that_it_shows(made):
     assert utility_map(replace(near, goal=None), Finishing()).label == InformationGain().label
 
 
-def by_importance(made, prospect, goal, design, n=4000):
+def by_importance(made, utility_input, goal, design, n=4000):
     """Draw readings from every hypothesis, reweigh all by each, count how often the sds are small enough."""
-    level = made.chain(20).predict(prospect.theta, prospect.plan.take(np.array([design])))[:, 0]
+    level = made.chain(20).predict(utility_input.theta, utility_input.plan.take(np.array([design])))[:, 0]
     rng = np.random.default_rng(1)
     reading = rng.choice(level, n) + rng.standard_normal(n)
     weight = np.exp(-0.5 * (reading[:, None] - level) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    lengths = prospect.theta[:, goal.columns]
+    lengths = utility_input.theta[:, goal.columns]
     spread = weight @ lengths**2 - (weight @ lengths) ** 2
     return (spread < goal.sd**2).all(axis=1).mean()
 

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.diagnosis import Hypothesis
 from probewise.errors import ParameterError
-from probewise.investigation import Budget, investigate, settled_by
+from probewise.investigation import Budget, investigate, reason_if_settled
 from probewise.recordings import Recording, paper_plan
 
 
@@ -54,13 +54,13 @@ def test_it_ends_as_soon_as_one_hypothesis_is_settled(diagnosed):
     assert [each.settled for each in rounds] == [False, True]
     assert rounds[-1].stop_reason == "lag has probability 0.970"
     assert [len(recordings) for recordings, _ in calls] == [1, 2]
-    assert rounds[1].asked == "take it again"
+    assert rounds[1].reason_for_readings == "take it again"
 
 
 def test_what_the_verdict_does_not_state_is_not_settled():
-    assert settled_by(diagnosis(0.99, verdict="cannot_tell")) is None
-    assert settled_by(diagnosis(0.949)) is None
-    assert settled_by(diagnosis(0.95)) is not None
+    assert reason_if_settled(diagnosis(0.99, verdict="cannot_tell")) is None
+    assert reason_if_settled(diagnosis(0.949)) is None
+    assert reason_if_settled(diagnosis(0.95)) is not None
 
 
 def test_it_ends_where_nothing_would_tell_more(diagnosed):

@@ -12,7 +12,7 @@ from nested_sampling import hard, problems
 from probewise.nested import NestedResult
 from probewise.nested.ascent import climb_to_top, top_from_live_points
 from probewise.nested.evaluate import Evaluator
-from probewise.nested.missing import look_for_missing
+from probewise.nested.missing import find_missed_hills
 from probewise.nested.sampler import run_once
 
 
@@ -85,7 +85,7 @@ def test_along_the_arm_of_a_heavy_tail_the_draws_reach_the_middle(on_an_arm: Nes
 
 def test_what_lies_at_the_end_of_the_arm_is_weighed_and_doubts_the_run(on_an_arm: NestedResult) -> None:
     problem = Cross(-math.inf)
-    missing = look_for_missing(on_an_arm, problem, max_calls=on_an_arm.n_calls, rng=np.random.default_rng(3))
+    missing = find_missed_hills(on_an_arm, problem, max_calls=on_an_arm.n_calls, rng=np.random.default_rng(3))
     (hill,) = missing.lost
     # Most of the evidence is near the middle; arms hold the rest.
     assert problem.known.log_z - 1.5 < hill.log_z < problem.known.log_z + 0.7

@@ -10,8 +10,8 @@ import pytest
 from nested_sampling import hard, problems
 
 from probewise.nested import check
-from probewise.nested.hills import Hill, evidence_not_met
-from probewise.nested.missing import Missing, look_for_missing
+from probewise.nested.hills import Hill, log_evidence_of_unmet_hills
+from probewise.nested.missing import MissedHills, find_missed_hills
 from probewise.nested.moves import SliceMove
 from probewise.nested.sampler import least_live, run_once
 
@@ -25,8 +25,8 @@ def test_a_spike_that_no_live_point_met_is_found_and_weighed() -> None:
         rng = np.random.default_rng([seed, 20])
         run = run_once(known, rng=rng, n_live=300)
         assert run.log_z < known.log_z - 3  # not met by the run
-        missing = look_for_missing(run, known, max_calls=run.n_calls, rng=rng)
-        found.append(evidence_not_met((*missing.lost, *missing.above), run))
+        missing = find_missed_hills(run, known, max_calls=run.n_calls, rng=rng)
+        found.append(log_evidence_of_unmet_hills((*missing.lost, *missing.above), run))
     assert any(abs(log_z - known.log_z) < 1.5 for log_z in found)
 
 
@@ -34,7 +34,7 @@ def test_a_spike_that_no_live_point_met_is_found_and_weighed() -> None:
 def test_where_there_is_no_higher_peak_nothing_is_found_for_a_third_of_the_cost(name: str) -> None:
     known = problems.problem(name)
     run = run_once(known, rng=np.random.default_rng(1), n_live=100)
-    missing = look_for_missing(run, known, max_calls=10 * run.n_calls, rng=np.random.default_rng(2))
+    missing = find_missed_hills(run, known, max_calls=10 * run.n_calls, rng=np.random.default_rng(2))
     assert not missing.above
     assert missing.n_calls <= run.n_calls / 3
 
@@ -42,7 +42,7 @@ def test_where_there_is_no_higher_peak_nothing_is_found_for_a_third_of_the_cost(
 def test_with_hardly_any_evaluations_left_no_more_are_used() -> None:
     known = problems.problem("Gaussian 4-D")
     run = run_once(known, rng=np.random.default_rng(1), n_live=100)
-    assert look_for_missing(run, known, max_calls=10, rng=np.random.default_rng(2)).n_calls <= 10
+    assert find_missed_hills(run, known, max_calls=10, rng=np.random.default_rng(2)).n_calls <= 10
 
 
 @pytest.mark.parametrize(("above_it", "doubted"), [(3.0, True), (-6.0, False)])
@@ -52,8 +52,8 @@ def test_a_peak_that_holds_much_of_the_evidence_is_a_doubt(
     known = problems.problem("Gaussian 4-D")
     run = run_once(known, rng=np.random.default_rng(1), n_live=100)
     hill = SimpleNamespace(log_z=run.log_z + above_it, is_met_by=lambda _: False)
-    missing = Missing((), (cast(Hill, hill),), 77)
-    monkeypatch.setattr(check, "look_for_missing", lambda *_, **__: missing)
+    missing = MissedHills((), (cast(Hill, hill),), 77)
+    monkeypatch.setattr(check, "find_missed_hills", lambda *_, **__: missing)
     result = check.check_and_repeat(
         run,
         known,

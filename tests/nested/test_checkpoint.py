@@ -35,7 +35,7 @@ from probewise.nested import (
     Tally,
     run,
 )
-from probewise.nested.checkpoint import CheckpointFile, Live, Origin, Run, settings_of
+from probewise.nested.checkpoint import BirthRecords, CheckpointFile, LivePoints, RunState, settings_of_run
 from probewise.priors import Normal, Product, Uniform
 
 SEED = 20240229
@@ -680,7 +680,7 @@ def test_a_run_is_saved_as_often_as_asked(
     n_saved = itertools.count()
     true = CheckpointFile.save
 
-    def save(self: CheckpointFile, now: Run) -> None:
+    def save(self: CheckpointFile, now: RunState) -> None:
         next(n_saved)
         true(self, now)
 
@@ -693,14 +693,14 @@ def test_a_run_is_saved_as_often_as_asked(
 
 def test_saving_takes_a_tenth_of_the_time_at_most(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever `checkpoint_every_s` above 0 says; by a clock that ticks at every look."""
-    settings = settings_of(("p0",), 10, 5, SliceMove(), RemainingEvidence(), "{}")
+    settings = settings_of_run(("p0",), 10, 5, SliceMove(), RemainingEvidence(), "{}")
     clock = itertools.count(0.0, 3.0)
     monkeypatch.setattr("probewise.nested.checkpoint.time.monotonic", lambda: next(clock))
     keeper = CheckpointFile(path, 1.0, settings, _last_saving=0.0)
-    live = Live(_points(10, 1), Origin.of_prior(10), 0.0)
+    live = LivePoints(_points(10, 1), BirthRecords.of_prior_draws(10), 0.0)
     saved = []
     for k in range(60):
-        now = Run(live, (), SliceMove(), 0.0, 0.0, (), n_calls=k)
+        now = RunState(live, (), SliceMove(), 0.0, 0.0, (), n_calls=k)
         keeper.save_if_due(now)
         saved.append(keeper._state_in_file is now)
     # A saving looks twice and so takes 3 s; ten times that pass at ten looks.

@@ -13,8 +13,8 @@ from scipy.stats import chi2, norm
 
 from probewise._arrays import FloatArray
 from probewise.nested import NestedResult, Weighted, refine, run, update
-from probewise.nested.importance import _bridge_sampling_estimate, with_loss_in_error
-from probewise.nested.proposal import find_parts, fit_proposals, mixture_of_proposals
+from probewise.nested.importance import _bridge_sampling_estimate, with_error_of_lost_parts
+from probewise.nested.proposal import find_disconnected_clusters, fit_wide_and_narrow_proposals, mixture_of_proposals
 from probewise.nested.space import unbounded_space_of
 from probewise.priors import Normal, Product
 
@@ -59,9 +59,11 @@ def test_no_single_draw_decides_where_samples_say_what_it_stands_for() -> None:
 def test_a_lattice_of_modes_is_parted_and_a_gaussian_is_not() -> None:
     rng = np.random.default_rng(1)
     lattice = 6.0 * np.stack(np.meshgrid(np.arange(6), np.arange(3)), axis=-1).reshape(-1, 2)
-    assert len(find_parts(lattice[rng.integers(18, size=900)] + 0.3 * rng.standard_normal((900, 2)))) == 18
-    assert len(find_parts(rng.standard_normal((900, 2)))) == 1
-    assert len(find_parts(rng.standard_normal((4, 2)))) == 1
+    assert (
+        len(find_disconnected_clusters(lattice[rng.integers(18, size=900)] + 0.3 * rng.standard_normal((900, 2)))) == 18
+    )
+    assert len(find_disconnected_clusters(rng.standard_normal((900, 2)))) == 1
+    assert len(find_disconnected_clusters(rng.standard_normal((4, 2)))) == 1
 
 
 def test_a_part_followed_by_few_lines_of_descent_may_be_lost() -> None:
@@ -71,19 +73,19 @@ def test_a_part_followed_by_few_lines_of_descent_may_be_lost() -> None:
     theta = 0.1 * rng.standard_normal((1000, 2)) + np.where(np.arange(1000) < 100, 3.0, -1.0)[:, None]
     even = np.full(1000, -math.log(1000))
     found = Weighted(("x", "y"), theta, np.zeros(1000), even, 0.0, 0.01, 1000.0, 1000, 0.1)
-    told = with_loss_in_error(found, 20.0, space, rng)
+    told = with_error_of_lost_parts(found, 20.0, space, rng)
     assert told.lost == pytest.approx(0.1 * math.exp(-2.0), rel=0.01)
     assert told.log_z_error == pytest.approx(math.hypot(0.01, told.lost))
     assert told.sound
-    hopeless = with_loss_in_error(found, 0.5, space, rng)
+    hopeless = with_error_of_lost_parts(found, 0.5, space, rng)
     assert not hopeless.sound
     assert "may be lost" in hopeless.summary()
 
 
 def test_joined_proposals_get_their_shares_of_the_draws_and_of_the_density() -> None:
     rng = np.random.default_rng(3)
-    left = fit_proposals(rng.standard_normal((30, 1)) - 10.0, rng=rng)
-    right = fit_proposals(rng.standard_normal((30, 1)) + 10.0, rng=rng)
+    left = fit_wide_and_narrow_proposals(rng.standard_normal((30, 1)) - 10.0, rng=rng)
+    right = fit_wide_and_narrow_proposals(rng.standard_normal((30, 1)) + 10.0, rng=rng)
     both = mixture_of_proposals([*left, *right], [0.7, 0.3])
     drawn = both.draw(4000, rng=rng)
     assert (drawn < 0).mean() == pytest.approx(0.7, abs=4 * math.sqrt(0.21 / 4000))
@@ -225,7 +227,7 @@ def test_a_reading_that_surprises_is_inferred_from_scratch() -> None:
 def test_a_mixture_of_what_was_fitted_is_whole_however_many_forms_there_are() -> None:
     """Few samples allow one form only; its share is then all there is."""
     rng = np.random.default_rng(5)
-    (only,) = fit_proposals(rng.standard_normal((30, 2)), rng=rng)
+    (only,) = fit_wide_and_narrow_proposals(rng.standard_normal((30, 2)), rng=rng)
     mixed = mixture_of_proposals((only,), [0.75])
     assert mixed.share.sum() == pytest.approx(1.0)
     assert mixed.draw(100, rng=rng).shape == (100, 2)

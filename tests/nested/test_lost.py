@@ -14,9 +14,9 @@ from probewise.nested import NestedResult, SliceMove, refine
 from probewise.nested.check import check_and_repeat
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Samplable
-from probewise.nested.hills import evidence_not_met
+from probewise.nested.hills import log_evidence_of_unmet_hills
 from probewise.nested.hops import HoppingMove
-from probewise.nested.missing import Missing, look_for_missing
+from probewise.nested.missing import MissedHills, find_missed_hills
 from probewise.nested.sampler import run_once
 
 SHARE = 0.6
@@ -48,8 +48,8 @@ def robbed() -> NestedResult:
     return run_once(Two(veil=-50.0), rng=np.random.default_rng(1), n_live=100)
 
 
-def missing_from(run: NestedResult, problem: Samplable, max_calls: float) -> Missing:
-    return look_for_missing(run, problem, max_calls=max_calls, rng=np.random.default_rng(2))
+def missing_from(run: NestedResult, problem: Samplable, max_calls: float) -> MissedHills:
+    return find_missed_hills(run, problem, max_calls=max_calls, rng=np.random.default_rng(2))
 
 
 def share_of_second(run: NestedResult) -> float:
@@ -61,7 +61,7 @@ def test_a_mode_without_live_points_is_found_and_weighed(robbed: NestedResult) -
     assert share_of_second(robbed) < 1e-6
     missing = missing_from(robbed, Two(), 10 * robbed.n_calls)
     assert len(missing.lost) == 1
-    assert evidence_not_met(missing.lost, robbed) == pytest.approx(Two().log_z + math.log(SHARE), abs=0.5)
+    assert log_evidence_of_unmet_hills(missing.lost, robbed) == pytest.approx(Two().log_z + math.log(SHARE), abs=0.5)
     assert np.allclose(missing.lost[0].theta.mean(axis=0), 0.5, atol=0.02)
     assert missing.n_calls < robbed.n_calls / 3
 
@@ -133,7 +133,9 @@ def test_hops_hold_the_share_of_each_mode_and_reach_it_from_another() -> None:
 
     evaluate = Evaluator(problems.Known(problems.box(2, 0, 1), function, 0.0))
     rng = np.random.default_rng(6)
-    modes = Clusters.of([0.3 + 0.1 * rng.standard_normal((300, 2)), 0.8 + 0.05 * rng.standard_normal((300, 2))])
+    modes = Clusters.from_groups(
+        [0.3 + 0.1 * rng.standard_normal((300, 2)), 0.8 + 0.05 * rng.standard_normal((300, 2))]
+    )
     move = HoppingMove(SliceMove(hops=0, differences=0.0), modes)
     now = evaluate(rng.uniform(0.2, 0.4, (2000, 2)), rng)
     for _ in range(6):

@@ -24,7 +24,7 @@ from probewise.nested import (
     SliceMove,
     run,
 )
-from probewise.nested.checkpoint import Live, Origin
+from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import insertion_p_value, integrate
 from probewise.nested.sampler import step
@@ -102,13 +102,13 @@ def test_one_step_by_hand_counts_the_shrinkage(rng: np.random.Generator) -> None
     problem = problems.box(1, 0, 1)
     evaluate = Evaluator(problems.Known(problem, lambda t: t[:, 0], 0.0))
     u = np.array([[0.1], [0.5], [0.3], [0.9], [0.7]])
-    live = Live(Points(u, u, np.zeros(5), u[:, 0], np.zeros(5)), Origin.of_prior(5), 0.0)
+    live = LivePoints(Points(u, u, np.zeros(5), u[:, 0], np.zeros(5)), BirthRecords.of_prior_draws(5), 0.0)
     after, dead, _ = step(live, PriorRejection(1.0), evaluate, n_replaced=2, rng=rng)
     assert dead.points.theta[:, 0].tolist() == [0.1, 0.3]
     assert dead.n_at_death.tolist() == [5, 4]
     assert after.log_volume == pytest.approx(-1 / 5 - 1 / 4)
     assert (after.points.log_likelihood > 0.3).all()
-    assert after.origin.log_birth.tolist() == [-np.inf, -np.inf, -np.inf, 0.3, 0.3]
+    assert after.births.log_birth.tolist() == [-np.inf, -np.inf, -np.inf, 0.3, 0.3]
     assert (dead.rank <= dead.n_ranked).all()
     assert dead.n_ranked.tolist() == [3, 4]
 
@@ -161,7 +161,7 @@ def test_slice_chains_leave_the_uniform_distribution_alone(
 
 def test_a_cluster_is_measured_without_the_start_of_the_chain_that_uses_it(rng: np.random.Generator) -> None:
     points = rng.standard_normal((60, 4)) @ rng.standard_normal((4, 4))
-    without = Clusters.of([points]).without_point_itself(points[:3], np.zeros(3, dtype=int))
+    without = Clusters.from_groups([points]).leave_one_out(points[:3], np.zeros(3, dtype=int))
     for i in range(3):
         rest = np.delete(points, i, axis=0)
         assert without.mean[i] == pytest.approx(rest.mean(axis=0))

@@ -9,12 +9,12 @@ from multiprocessing import get_all_start_methods, get_context
 import pytest
 
 from probewise.errors import FileError
-from probewise.recordings import locked, write_bytes_atomically
+from probewise.recordings import hold_lock, write_bytes_atomically
 
 HOLD = """
 import sys, time
-from probewise.recordings.locking import locked
-with locked(sys.argv[1]):
+from probewise.recordings.locking import hold_lock
+with hold_lock(sys.argv[1]):
     print("held", flush=True)
     time.sleep(60)
 """
@@ -22,7 +22,7 @@ with locked(sys.argv[1]):
 
 def count_to_25(path):
     for _ in range(25):
-        with locked(path, patience_s=60):
+        with hold_lock(path, patience_s=60):
             path.write_text(str(int(path.read_text()) + 1))
 
 
@@ -30,17 +30,17 @@ def test_who_holds_it_is_named_and_a_killed_holder_holds_it_no_more(tmp_path):
     path = tmp_path / "journal.jsonl"
     with subprocess.Popen([sys.executable, "-c", HOLD, path], stdout=subprocess.PIPE, text=True) as other:
         assert other.stdout.readline() == "held\n"
-        with pytest.raises(FileError, match=rf"journal.jsonl: process {other.pid} is writing to it"), locked(path):
+        with pytest.raises(FileError, match=rf"journal.jsonl: process {other.pid} is writing to it"), hold_lock(path):
             pass
         other.send_signal(signal.SIGKILL if os.name != "nt" else signal.SIGTERM)
         other.wait()
-    with locked(path, patience_s=10):
+    with hold_lock(path, patience_s=10):
         pass
     assert not list(tmp_path.iterdir())
 
 
 def test_a_lock_is_not_taken_twice_within_one_process_either(tmp_path):
-    with locked(tmp_path / "a"), pytest.raises(FileError, match=f"process {os.getpid()}"), locked(tmp_path / "a"):
+    with hold_lock(tmp_path / "a"), pytest.raises(FileError, match=f"process {os.getpid()}"), hold_lock(tmp_path / "a"):
         pass
 
 
@@ -60,7 +60,7 @@ def test_processes_that_come_and_go_never_hold_it_together(tmp_path):
 
 
 def test_a_folder_that_is_missing_is_named(tmp_path):
-    with pytest.raises(FileError, match=r"nowhere.*cannot be written"), locked(tmp_path / "nowhere" / "a"):
+    with pytest.raises(FileError, match=r"nowhere.*cannot be written"), hold_lock(tmp_path / "nowhere" / "a"):
         pass
 
 

@@ -31,7 +31,7 @@ from probewise.recordings import (
     write_prediction,
     write_recording,
 )
-from probewise.recordings.description import degrees_of
+from probewise.recordings.description import shortest_degrees
 
 numbers = st.floats(-1e6, 1e6)
 lengths = st.floats(1e-6, 1e6)
@@ -129,11 +129,11 @@ def test_a_plan_comes_back_to_the_last_bit(plan, tmp_path_factory):
 @given(degrees=st.floats(-1e4, 1e4))
 def test_an_angle_read_from_degrees_is_written_as_degrees_that_read_the_same(degrees):
     radians = math.radians(degrees)
-    assert math.radians(degrees_of(radians)) == radians
+    assert math.radians(shortest_degrees(radians)) == radians
 
 
 def test_round_angles_are_written_round():
-    assert [degrees_of(math.radians(d)) for d in (0, 90, 180, 270, -84.5592)] == [0, 90, 180, 270, -84.5592]
+    assert [shortest_degrees(math.radians(d)) for d in (0, 90, 180, 270, -84.5592)] == [0, 90, 180, 270, -84.5592]
 
 
 def plan_of(n: int, **changes) -> Plan:

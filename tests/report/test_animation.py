@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from probewise.errors import ParameterError
-from probewise.report.animation import gif
+from probewise.report.animation import animated_gif
 
 
 def png(colour, size):
@@ -17,7 +17,7 @@ def png(colour, size):
 
 
 def test_frames_follow_each_other_and_smaller_ones_are_set_on_white():
-    moving = Image.open(io.BytesIO(gif([png("red", (8, 6)), png("blue", (4, 6))], frame_s=0.5, last_s=2.0)))
+    moving = Image.open(io.BytesIO(animated_gif([png("red", (8, 6)), png("blue", (4, 6))], frame_s=0.5, last_s=2.0)))
     assert moving.n_frames == 2
     assert moving.size == (8, 6)
     assert moving.info["loop"] == 0
@@ -32,4 +32,4 @@ def test_frames_follow_each_other_and_smaller_ones_are_set_on_white():
 
 def test_no_frames_make_no_picture():
     with pytest.raises(ParameterError, match="one picture or more"):
-        gif([])
+        animated_gif([])

@@ -12,12 +12,20 @@ from PIL import Image
 
 from probewise.arm import SimulatedArm
 from probewise.calibration import FittedSensor, OrderEvidence, predict
-from probewise.experiment import Experiment, Exploration, chance_off, explore, found_shape, result_json, samples_csv
+from probewise.experiment import (
+    Experiment,
+    Exploration,
+    explore,
+    found_shape,
+    probability_of_length_off,
+    result_json,
+    samples_csv,
+)
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc, Instrumentation, read_recording, shipped
 from probewise.report import calibration as calibration_report
 from probewise.report import exploration
-from probewise.report.animation import gif
+from probewise.report.animation import animated_gif
 from probewise.scene import Circle, HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
 from probewise.world import Blob, World, gaussian_spot
@@ -86,7 +94,7 @@ def has_green(image):
 @pytest.mark.slow
 def test_the_next_place_is_green_in_every_frame_but_the_last_of_the_moving_picture(frames):
     """In the frames it is in the key and in the field; the last frame has no next place."""
-    moving = Image.open(io.BytesIO(gif(frames)))
+    moving = Image.open(io.BytesIO(animated_gif(frames)))
     for number, frame in enumerate(frames):
         moving.seek(number)
         still = Image.open(io.BytesIO(frame))
@@ -145,7 +153,7 @@ def test_result_json_says_what_was_found_and_samples_csv_holds_the_posterior(run
         assert weight[(values >= low) & (values <= high)].sum() == pytest.approx(0.95, abs=0.02)
         off |= np.abs(values - mean) > 12.0
     assert document["chance_off_12mm"] == pytest.approx(weight[off].sum(), abs=1e-3)
-    assert chance_off(run.experiment, run.posterior, 1e6) == 0.0
+    assert probability_of_length_off(run.experiment, run.posterior, 1e6) == 0.0
 
 
 def hand_made_sensor():

@@ -10,13 +10,13 @@ import probewise
 from probewise.arm import Pose, SimulatedArm
 from probewise.cli import demo, main
 from probewise.errors import ParameterError
-from probewise.experiment import Experiment, run_from
+from probewise.experiment import Experiment, run_from_place
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid, ReadingEntropy
 from probewise.recordings import Disc, read_recording, shipped
 from probewise.report import doubt
 from probewise.report.demo import HEADER, comparison_lines
-from probewise.report.paper_view import fine_map, paper_view, window_mm
+from probewise.report.paper_view import fine_entropy_map, paper_view, window_mm
 from probewise.report.plots import PAGE_IN
 from probewise.report.robot_search import RobotSearch
 from probewise.report.slides import side_by_side
@@ -37,7 +37,7 @@ def searched(max_readings):
     model = Chain(mixture, FixedLevels(10.0, 60.0), HypothesisScene(circle))
     grid = Grid(n_x=66, n_y=33)
     experiment = Experiment(circle, model, GaussianKnown(0.7), 0.7, grid, ReadingEntropy(), n_live=60, n_particles=500)
-    return run_from(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
+    return run_from_place(FIRST, arm, experiment, rng=np.random.default_rng(5), max_readings=max_readings)
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_a_run_takes_its_first_reading_where_it_is_told_to(found):
 
 
 def test_the_fine_map_agrees_with_the_robots_own_where_both_have_a_place(found):
-    drawn = fine_map(found, 1)
+    drawn = fine_entropy_map(found, 1)
     np.testing.assert_allclose(drawn.image[::2, ::2], found.steps[0].map.image, atol=1e-9)
 
 
@@ -137,5 +137,5 @@ def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
     said = "".join(doubt.section(searches, drawn).body)
     for row in ("trusting", "doubting"):
         assert f">{row}<" in said
-    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubt.answer(searches)
+    assert f"2 readings, off by {searches[0].largest_error_mm:.1f} mm" in doubt.summary_sentence(searches)
     assert found.stop_reason in said

@@ -11,10 +11,10 @@ from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page
-from probewise.report.covariate import category_names, covariate_values, label_of
-from probewise.report.covariate_view import is_line
+from probewise.report.covariate import axis_label, category_names, covariate_values
+from probewise.report.covariate_view import is_along_line
 from probewise.report.diagnosis_figures import scan_changed_most
-from probewise.report.plots import gain_by_scan, one_scan
+from probewise.report.plots import gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
 from probewise.report.words import typeset
 from probewise.scene import KnownScene
@@ -105,9 +105,9 @@ def test_numbers_are_written_as_people_write_them():
 def test_labels_carry_units():
     recording = SimpleNamespace(plan=paper_plan())
     found = SimpleNamespace(recording=recording, apparatus=SimpleNamespace(words=SimpleNamespace(run="scan")))
-    assert label_of(found, "level") == "predicted reading (LEGO units)"
-    assert label_of(found, "place", "edge_0") == "place along the scans, scan edge_0 (mm)"
-    assert label_of(found, "battery_mv") == "battery (mV)"
+    assert axis_label(found, "level") == "predicted reading (LEGO units)"
+    assert axis_label(found, "place", "edge_0") == "place along the scans, scan edge_0 (mm)"
+    assert axis_label(found, "battery_mv") == "battery (mV)"
 
 
 def test_residuals_are_averaged_in_even_steps_with_their_chance():
@@ -188,7 +188,7 @@ def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
 
 def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_one_place_change_more():
     plan = read_plan(shipped("concealed"))
-    assert {name for rows, name in scans_of(plan) if not is_line(plan, rows)} == {"quadrants"}
+    assert {name for rows, name in scans_of(plan) if not is_along_line(plan, rows)} == {"quadrants"}
     change = np.zeros(len(plan))
     for rows, name in scans_of(plan):
         change[rows] = {"quadrants": 9.0, "edge_90_out": 0.5}.get(name, 0.1)
@@ -196,7 +196,7 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
     assert plan.scan_names[plan.scan[chosen[0]]] == "edge_90_out"
     alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
     assert len(scan_changed_most(alone, np.ones(4))) == 4
-    assert not is_line(plan, np.arange(1))
+    assert not is_along_line(plan, np.arange(1))
 
 
 def scans_of(plan):
@@ -206,7 +206,7 @@ def scans_of(plan):
 def test_readings_on_no_line_are_not_joined():
     x, y = np.arange(4.0), np.array([10.0, 50.0, 20.0, 30.0])
     for joined in (True, False):
-        axes = one_scan(x, y, [("as calibrated", y + 1)], joined=joined, label="time (s)", unit="V")
+        axes = scan_with_residuals(x, y, [("as calibrated", y + 1)], joined=joined, label="time (s)", unit="V")
         curve = next(line for line in axes[0].lines if line.get_label().startswith("predicted"))
         assert (curve.get_linestyle() != "None") is joined
 

@@ -91,7 +91,7 @@ FIGURES = {
         dict.fromkeys((1, 2, 3), blob()), {1: -389.8, 2: -394.0, 3: -397.7}, {1: 0.02, 2: 0.5, 3: 0.6}
     ),
     "log_evidences": lambda s: plots.log_evidences([1, 2], [-3.0, -5.0], [0.1, 0.2]),
-    "belief_in_the_sensor": lambda s: plots.belief_in_the_sensor(DOUBT),
+    "effect_probabilities_by_reading": lambda s: plots.effect_probabilities_by_reading(DOUBT),
     "posterior_widths": lambda s: plots.posterior_widths(WIDTHS),
     "information_gained": lambda s: plots.information_gained({k: np.arange(16.0) for k in WIDTHS}),
     "readings_by_orientation": lambda s: plots.readings_by_orientation(s.recording),
@@ -104,11 +104,11 @@ FIGURES = {
     ),
     "readings_needed": lambda s: plots.readings_needed(ROWS),
     "readings_needed, one row": lambda s: plots.readings_needed({"inside, naive": row(16.0)}),
-    "doubt_beside_trust": lambda s: plots.doubt_beside_trust(CONCEALED),
-    "widths_of_runs": lambda s: plots.widths_of_runs(RUNS),
-    "widths_of_runs, one": lambda s: plots.widths_of_runs({"inside, SSF": RUNS["inside, SSF"]}),
+    "doubt_against_trust": lambda s: plots.doubt_against_trust(CONCEALED),
+    "posterior_widths_of_runs": lambda s: plots.posterior_widths_of_runs(RUNS),
+    "posterior_widths_of_runs, one": lambda s: plots.posterior_widths_of_runs({"inside, SSF": RUNS["inside, SSF"]}),
     "hypothesis_probabilities": lambda s: plots.hypothesis_probabilities(EFFECTS[:3], [0.5, 0.3, 0.2]),
-    "beliefs_by_round": lambda s: plots.beliefs_by_round(
+    "probabilities_by_round": lambda s: plots.probabilities_by_round(
         {
             "round 1: 408 readings": dict(zip(EFFECTS[:8], (0.3, 0.2, 0.2, 0.1, 0.1, 0.05, 0.03, 0.02), strict=True)),
             "round 2: 78 more": {EFFECTS[1]: 0.97, EFFECTS[0]: 0.03},
@@ -134,7 +134,7 @@ FIGURES = {
 
 
 def test_every_plot_function_is_here():
-    others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "explain_field", "grid_of_axes", "png", "stack_of_axes", "svg"}
+    others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "field_legend", "grid_of_axes", "png", "stack_of_axes", "svg"}
     of_a_diagnosis = {  # laid out by `svg`, and drawn by the tests of its pages
         "before_and_after",
         "correlation_of_neighbours",
@@ -142,11 +142,11 @@ def test_every_plot_function_is_here():
         "lattice_of_readings",
         "lost_readings",
         "mean_residuals_along",
-        "one_scan",
+        "scan_with_residuals",
         "readings_in_order",
-        "residual_clouds",
+        "residuals_against_covariates",
         "spread_by_level",
-        "tails",
+        "residual_histogram",
     }
     assert {name.partition(",")[0] for name in FIGURES} == set(plots.__all__) - others - of_a_diagnosis
 

@@ -111,4 +111,4 @@ def test_many_long_names_above_a_single_round_leave_room_for_its_bar(repeats):
     """Warnings are errors: matplotlib warns where a legend leaves its axes no width or no height."""
     long = " and ".join(["noise that neighbouring readings share and an effect with a long name"] * repeats)
     names = [f"{long}, number {k}" for k in range(9)]
-    assert plots.png(plots.beliefs_by_round({"round 1: 30 readings": dict.fromkeys(names, 1 / 9)}), dpi=30)
+    assert plots.png(plots.probabilities_by_round({"round 1: 30 readings": dict.fromkeys(names, 1 / 9)}), dpi=30)

@@ -15,7 +15,7 @@ def test_the_colours_span_the_angles_that_there_are_also_across_180_degrees(moun
     geometry = read_geometry(shipped_geometry())
     places = np.stack(np.meshgrid(X, Y), axis=-1).reshape(-1, 2)
     standing = geometry.orientation_rad(places) + np.radians(mounted_deg - 180.0)
-    held = np.where(geometry.holds(places), (standing + np.pi) % (2 * np.pi) - np.pi, np.nan).reshape(Y.size, X.size)
+    held = np.where(geometry.contains(places), (standing + np.pi) % (2 * np.pi) - np.pi, np.nan).reshape(Y.size, X.size)
     ax = reach_map(held, X, Y, axis_mm=geometry.axis_mm)
     low, high = ax.images[0].get_clim()
     assert 150 < high - low < 180

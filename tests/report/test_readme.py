@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from probewise import experiment
-from probewise.cli.diagnose import generators
+from probewise.cli.diagnose import generators_of_diagnosis
 from probewise.diagnosis import diagnose
 from probewise.experiment import loop
 from probewise.recordings import read_recording, shipped
@@ -38,7 +38,7 @@ def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
     taken = [(r.pose, r.value) for r in printed["state"].readings]
     assert [(r.pose, r.value) for r in found.readings] == taken[:4]
     last = printed["info"]
-    assert printed["asked"].is_known(last.sd, last.shapes)
+    assert printed["asked"].may_stop(last.sd, last.shapes)
     assert abs((last.mean - [600.0, 260.0, 90.0]) / last.sd).max() < 4
 
 
@@ -52,7 +52,7 @@ def test_the_readme_quotes_what_the_demo_said_when_its_pictures_were_made():
 
 @pytest.mark.slow
 def test_the_readme_quotes_what_the_command_says_of_the_shipped_recording():
-    rng, *_ = generators(QUOTED["seed"])
+    rng, *_ = generators_of_diagnosis(QUOTED["seed"])
     found = diagnose(read_recording(shipped("concealed")), rng=rng)
     assert typeset(found.reason) == QUOTED["reason"]
 

@@ -22,8 +22,10 @@ def drawn():
     noise, scan = rng.standard_normal(200), np.repeat([0, 1], 100)
     return {
         "means": plots.mean_residuals_along(means(), label="X (mm)", unit="V", each=(X, np.sin(X)), window=(2.0, 3.0)),
-        "scan": plots.one_scan(X, np.sin(X), [("as calibrated", X), ("repaired", np.sin(X))], label="X (mm)", unit="V"),
-        "clouds": plots.residual_clouds([("time (s)", X)], [("as calibrated", noise)], unit="V"),
+        "scan": plots.scan_with_residuals(
+            X, np.sin(X), [("as calibrated", X), ("repaired", np.sin(X))], label="X (mm)", unit="V"
+        ),
+        "clouds": plots.residuals_against_covariates([("time (s)", X)], [("as calibrated", noise)], unit="V"),
         "gain": plots.gain_by_scan([("edge_0", 0.5), ("edge_90", -0.1)], 0.2, 0.05),
         "neighbours": plots.correlation_of_neighbours(noise, scan, rho=0.3),
         "spread": plots.spread_by_level(X, noise, unit="V", model_sd=np.ones(200)),
@@ -84,7 +86,10 @@ def test_small_residuals_are_labelled_in_full():
 def test_a_hundred_thousand_dots_stay_a_small_file():
     rng = np.random.default_rng(0)
     cloud = [("as calibrated", rng.standard_normal(100_000))]
-    assert len(plots.svg(plots.residual_clouds([("time (s)", rng.random(100_000))], cloud, unit="V"))) < 1_000_000
+    assert (
+        len(plots.svg(plots.residuals_against_covariates([("time (s)", rng.random(100_000))], cloud, unit="V")))
+        < 1_000_000
+    )
 
 
 def test_rounded_readings_lie_on_their_lattice(figures):

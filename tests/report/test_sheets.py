@@ -12,7 +12,7 @@ from probewise.cli import main
 from probewise.errors import ParameterError
 from probewise.recordings import paper_plan, two_way_plan
 from probewise.recordings.patterns import HalfPlane, Image, Quadrant, Stripes, Uniform
-from probewise.recordings.where_white import where_white
+from probewise.recordings.where_white import where_white_in_words
 from probewise.report.plots.sheets import sheets_pdf
 from probewise.report.sheets import (
     BOTTOM_MM,
@@ -170,7 +170,7 @@ def test_marks_and_targets_are_at_their_places_of_the_field():
     geometry = read_geometry(shipped_geometry())
     sheet = marks_sheet(geometry)
     assert len(sheet.crosses_mm) == 8
-    assert geometry.holds(sheet.crosses_mm).all()
+    assert geometry.contains(sheet.crosses_mm).all()
     tiles = tiles_of(sheet, "a4")
     pages = pages_of(sheets_pdf([sheet], paper="a4", title="t"))[1:]
     found = set()
@@ -229,10 +229,10 @@ def test_the_jigs_beams_are_as_wide_as_lego_and_its_pages_have_a_ruler():
 
 
 def test_words_say_which_side_is_white():
-    assert where_white(HalfPlane(0.0, 0.0)).startswith("white on the right, x > 0 mm")
-    assert where_white(HalfPlane(np.pi, 5.0)).startswith("white on the left, x < -5 mm")
-    assert where_white(HalfPlane(np.pi / 2, 3.0, 0.0, 1.0)) == "black on top, y > 3 mm, white elsewhere"
-    assert where_white(Quadrant((-4.0, 4.0), (-1, 1))).startswith("white above y = 4 mm and left of x = -4 mm")
+    assert where_white_in_words(HalfPlane(0.0, 0.0)).startswith("white on the right, x > 0 mm")
+    assert where_white_in_words(HalfPlane(np.pi, 5.0)).startswith("white on the left, x < -5 mm")
+    assert where_white_in_words(HalfPlane(np.pi / 2, 3.0, 0.0, 1.0)) == "black on top, y > 3 mm, white elsewhere"
+    assert where_white_in_words(Quadrant((-4.0, 4.0), (-1, 1))).startswith("white above y = 4 mm and left of x = -4 mm")
 
 
 def test_the_command_writes_the_pages_and_refuses_what_it_cannot_draw(tmp_path, capsys):

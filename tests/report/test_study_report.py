@@ -61,14 +61,14 @@ def test_the_bound_stands_beside_what_was_measured(study):
     """Bits over capacity, of the rows whose robot knows its sensor."""
     least = least_readings(experiment_of(REFERENCE), rng=np.random.default_rng(0))
     shown = str(report.table_of_bounds(study))
-    assert f"{least.search:.1f} = " in shown
-    assert f"{least.refinement:.1f} = " in shown
+    assert f"{least.readings_of_search:.1f} = " in shown
+    assert f"{least.readings_of_refinement:.1f} = " in shown
     assert ROWS[1].name not in shown
 
 
 def test_each_curve_is_the_median_of_its_runs():
     widths = [np.array([100.0, 10.0, 2.0]), np.array([200.0, 50.0, 30.0, 3.0]), np.array([300.0, 3.0])]
-    axes = plots.widths_of_runs({"some": widths, "other": widths[:2]})
+    axes = plots.posterior_widths_of_runs({"some": widths, "other": widths[:2]})
     assert axes.shape == (1, 2)
     for ax in axes.flat:
         (own,) = (line for line in ax.lines if line.get_label() == "median")
@@ -115,7 +115,7 @@ def concealed_runs():
 
 def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
     rows = concealed_rows(concealed_runs())
-    assert concealed.answer(rows).startswith(
+    assert concealed.summary_sentence(rows).startswith(
         "Sure and wrong: 3 of 6 runs where the robot trusts its sensor, 0 of 6 runs where it doubts it"
     )
     page = concealed.write_page(rows, command="probewise study --concealed")
@@ -124,7 +124,7 @@ def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
 
 
 def test_doubt_and_trust_stand_beside_each_other_in_every_row():
-    axes = plots.doubt_beside_trust(concealed_rows(concealed_runs()))
+    axes = plots.doubt_against_trust(concealed_rows(concealed_runs()))
     assert [label.get_text() for label in axes[0, 0].get_yticklabels()] == ["nothing", "backlash (play) of the arm, 6"]
     (line, *_), *_ = axes[0, 2].containers
     assert line.get_xdata().tolist() == [11.0, 7.0]

@@ -13,7 +13,7 @@ from probewise.recordings import Disc, Plan
 from probewise.scene import Card, CardedScene
 from probewise.study import experiment_of
 from probewise.study.rows import REFERENCE
-from probewise.study.trial import BRIGHT, DARK, spot_of
+from probewise.study.trial import BRIGHT, DARK, footprint_pixels
 from probewise.world import World
 
 CARDS = (Card(300.0, 200.0, 60.0, 40.0, 0.5), Card(700.0, 100.0, 30.0, 30.0, 1.0))
@@ -37,7 +37,7 @@ def plan():
 def test_the_closed_form_reads_cards_as_the_pixels_do(chain, plan):
     """Two routes: polygons under Gaussians, and rays that land on the card before they land on the disc."""
     for disc in (np.array([500.0, 300.0, 100.0]), np.array([700.0, 120.0, 80.0])):
-        world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=0.0)
+        world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
         surface = with_cards(Disc((disc[0], disc[1]), disc[2]), CARDS)
         read = [world.read(surface, x, y, 0.3, time_s=0.0, rng=None) for x, y in zip(plan.x_mm, plan.y_mm, strict=True)]
         np.testing.assert_allclose(chain.predict(disc[None], plan)[0], read, atol=0.05)
@@ -77,7 +77,7 @@ def test_an_outlook_knows_that_a_card_tells_nothing_of_the_shape(chain):
     even = np.full(len(theta), 1 / len(theta))
     plan = experiment.designs.plan("field")
     predictive = experiment.forecast.predictive(theta, even, experiment.designs, plan, np.arange(len(plan)), 1.0)
-    ((_, mass),) = list(predictive.maps(even))
+    ((_, mass),) = list(predictive.level_weights(even))
     on_card = int(np.argmin((plan.x_mm - 300.0) ** 2 + (plan.y_mm - 200.0) ** 2))
     beside = int(np.argmin((plan.x_mm - 500.0) ** 2 + (plan.y_mm - 260.0) ** 2))
     assert mass[on_card].max() > 0.999

@@ -87,7 +87,7 @@ def test_a_shape_kept_inside_stays_on_the_field(name):
 def test_a_set_of_shapes_takes_each_with_its_weight():
     """10 000 draws: binomial sd 0.005, so 0.02 is passed by chance less than once in 10 000."""
     shape = SHAPES["any"]
-    which = shape.which(draws(shape, 10_000))
+    which = shape.shape_index(draws(shape, 10_000))
     share = {label: Counter(which.tolist())[k] / 10_000 for k, label in enumerate(shape.labels)}
     assert share == pytest.approx({"circle": 0.5, "rectangle": 0.3, "hexagon": 0.2}, abs=0.02)
 
@@ -110,7 +110,7 @@ def test_a_set_of_shapes_makes_the_region_of_the_shape_it_takes():
     shape = SHAPES["any"]
     theta = draws(shape, 50)
     points = np.random.default_rng(1).uniform(0, 1, (300, 2)) * [1048, 520]
-    found, which = shape.region(theta).albedo(points), shape.which(theta)
+    found, which = shape.region(theta).albedo(points), shape.shape_index(theta)
     circles = Circle().region(theta[which == 0][:, [1, 2, 3]])
     rectangles = Rectangle().region(theta[which == 1][:, [1, 2, 4, 5, 6]])
     assert np.array_equal(found[which == 0], circles.albedo(points))
@@ -134,7 +134,7 @@ def test_a_new_shape_is_one_short_class_and_joins_the_set():
     theta = draws(shape, 40)
     assert np.isfinite(shape.prior.log_prob(theta)).all()
     points = np.array([[10.0, 5.0], [20.0, 5.0]])
-    bands = shape.which(theta) == 1
+    bands = shape.shape_index(theta) == 1
     assert np.array_equal(shape.region(theta).albedo(points)[bands], Bands().region(theta[bands, 4:]).albedo(points))
 
 

@@ -205,7 +205,7 @@ def test_a_set_of_shapes_goes_through_the_chain():
     theta = shape.prior.from_unit_cube(np.random.default_rng(0).random((30, 7)))
     plan = replace(plan_of(50), x_mm=np.linspace(0, 1048, 50), y_mm=np.linspace(0, 520, 50)[::-1])
     found = Chain(ssf, levels, HypothesisScene(shape)).predict(theta, plan)
-    circles = shape.which(theta) == 0
+    circles = shape.shape_index(theta) == 0
     alone = Chain(ssf, levels, HypothesisScene(Circle())).predict(theta[circles][:, 1:4], plan)
     assert found[circles] == pytest.approx(alone, abs=1e-8)
 

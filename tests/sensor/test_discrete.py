@@ -6,7 +6,7 @@ import pytest
 from probewise.errors import ShapeError
 from probewise.recordings import patterns as kinds
 from probewise.scene import HalfPlaneRegion, disc_region, region_of
-from probewise.sensor import FixedMixture, Poses, field_of, seen_discrete
+from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels
 from probewise.sensor.gaussian import Spot, seen_by_one
 
 MIXTURE = FixedMixture([1.0], [[0.7, 1.3]], [[[20.0, 6.0], [6.0, 30.0]]])
@@ -45,7 +45,7 @@ def closed(region, poses):
 @pytest.mark.parametrize("name", PATTERNS)
 def test_the_two_routes_agree_to_a_thousandth_at_one_millimetre(name):
     region, poses = region_of(PATTERNS[name]), poses_about(12)
-    found = seen_discrete(region, pixels(1.0), poses)
+    found = mean_albedo_by_pixels(region, pixels(1.0), poses)
     assert np.abs(found - closed(region, poses)).max() < 1e-3
 
 
@@ -54,7 +54,7 @@ def test_the_error_of_the_sum_falls_as_the_pixel_squared(name):
     """Pixels of 3, 1.5 and 0.75 mm: the root mean square error over places falls fourfold each time."""
     region, poses = region_of(PATTERNS[name]), poses_about(16)
     wanted = closed(region, poses)
-    rms = [np.sqrt(np.mean((seen_discrete(region, pixels(p), poses) - wanted) ** 2)) for p in (3.0, 1.5, 0.75)]
+    rms = [np.sqrt(np.mean((mean_albedo_by_pixels(region, pixels(p), poses) - wanted) ** 2)) for p in (3.0, 1.5, 0.75)]
     assert np.allclose(np.log2(np.array(rms[:-1]) / rms[1:]), 2.0, atol=0.3), rms
     assert np.log2(rms[0] / rms[-1]) / 2 == pytest.approx(2.0, abs=0.1)
 
@@ -64,18 +64,18 @@ def test_many_hypotheses_and_poses_equal_one_by_one():
     discs = disc_region(rng.normal(size=(3, 2)), np.array([5.0, 9.0, 14.0]))
     field = pixels(2.0)
     poses = Poses(rng.normal(size=(3, 4)) * 9, rng.normal(size=(1, 4)) * 9, np.zeros((1, 1)))
-    together = seen_discrete(discs, field, poses)
+    together = mean_albedo_by_pixels(discs, field, poses)
     for i in range(3):
         one = disc_region(discs.center_mm[i : i + 1], discs.semi_axes_mm[i : i + 1, 0])
-        alone = seen_discrete(one, field, Poses(poses.x_mm[i : i + 1], poses.y_mm, poses.orientation_rad))
+        alone = mean_albedo_by_pixels(one, field, Poses(poses.x_mm[i : i + 1], poses.y_mm, poses.orientation_rad))
         assert np.allclose(together[i], alone[0])
-    shared = seen_discrete(discs, field, poses_about(4))
+    shared = mean_albedo_by_pixels(discs, field, poses_about(4))
     assert shared.shape == (3, 4)
     with pytest.raises(ShapeError, match="poses of 3 hypotheses, 2 regions"):
-        seen_discrete(disc_region(np.zeros((2, 2)), np.array([5.0, 9.0])), field, poses)
+        mean_albedo_by_pixels(disc_region(np.zeros((2, 2)), np.array([5.0, 9.0])), field, poses)
 
 
 def test_poses_of_each_hypothesis_over_one_known_region():
     half = HalfPlaneRegion(np.zeros(1), np.zeros(1))
     poses = Poses(np.array([[-90.0], [90.0]]), np.zeros((1, 1)), np.zeros((1, 1)))
-    assert seen_discrete(half, pixels(2.0), poses) == pytest.approx(np.array([[0.0], [1.0]]))
+    assert mean_albedo_by_pixels(half, pixels(2.0), poses) == pytest.approx(np.array([[0.0], [1.0]]))

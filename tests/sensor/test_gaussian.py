@@ -22,7 +22,7 @@ from probewise.scene import (
     disc_region,
     region_of,
 )
-from probewise.sensor import FAST_NODES, seen
+from probewise.sensor import FAST_NODES, mean_albedo_under_gaussians
 from probewise.sensor._normal import normal_cdf
 
 PATTERNS = {
@@ -43,7 +43,7 @@ PATTERNS = {
 def see(region, x, y, cov, **options):
     """One place, one Gaussian."""
     arrays = (np.reshape(value, (1, 1, 1)) for value in (x, y, cov[0][0], cov[1][1], cov[0][1]))
-    return seen(region, *arrays, **options)[0, 0, 0]
+    return mean_albedo_under_gaussians(region, *arrays, **options)[0, 0, 0]
 
 
 def covariance(sd_1, sd_2, rho):
@@ -257,7 +257,7 @@ def test_hypotheses_readings_and_gaussians_together_equal_one_by_one(pattern):
     region = region_of(pattern)
     x, y = rng.normal(size=(2, 3, 4, 2)) * 9
     sd_1, sd_2, rho = rng.uniform(2, 6, (3, 1, 2)), rng.uniform(2, 6, (3, 1, 2)), rng.uniform(-0.8, 0.8, (3, 1, 2))
-    together = seen(region, x, y, sd_1**2, sd_2**2, rho * sd_1 * sd_2)
+    together = mean_albedo_under_gaussians(region, x, y, sd_1**2, sd_2**2, rho * sd_1 * sd_2)
     assert together.shape == (3, 4, 2)
     for i, j, k in np.ndindex(3, 4, 2):
         alone = see(region, x[i, j, k], y[i, j, k], covariance(sd_1[i, 0, k], sd_2[i, 0, k], rho[i, 0, k]))
@@ -280,15 +280,15 @@ def test_a_batch_of_regions_equals_one_by_one():
     cov = [np.reshape(value, (1, 1, 1)) for value in (16.0, 9.0, 5.0)]
     parts = []
     for make in makers:
-        whole = seen(make(slice(None)), x, y, *cov)
+        whole = mean_albedo_under_gaussians(make(slice(None)), x, y, *cov)
         parts.append(whole)
         for i in range(6):
-            assert np.allclose(whole[i], seen(make(slice(i, i + 1)), x, y, *cov)[0], atol=1e-10)
+            assert np.allclose(whole[i], mean_albedo_under_gaussians(make(slice(i, i + 1)), x, y, *cov)[0], atol=1e-10)
     which = np.array([3, 0, 1, 3, 2, 0])
     mixed = MixtureOfRegions(
         which, tuple(make(np.flatnonzero(which == k)) if (which == k).any() else None for k, make in enumerate(makers))
     )
-    found = seen(mixed, x, y, *cov)
+    found = mean_albedo_under_gaussians(mixed, x, y, *cov)
     for i, k in enumerate(which):
         assert np.allclose(found[i], parts[k][i], atol=1e-10)
 

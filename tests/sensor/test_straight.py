@@ -10,8 +10,8 @@ from probewise.recordings import paper_plan
 from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene, region_of
-from probewise.sensor import Chain, FixedLevels, FreeMixture, footprint_of, seen
-from probewise.sensor.gaussian import beyond_corner, turned
+from probewise.sensor import Chain, FixedLevels, FreeMixture, footprint_of, mean_albedo_under_gaussians
+from probewise.sensor.gaussian import probabilities_beyond_corner, turn_into_lab_frame
 
 EDGES = {
     "edge": kinds.HalfPlane(0.0, 0.0),
@@ -54,9 +54,13 @@ def out_and_back(patterns):
 def by_itself(theta, plan, row):
     """What a reading sees, from the closed form of its own pattern."""
     foot = footprint_of(theta, theta.shape[1] // 6)
-    dx, dy, *spread = turned(plan.orientation_rad[row], foot.u_mm, foot.v_mm, foot.var_u, foot.var_v, foot.cov_uv)
+    dx, dy, *spread = turn_into_lab_frame(
+        plan.orientation_rad[row], foot.u_mm, foot.v_mm, foot.var_u, foot.var_v, foot.cov_uv
+    )
     region = region_of(plan.patterns[plan.pattern_names[plan.pattern[row]]])
-    return (seen(region, plan.x_mm[row] + dx, plan.y_mm[row] + dy, *spread) * foot.weight).sum(axis=2)[:, 0]
+    return (mean_albedo_under_gaussians(region, plan.x_mm[row] + dx, plan.y_mm[row] + dy, *spread) * foot.weight).sum(
+        axis=2
+    )[:, 0]
 
 
 @pytest.mark.parametrize("patterns", [EDGES, CORNERS, EDGES | CORNERS], ids=["edges", "corners", "both"])
@@ -71,9 +75,9 @@ def test_the_papers_scans_from_both_sides_are_half_as_many_views():
     """Four scans of 101 readings at right angles: the third and the fourth see the first two's places from behind."""
     plan = paper_plan()
     chain = Chain(FreeMixture(1), FixedLevels(0.0, 1.0), KnownScene(plan.patterns))
-    edges = chain._layout_of(thetas(1, 1), plan).straight_batches[0]
+    edges = chain._layout_under_poses(thetas(1, 1), plan).straight_batches[0]
     assert len(edges.rows) == 404
-    assert len(edges._views.distance_mm) == 202
+    assert len(edges._distinct_views.distance_mm) == 202
 
 
 def test_what_lies_beyond_a_corner_is_owens_function():
@@ -87,7 +91,7 @@ def test_what_lies_beyond_a_corner_is_owens_function():
         slope_1, slope_2 = (z2 / z1 - rho) / free, (z1 / z2 - rho) / free
     apart = np.where(z1 * z2 < 0, 0.5, 0.0)
     wanted = 0.5 * (ndtr(-z1) + ndtr(-z2)) - owens_t(z1, slope_1) - owens_t(z2, slope_2) - apart
-    both, beyond_1, beyond_2 = beyond_corner(z1, z2, rho)
+    both, beyond_1, beyond_2 = probabilities_beyond_corner(z1, z2, rho)
     known = (z1 != 0) & (z2 != 0)
     np.testing.assert_allclose(both[known], wanted[known], atol=1e-12)
     at_origin = (z1 == 0) & (z2 == 0)

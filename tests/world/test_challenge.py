@@ -25,8 +25,8 @@ from probewise.world.challenge import (
     draw_case,
     draw_plan,
     draw_sensor,
-    held_out,
     held_out_plans,
+    held_out_recordings,
     stratum_of,
 )
 from probewise.world.challenge.effect_samplers import CleanSetup
@@ -86,8 +86,8 @@ def test_seed_and_number_alone_make_the_case(number):
     assert fingerprint(first.recording) == fingerprint(again.recording)
     assert first.truth.to_json() == again.truth.to_json()
     assert fingerprint(first.recording) != fingerprint(other.recording)
-    once, twice = held_out(first), held_out(first)
-    for name, recording in held_out(again).items():
+    once, twice = held_out_recordings(first), held_out_recordings(first)
+    for name, recording in held_out_recordings(again).items():
         np.testing.assert_array_equal(recording.readings, once[name].readings)
         np.testing.assert_array_equal(recording.readings, twice[name].readings)
 

@@ -19,7 +19,7 @@ from probewise.world import (
     paint,
     raster_spot,
     ridge_spot,
-    seen_white,
+    seen_white_fraction,
     tailed_spot,
 )
 
@@ -51,8 +51,8 @@ def poses(n=40):
 
 @pytest.mark.parametrize(("spot", "surface"), list(zip([*SPOTS, *SPOTS], SURFACES, strict=False)))
 def test_refining_pixels_and_rays_changes_less_than_a_thousandth(spot, surface):
-    coarse = seen_white(SURFACES[surface], SPOTS[spot](0.25), *poses(6))
-    fine = seen_white(SURFACES[surface], SPOTS[spot](0.125), *poses(6), n_rays=100)
+    coarse = seen_white_fraction(SURFACES[surface], SPOTS[spot](0.25), *poses(6))
+    fine = seen_white_fraction(SURFACES[surface], SPOTS[spot](0.125), *poses(6), n_rays=100)
     assert np.abs(coarse - fine).max() < 1e-3
 
 
@@ -60,8 +60,8 @@ def test_refining_pixels_and_rays_changes_less_than_a_thousandth(spot, surface):
 @pytest.mark.parametrize("spot", SPOTS)
 @pytest.mark.parametrize("surface", SURFACES)
 def test_refining_further_at_more_places_changes_less_than_a_thousandth_still(spot, surface):
-    coarse = seen_white(SURFACES[surface], SPOTS[spot](0.25), *poses())
-    fine = seen_white(SURFACES[surface], SPOTS[spot](0.1), *poses(), n_rays=256)
+    coarse = seen_white_fraction(SURFACES[surface], SPOTS[spot](0.25), *poses())
+    fine = seen_white_fraction(SURFACES[surface], SPOTS[spot](0.1), *poses(), n_rays=256)
     assert np.abs(coarse - fine).max() < 1e-3
 
 
@@ -73,7 +73,7 @@ def test_a_half_plane_is_the_normal_integral():
     c, s = np.cos(direction), np.sin(direction)
     sd = np.sqrt(16 * c**2 + 6.25 * s**2 + 2 * 0.15 * 10 * c * s)
     expected = ndtr((x * math.cos(normal) + 1.5 * s - offset) / sd)
-    got = seen_white(HalfPlane(normal, offset), gaussian_spot([BLOB]), x, np.zeros(200), turn)
+    got = seen_white_fraction(HalfPlane(normal, offset), gaussian_spot([BLOB]), x, np.zeros(200), turn)
     assert np.abs(got - expected).max() < 3e-4
 
 
@@ -84,20 +84,20 @@ def test_a_quadrant_is_the_bivariate_normal_integral(corner, direction):
     (cx, cy), (dx, dy) = corner, direction
     cov = [[16, 1.5 * dx * dy], [1.5 * dx * dy, 6.25]]
     expected = multivariate_normal(mean=[0, 0], cov=cov).cdf([dx * (0 - cx), dy * (1.5 - cy)])
-    got = seen_white(Quadrant(corner, direction), gaussian_spot([BLOB]), *np.zeros((3, 1)))[0]
+    got = seen_white_fraction(Quadrant(corner, direction), gaussian_spot([BLOB]), *np.zeros((3, 1)))[0]
     assert abs(got - expected) < 3e-4
 
 
 def test_a_disc_under_a_round_spot_is_the_rayleigh_integral():
     spot = gaussian_spot([Blob(1.0, (0.0, 0.0), (3.0, 3.0))])
-    got = seen_white(Disc((5.0, 5.0), 4.0), spot, np.array([5.0]), np.array([5.0]), np.array([1.0]))[0]
+    got = seen_white_fraction(Disc((5.0, 5.0), 4.0), spot, np.array([5.0]), np.array([5.0]), np.array([1.0]))[0]
     assert abs(got - (1 - math.exp(-16 / 18))) < 3e-4
 
 
 @pytest.mark.parametrize("spot", SPOTS)
 def test_a_plain_surface_shows_its_albedo(spot):
     x, y, turn = poses()
-    np.testing.assert_allclose(seen_white(Uniform(0.3), SPOTS[spot](0.25), x, y, turn), 0.3, rtol=1e-12)
+    np.testing.assert_allclose(seen_white_fraction(Uniform(0.3), SPOTS[spot](0.25), x, y, turn), 0.3, rtol=1e-12)
 
 
 def test_a_ramp_shows_the_albedo_at_the_spots_middle():
@@ -105,7 +105,7 @@ def test_a_ramp_shows_the_albedo_at_the_spots_middle():
     mean, _ = spot.moments()
     x, y, turn = poses()
     u = x + np.cos(turn) * mean[0] - np.sin(turn) * mean[1]
-    np.testing.assert_allclose(seen_white(Ramp(0.0, 0.02), spot, x, y, turn), 0.02 * u, atol=1e-12)
+    np.testing.assert_allclose(seen_white_fraction(Ramp(0.0, 0.02), spot, x, y, turn), 0.02 * u, atol=1e-12)
 
 
 def test_turning_spot_and_surface_together_changes_nothing():
@@ -113,8 +113,8 @@ def test_turning_spot_and_surface_together_changes_nothing():
     x, y, turn = poses()
     by = 0.9
     c, s = math.cos(by), math.sin(by)
-    one = seen_white(HalfPlane(0.2, 1.0), spot, x, y, turn)
-    two = seen_white(HalfPlane(0.2 + by, 1.0), spot, c * x - s * y, s * x + c * y, turn + by)
+    one = seen_white_fraction(HalfPlane(0.2, 1.0), spot, x, y, turn)
+    two = seen_white_fraction(HalfPlane(0.2 + by, 1.0), spot, c * x - s * y, s * x + c * y, turn + by)
     assert np.abs(one - two).max() < 5e-4
 
 
@@ -124,7 +124,7 @@ def test_a_photograph_of_a_polygon_looks_like_the_polygon():
     x, y = np.meshgrid(centers, centers[::-1])  # first row on top
     photo = Image(paint(triangle, x, y), 0.1, (-15.0, -15.0), "photo.npy")
     spot = gaussian_spot([BLOB])
-    apart = seen_white(photo, spot, *poses()) - seen_white(triangle, spot, *poses())
+    apart = seen_white_fraction(photo, spot, *poses()) - seen_white_fraction(triangle, spot, *poses())
     assert np.abs(apart).max() < 2e-3
 
 
@@ -188,7 +188,7 @@ def test_a_skew_of_one_is_refused():
 
 def test_any_density_can_be_a_spot():
     square = raster_spot(lambda u, v: ((abs(u) < 2) & (abs(v) < 2)).astype(float), 5.0)
-    got = seen_white(HalfPlane(0.0, 0.0), square, np.array([-1.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
+    got = seen_white_fraction(HalfPlane(0.0, 0.0), square, np.array([-1.0, 0.0, 1.0]), np.zeros(3), np.zeros(3))
     np.testing.assert_allclose(got, [0.25, 0.5, 0.75], atol=2e-3)
 
 

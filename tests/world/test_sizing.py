@@ -9,7 +9,7 @@ from probewise.errors import NotConvergedError, ParameterError
 from probewise.world import World, gaussian_spot
 from probewise.world.challenge import EffectSizer, amplitude_of_size
 from probewise.world.challenge.effect_samplers import CleanSetup
-from probewise.world.challenge.sizing import noise_size
+from probewise.world.challenge.sizing import noise_effect_size
 from probewise.world.concealed import (
     AmbientGradient,
     CorrelatedNoise,
@@ -132,4 +132,4 @@ def test_lost_readings_count_by_how_far_off_they_are(plan, sizer):
 
 def test_noise_without_a_name_has_no_size(plan):
     with pytest.raises(ParameterError, match="vocabulary"):
-        noise_size(HeavyTails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)
+        noise_effect_size(HeavyTails(4.0), World(SPOT).view(plan), np.zeros(len(plan)), 1.0)

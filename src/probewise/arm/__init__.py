@@ -6,19 +6,19 @@ from probewise.arm.geometry_file import read_geometry, shipped_geometry
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm, in_lego_units
 from probewise.arm.limits import SoftLimits
-from probewise.arm.machine import Machine, Rehearsal
+from probewise.arm.machine import DryRun, Machine
 from probewise.arm.own_instrument import Measures, OwnInstrument, instrument_of
 from probewise.arm.reach import FIELD_MM, Reach, Workspace, require_reach
-from probewise.arm.scale import LegoScale
+from probewise.arm.scale import ReadingScale
 from probewise.arm.simulated import Light, SimulatedArm, Speed
 
 __all__ = [
     "FIELD_MM",
+    "DryRun",
     "Geometry",
     "Instrument",
     "Joint",
     "LegoArm",
-    "LegoScale",
     "Light",
     "Machine",
     "Measures",
@@ -26,7 +26,7 @@ __all__ = [
     "Pose",
     "Reach",
     "Reading",
-    "Rehearsal",
+    "ReadingScale",
     "Request",
     "SimulatedArm",
     "SoftLimits",
@@ -44,3 +44,9 @@ __all__ = [
 
 recorded = recording_of
 """The old name of `recording_of`."""
+
+Rehearsal = DryRun
+"""The old name of `DryRun`."""
+
+LegoScale = ReadingScale
+"""The old name of `ReadingScale`."""

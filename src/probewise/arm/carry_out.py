@@ -16,7 +16,7 @@ from probewise.arm.reach import Bounds, require_reach
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
-from probewise.recordings.where_white import where_white
+from probewise.recordings.where_white import where_white_in_words
 
 QUARTER_RAD = math.pi / 2  # a LEGO mount turns by right angles
 _SAME_TURN_RAD = math.radians(0.5)
@@ -87,7 +87,7 @@ def carry_out(
     """
     arm = instrument_of(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
-    require_reach(bounds_of(arm), places, "row of the plan", way_out="; move the plan's origin")
+    require_reach(reach_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
     row_reader = _LegoRowReader(arm) if isinstance(arm, LegoArm) else _OwnRowReader(arm)
     turns = row_reader.hand_turns_rad(plan, places)
@@ -97,7 +97,7 @@ def carry_out(
             lying = int(plan.pattern[row])
             name = plan.pattern_names[lying]
             where = f"its origin at ({origin_mm[0]:g}, {origin_mm[1]:g}) mm of the field, its x axis along the field's"
-            shown = f": {where_white(plan.patterns[name])}" if name in plan.patterns else ""
+            shown = f": {where_white_in_words(plan.patterns[name])}" if name in plan.patterns else ""
             ask(Request(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
             mounted = float(turns[row])
@@ -224,7 +224,7 @@ def readings_of(recording: Recording) -> list[Reading]:
     ]
 
 
-def bounds_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
+def reach_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
     """Return what says which places an arm can reach: its geometry, its `Reach`, or the instrument itself."""
     match arm:
         case LegoArm():

@@ -285,7 +285,7 @@ class Geometry:
         """Places all over the field at which the sensor can read, (n, 2)."""
         sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
         places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
-        return places[self.holds(places)]
+        return places[self.contains(places)]
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
         """Compute place and height of the sensor's face in the lab frame from joint angles, both (n, 3)."""
@@ -334,16 +334,19 @@ class Geometry:
             lower = rise - np.arccos((lower_mm**2 + span**2 - upper_mm**2) / (2 * lower_mm * span))
         elbow = lower - shoulder if self.elbow_is_relative else lower
         angles = np.stack([base, shoulder, elbow], axis=-1)
-        angles[~self.allows(angles)] = np.nan
+        angles[~self.are_within_joint_limits(angles)] = np.nan
         return angles
 
-    def holds(self, places_mm: FloatArray) -> BoolArray:
+    def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n, 2), are on the field with room for the motors to approach: shape (n,)."""
         places = _checked_rows(places_mm, 2)
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
         return np.asarray(on_field & self._leaves_room_to_approach(places))
 
-    def allows(self, angles_rad: FloatArray) -> BoolArray:
+    holds = contains
+    """The old name of `contains`."""
+
+    def are_within_joint_limits(self, angles_rad: FloatArray) -> BoolArray:
         """Return which joint angles, shape (n, 3), are within the joints' limits: shape (n,); NaN is not."""
         angles = _checked_rows(angles_rad, 3)
         low = np.array([joint.low_rad for joint in self.joints])
@@ -358,7 +361,7 @@ class Geometry:
         """
         places = _checked_rows(places_mm, 2)
         base = np.arctan2(places[:, 1] - self.axis_mm[1], places[:, 0] - self.axis_mm[0])
-        return wrapped(self.mounting_rad + base - math.pi / 2)
+        return wrapped_to_pi(self.mounting_rad + base - math.pi / 2)
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""
@@ -372,7 +375,7 @@ class Geometry:
         """Return which places, (n, 2), leave the motors room to approach at both heights, shape (n,)."""
         room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
         read, travel = (self.angles_rad(places_mm, height) for height in (self.read_height_mm, self.travel_height_mm))
-        roomy = [self.allows(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
+        roomy = [self.are_within_joint_limits(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
         return np.asarray(np.all(roomy, axis=0))
 
     def _radii_with_room_mm(self) -> tuple[float, float]:
@@ -401,7 +404,7 @@ def forward_kinematics_mm(
     return np.stack([axis_mm[0] + away * np.cos(base), axis_mm[1] + away * np.sin(base), height], axis=-1)
 
 
-def wrapped(angle_rad: FloatArray) -> FloatArray:
+def wrapped_to_pi(angle_rad: FloatArray) -> FloatArray:
     """Wrap angles, of any shape, to -pi to pi."""
     return np.asarray(np.mod(angle_rad + math.pi, 2 * math.pi) - math.pi)
 

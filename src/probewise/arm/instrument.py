@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._kinds import radians_meant, require_kind, require_number
+from probewise._kinds import require_kind, require_number, warn_of_likely_degrees
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Pose:
     def __post_init__(self) -> None:
         for name in ("x_mm", "y_mm", "orientation_rad"):
             object.__setattr__(self, name, require_number(name, getattr(self, name)))
-        radians_meant("orientation_rad", self.orientation_rad)
+        warn_of_likely_degrees("orientation_rad", self.orientation_rad)
         if self.height_mm is not None:
             object.__setattr__(self, "height_mm", require_number("height_mm", self.height_mm, "a number or None"))
 

@@ -14,11 +14,11 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.basics import Clock, Side
-from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped
+from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped_to_pi
 from probewise.arm.instrument import Pose, Reading
 from probewise.arm.machine import Machine
 from probewise.arm.reach import require_reach
-from probewise.arm.scale import LegoScale
+from probewise.arm.scale import ReadingScale
 from probewise.errors import LinkError, ReachError
 
 BASE, SHOULDER, ELBOW = range(3)
@@ -44,7 +44,7 @@ def in_lego_units(percent: float, geometry: Geometry) -> float:
     """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, as in recordings."""
     if geometry.whole_percent and math.isfinite(percent):
         percent = math.floor(percent)  # the brick truncates fractions
-    return LegoScale(step=1.0 if geometry.whole_percent else None).convert(percent)
+    return ReadingScale(step=1.0 if geometry.whole_percent else None).convert(percent)
 
 
 class LegoArm:
@@ -107,11 +107,11 @@ class LegoArm:
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2): shape (n_places,)."""
-        return wrapped(self.geometry.orientation_rad(places_mm) + self.turned_rad)
+        return wrapped_to_pi(self.geometry.orientation_rad(places_mm) + self.turned_rad)
 
     def reachable(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
-        return self.geometry.holds(places_mm)
+        return self.geometry.contains(places_mm)
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
         """Estimate the seconds to move from `start` to each place and read, shape (n_places,); NaN out of reach."""
@@ -142,7 +142,7 @@ class LegoArm:
                 "height_mm", pose.height_mm, f"{self.geometry.read_height_mm:g}, at which this arm reads, or None"
             )
         stands = float(self.orientation_rad(place)[0])
-        if not abs(float(wrapped(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
+        if not abs(float(wrapped_to_pi(np.array(pose.orientation_rad - stands)))) <= SAME_TURN_RAD:
             raise ReachError(
                 "orientation_rad",
                 pose.orientation_rad,
@@ -239,7 +239,10 @@ class LegoArm:
                 self._arrived[joint] = side
                 stopped.append(joint)
         self.rise()
-        goals = [Goal(0, side) for side in self._sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))]
+        goals = [
+            Goal(0, side)
+            for side in self._approach_sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))
+        ]
         self._turn_joint_to(BASE, goals[BASE])
         for joint in self._link_order(goals):
             self._turn_joint_to(joint, goals[joint])
@@ -281,7 +284,7 @@ class LegoArm:
         angles = self.angles_rad
         x_mm, y_mm, _ = self.geometry.position_mm(angles[None, :])[0]
         standing = self.geometry.mounting_rad + angles[BASE] - math.pi / 2 + self.turned_rad
-        return Pose(float(x_mm), float(y_mm), float(wrapped(standing)))
+        return Pose(float(x_mm), float(y_mm), float(wrapped_to_pi(standing)))
 
     def _goals_at_place(self, x_mm: float, y_mm: float, height_mm: float) -> list[Goal]:
         """Return the joints' goals for the sensor at a place and height; raise ReachError if it is out of reach."""
@@ -293,10 +296,12 @@ class LegoArm:
     def _goals_at_angles(self, angles_rad: FloatArray) -> list[Goal]:
         return [
             Goal(joint.counts_at(float(angle), side), side)
-            for joint, angle, side in zip(self.geometry.joints, angles_rad, self._sides_of(angles_rad), strict=True)
+            for joint, angle, side in zip(
+                self.geometry.joints, angles_rad, self._approach_sides_of(angles_rad), strict=True
+            )
         ]
 
-    def _sides_of(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
+    def _approach_sides_of(self, angles_rad: FloatArray) -> tuple[Side, Side, Side]:
         """Choose the direction from which each joint approaches these angles, (3,).
 
         The links approach a place from above, so that their weight and their motors take up the play in the same
@@ -332,7 +337,7 @@ class LegoArm:
     def _single_link_rise(self, joint: int) -> tuple[int, int, int] | None:
         """Find how one link alone can raise the sensor: counts to turn, joint, target count; None if it cannot."""
         mechanics, stand = self.geometry.joints[joint], self.angles_rad
-        up = mechanics.low_rad if self._sides_of(stand)[joint] > 0 else mechanics.high_rad
+        up = mechanics.low_rad if self._approach_sides_of(stand)[joint] > 0 else mechanics.high_rad
         angles = np.tile(stand, (N_TRIED, 1))
         angles[:, joint] = np.linspace(stand[joint], up, N_TRIED)
         high_enough = np.flatnonzero(self.geometry.position_mm(angles)[:, 2] >= self.geometry.travel_height_mm)

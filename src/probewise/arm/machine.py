@@ -56,7 +56,7 @@ class Machine(Protocol):
         ...
 
 
-class Rehearsal:
+class DryRun:
     """A dry run: prints every commanded move, and reads nothing.
 
     Parameters

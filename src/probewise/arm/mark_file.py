@@ -32,7 +32,7 @@ def read_marks(path: Path) -> tuple[FloatArray, FloatArray]:
     Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty.
     """
     table = read_table(path)
-    table.require(*_TURNED, *_PLACE)
+    table.require_columns(*_TURNED, *_PLACE)
     turned = [table.numbers(name, largest=_LARGEST) for name in _TURNED]
     place = [table.numbers(name, missing=name == "height_mm", largest=_LARGEST) for name in _PLACE]
     return np.radians(np.stack(turned, axis=-1)), np.stack(place, axis=-1)

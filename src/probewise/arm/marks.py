@@ -15,7 +15,7 @@ _COLUMNS, _ROWS = (0.1, 0.3, 0.5, 0.7, 0.9), (0.12, 0.45, 0.75)
 _STEP_MM = 10.0
 
 
-def marks_of(geometry: Geometry) -> FloatArray:
+def places_of_marks(geometry: Geometry) -> FloatArray:
     """Choose places spread over the arm's reach on the field, in whole steps of 10 mm.
 
     Returns
@@ -36,7 +36,7 @@ def marks_of(geometry: Geometry) -> FloatArray:
         if (row + column) % 2 == 0
     ]
     marks = np.round(np.array(grid) / _STEP_MM) * _STEP_MM
-    marks = marks[geometry.holds(marks)]
+    marks = marks[geometry.contains(marks)]
     if len(marks) < LEAST_MARKS:
         raise ReachError("marks", f"{len(marks)} within reach", f"{LEAST_MARKS} or more on {geometry.sentence()}")
     return marks

@@ -18,13 +18,13 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_callable, require_finite_number, require_like
-from probewise._signals import deferred
+from probewise._signals import defer_signals
 from probewise.arm.basics import Clock
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.simulated import SimulatedArm, Speed
 from probewise.errors import FileError, LinkError, ParameterError, ShapeError
-from probewise.recordings.python_file import error_text, run_python_file
+from probewise.recordings.python_file import error_on_one_line, run_python_file
 
 _A_READING = 'a finite number, or a dict such as {"value": 41.5, "time_s": 12.0, "temperature_c": 21.3}'
 _OF_THE_POSE = ("x_mm", "y_mm", "orientation_rad")
@@ -105,7 +105,7 @@ class OwnInstrument:
         leave = getattr(own, "__exit__", None)
         close = getattr(own, "close", None)
         try:
-            with deferred(), self._errors_located("close"):
+            with defer_signals(), self._errors_located("close"):
                 if hasattr(own, "__enter__") and callable(leave):
                     leave(kind, error, trace)
                 elif callable(close):
@@ -113,7 +113,9 @@ class OwnInstrument:
         except Exception as failure:
             if error is None:
                 raise
-            warnings.warn(f"the instrument may not be at rest: {error_text(failure)}", RuntimeWarning, stacklevel=2)
+            warnings.warn(
+                f"the instrument may not be at rest: {error_on_one_line(failure)}", RuntimeWarning, stacklevel=2
+            )
 
     @property
     def turns(self) -> bool:
@@ -140,9 +142,12 @@ class OwnInstrument:
                 raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
             return held.astype(np.bool_)
 
-    def holds(self, places_mm: FloatArray) -> BoolArray:
+    def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, (n_places, 2), are reachable, as `reachable` does: shape (n_places,)."""
         return self.reachable(places_mm)
+
+    holds = contains
+    """The old name of `contains`."""
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2), by default 0: shape (n_places,)."""
@@ -212,7 +217,7 @@ class OwnInstrument:
         where = f"{self.source}, line {frames[-1]}" if frames else self.source
         if isinstance(error, ParameterError | ShapeError) and not frames:  # a wrong value was returned
             return f"{where}: {error}"
-        return f"{where}: {what} raises {type(error).__name__}: {error_text(error)}".rstrip(": ")
+        return f"{where}: {what} raises {type(error).__name__}: {error_on_one_line(error)}".rstrip(": ")
 
 
 def instrument_of(

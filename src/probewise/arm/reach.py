@@ -18,7 +18,7 @@ FIELD_MM = (1048.0, 520.0)
 class Bounds(Protocol):
     """The set of reachable places of an arm."""
 
-    def holds(self, places_mm: FloatArray) -> BoolArray:
+    def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         ...
 
@@ -35,7 +35,7 @@ class Workspace(Protocol):
         """Rest position of the sensor."""
         ...
 
-    def holds(self, places_mm: FloatArray) -> BoolArray:
+    def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are reachable: shape (n_places,)."""
         ...
 
@@ -67,7 +67,7 @@ def require_reach(workspace: Bounds, places_mm: FloatArray, of: str, *, way_out:
     ReachError
         If a place is out of reach; the message names the first, counts the others, and describes the reach.
     """
-    held = workspace.holds(places_mm)
+    held = workspace.contains(places_mm)
     if held.all():
         return
     first, n = int(np.argmin(held)), len(places_mm)
@@ -152,12 +152,15 @@ class Reach:
         """Return the sensor's orientation at each place, (n_places, 2): always 0, shape (n_places,)."""
         return np.zeros(len(places_mm))
 
-    def holds(self, places_mm: FloatArray) -> BoolArray:
+    def contains(self, places_mm: FloatArray) -> BoolArray:
         """Return which places, shape (n_places, 2), are within reach and on the field: shape (n_places,)."""
         x_mm, y_mm = places_mm[:, 0], places_mm[:, 1]
         away = np.hypot(x_mm - self.axis_mm[0], y_mm - self.axis_mm[1])
         on_field = (x_mm >= 0) & (x_mm <= self.field_mm[0]) & (y_mm >= 0) & (y_mm <= self.field_mm[1])
         return on_field & (away >= self.nearest_mm) & (away <= self.farthest_mm)
+
+    holds = contains
+    """The old name of `contains`."""
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""

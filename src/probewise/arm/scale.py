@@ -9,7 +9,7 @@ from probewise.errors import ParameterError
 
 
 @dataclass(frozen=True)
-class LegoScale:
+class ReadingScale:
     """Conversion of a value to a reading: rounded to multiples of `step` (None: not rounded), clipped to `low`, `high`.
 
     By default the LEGO brick's.

@@ -13,10 +13,10 @@ from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import require_callable, require_like, require_number
 from probewise.arm.instrument import Pose, Reading, require_pose
 from probewise.arm.reach import Reach, Workspace, require_reach
-from probewise.arm.scale import LegoScale
+from probewise.arm.scale import ReadingScale
 from probewise.errors import ParameterError, ReachError, ShapeError
 
-LEGO = LegoScale()
+LEGO = ReadingScale()
 
 Light: TypeAlias = Callable[[Pose, float, float], float]
 """Function of pose, time (s) and height (mm); returns the sensor's reading."""
@@ -61,7 +61,7 @@ class SimulatedArm:
         *,
         reach: Workspace | None = None,
         speed: Speed | None = None,
-        scale: LegoScale | None = LEGO,
+        scale: ReadingScale | None = LEGO,
         height_mm: float = 14.0,
         last: Reading | None = None,
     ) -> None:
@@ -101,7 +101,7 @@ class SimulatedArm:
         ShapeError
             If the places are not pairs.
         """
-        return self.reach.holds(_checked_places(places_mm))
+        return self.reach.contains(_checked_places(places_mm))
 
     def orientation_rad(self, places_mm: FloatArray) -> FloatArray:
         """Return the sensor's orientation at each place, (n_places, 2), unless it is turned: shape (n_places,).

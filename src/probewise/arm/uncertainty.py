@@ -17,13 +17,13 @@ RULER_SDS = np.array([*np.radians([5.0, 5.0, 5.0]), 5.0, 5.0, 10.0, 10.0, 10.0, 
 """Prior sd of each, as measured with a ruler and by eye."""
 
 
-def values_of(geometry: Geometry) -> FloatArray:
+def values_of_fitted(geometry: Geometry) -> FloatArray:
     """Return the values of the parameters `FITTED`, (9,)."""
     homes = [joint.home_rad for joint in geometry.joints]
     return np.array([*homes, *geometry.links_mm, *geometry.axis_mm, *geometry.shoulder_mm])
 
 
-def places_of(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
+def places_at_values(geometry: Geometry, values: FloatArray, turned_rad: FloatArray) -> FloatArray:
     """Return the sensor's places and heights, (n, 3), from values of `FITTED` and joint turns from home, (n, 3)."""
     return forward_kinematics_mm(
         values[:3] + turned_rad,
@@ -49,12 +49,14 @@ def slopes_mm(geometry: Geometry, places_mm: FloatArray) -> FloatArray:
     -------
     Shape (n, 3, 9): x, y and height by the parameters of `FITTED`; NaN at a place out of reach.
     """
-    values = values_of(geometry)
+    values = values_of_fitted(geometry)
     turned = geometry.angles_rad(places_mm, geometry.read_height_mm) - values[:3]
     slopes = np.empty((len(turned), 3, len(values)))
     for k, step in enumerate(RULER_SDS * 1e-4):
         up, down = values.copy(), values.copy()
         up[k] += step
         down[k] -= step
-        slopes[:, :, k] = (places_of(geometry, up, turned) - places_of(geometry, down, turned)) / (2 * step)
+        slopes[:, :, k] = (places_at_values(geometry, up, turned) - places_at_values(geometry, down, turned)) / (
+            2 * step
+        )
     return slopes

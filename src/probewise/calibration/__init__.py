@@ -4,12 +4,11 @@ Paper, sections "Estimating SSF MoG Model Parameters" and "Light Sensor SSF MoG 
 and "studentT", the table of log evidences, and the weighted mean of sampled SSF fields.
 """
 
-from probewise.calibration.climb import Climb, Rung
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
 from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
 from probewise.calibration.order_problems import problem_for
-from probewise.calibration.order_search import Found
+from probewise.calibration.order_search import Found, OrderPosterior
 from probewise.calibration.prediction import predict
 from probewise.calibration.priors import (
     PriorRow,
@@ -21,6 +20,7 @@ from probewise.calibration.priors import (
     scan_geometry,
 )
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
+from probewise.calibration.smc import Climb, Rung, SMCResult, TemperatureSummary
 from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 
 __all__ = [
@@ -30,12 +30,15 @@ __all__ = [
     "Found",
     "OrderEvidence",
     "OrderFit",
+    "OrderPosterior",
     "PriorRow",
     "Quantity",
     "Rung",
+    "SMCResult",
     "SSFPrior",
     "ScanGeometry",
     "ScanNoise",
+    "TemperatureSummary",
     "blind_axis_rad",
     "calibrate",
     "choose_pixel_mm",

@@ -1,9 +1,9 @@
-"""How the posterior of N - 1 Gaussians answers a light one more, to first order.
+"""How the parameters of N - 1 Gaussians shift when one light Gaussian is added, to first order.
 
 Adding a Gaussian that holds the share s of the light changes the predicted readings by s times a known curve. To first
-order the other parameters answer by a shift, which the covariances of parameters and predictions over the posterior's
-samples tell (as in the ensemble Kalman filter, Evensen 1994), and s itself has a normal posterior. Its integral over s
-tells which places and widths of the new Gaussian the readings ask for, before any likelihood is evaluated.
+order the other parameters shift to compensate. The covariances of parameters and predictions over the posterior's
+samples determine the shift (as in the ensemble Kalman filter, Evensen 1994), and s itself has a normal posterior. Its
+integral over s shows which places and widths of the new Gaussian fit the readings, before any likelihood is evaluated.
 """
 
 from __future__ import annotations
@@ -17,31 +17,31 @@ from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
-from probewise.calibration.gaussian_responses import LoneResponses, light_of
+from probewise.calibration.gaussian_responses import SingleGaussianResponses, light_by_gaussian
 from probewise.calibration.whole_coordinates import WholeCoordinates
 from probewise.effects.density import log_mass_between
 from probewise.inference import SensorProblem, sd_floor
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 
-# All particles take their shapes from one pool, whose scatter no cloud tells: with 6,000 it was the greatest part of
+# All particles take their shapes from one pool, whose scatter no cloud shows: with 6,000 it was the greatest part of
 # the error of ln Z of two Gaussians. So many are drawn at a time, until enough are effective or there are many.
 _N_DRAWN, _EFFECTIVE, _MOST_DRAWN = 12_000, 4_000, 60_000
 _AT_ONCE = 500
 # First-order evidences are tempered, and a share of the shapes does without: far from the mean they mislead.
 _TEMPERED, _PLAIN = 0.8, 0.1
 
-# A share is told by at least this part of the information that a sensor with fixed other parameters would give.
+# The information on a share is at least this part of what it would be with the other parameters fixed.
 _LEAST_TOLD = 0.1
 _WIDENED = 1.2
 _LOG_ROOT_2PI = 0.5 * float(np.log(2.0 * np.pi))
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """The answer to one Gaussian more.
+class CompensatingShift:
+    """Shift of the other Gaussians' coordinates that compensates for one Gaussian more, and that one's share of light.
 
-    `shift` of the coordinates per share of the light, (n, d); `mean` of the share, and `sd`, 1.2 times that of first
-    order, (n,).
+    `shift`: per share of the light, (n, d). `mean`, `sd`: of the share's first-order posterior, (n,) each; the sd is
+    widened by 1.2.
     """
 
     shift: FloatArray
@@ -49,30 +49,30 @@ class Answer:
     sd: FloatArray
 
     @classmethod
-    def joined(cls, parts: Sequence[Answer]) -> Answer:
-        """Join answers, one after the other."""
+    def concatenate(cls, parts: Sequence[CompensatingShift]) -> CompensatingShift:
+        """Concatenate shifts."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
 
-    def take(self, rows: IntArray) -> Answer:
+    def take(self, rows: IntArray) -> CompensatingShift:
         """Select rows."""
-        return Answer(self.shift[rows], self.mean[rows], self.sd[rows])
+        return CompensatingShift(self.shift[rows], self.mean[rows], self.sd[rows])
 
-    def put(self, rows: IntArray, other: Answer) -> Answer:
-        """Replace rows."""
+    def with_rows_replaced(self, rows: IntArray, other: CompensatingShift) -> CompensatingShift:
+        """Return a copy in which `rows` are those of `other`."""
         out = self.take(np.arange(len(self.mean)))
         out.shift[rows], out.mean[rows], out.sd[rows] = other.shift, other.mean, other.sd
         return out
 
-    def log_evidence(self, most: float) -> FloatArray:
-        """Log of the mean likelihood over shares from 0 to `most`, over that without the Gaussian, (n,)."""
+    def log_bayes_factor(self, most: float) -> FloatArray:
+        """Log of the mean likelihood over shares from 0 to `most`, over that without the added Gaussian, (n,)."""
         true_sd = self.sd / _WIDENED
-        low, high, _ = Answer(self.shift, self.mean, true_sd)._bounds(np.full(len(self.mean), most))
+        low, high, _ = CompensatingShift(self.shift, self.mean, true_sd)._bounds_in_sds(np.full(len(self.mean), most))
         log_mass = log_mass_between(low, high)
         return np.asarray(0.5 * (self.mean / true_sd) ** 2 + log_mass + np.log(true_sd / most) + _LOG_ROOT_2PI)
 
     def draw_share(self, most: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw shares from 0 to `most`, both (n,)."""
-        low, high, mirrored = self._bounds(most)
+        low, high, mirrored = self._bounds_in_sds(most)
         at_low, at_high = log_ndtr(low), log_ndtr(high)
         # Both bounds are in the lower tail or about 0, so that logarithms keep their digits.
         z = ndtri_exp(at_high + np.log(rng.random(len(most)) * -np.expm1(at_low - at_high) + np.exp(at_low - at_high)))
@@ -80,28 +80,28 @@ class Answer:
 
     def log_share_density(self, share: FloatArray, most: FloatArray) -> FloatArray:
         """Natural log of the density of `draw_share`, (n,)."""
-        low, high, _ = self._bounds(most)
+        low, high, _ = self._bounds_in_sds(most)
         log_mass = log_mass_between(low, high)
         z = (share - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - _LOG_ROOT_2PI - np.log(self.sd) - log_mass)
 
-    def _bounds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _bounds_in_sds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
         low, high = -self.mean / self.sd, (most - self.mean) / self.sd
         mirrored = low > 0
         return np.where(mirrored, -high, low), np.where(mirrored, -low, high), mirrored
 
 
 @dataclass(frozen=True, eq=False)
-class _Linear:
-    """Linear model of the posterior of N - 1 Gaussians about its mean; n_used readings.
+class _LinearisedPosterior:
+    """Posterior of N - 1 Gaussians, linearised about its mean; n_used is the number of usable readings.
 
     Attributes
     ----------
     alone
         Problem of one Gaussian.
     response
-        To a change of the readings in units of their noise sd: product with the mean residual, and minus the shift of
-        the coordinates, (n_used, 1 + d). The masses do not shift.
+        Matrix that multiplies a change of the readings in noise sds, (n_used, 1 + d). Column 0 gives the product with
+        the mean residual, the others give minus the shift of the coordinates. The masses do not shift.
     inverse
         Inverse covariance of the coordinates that shift, with zeros for the others, (d, d).
     dark, bright
@@ -115,14 +115,14 @@ class _Linear:
     bright: FloatArray
 
     @classmethod
-    def of(
+    def from_samples(
         cls,
         below: SensorProblem,
         coordinates: MomentCoordinates | WholeCoordinates,
         alone: SensorProblem,
         theta: FloatArray,
-    ) -> _Linear:
-        """Learn from posterior samples of N - 1 Gaussians, (n, 6 N - 4)."""
+    ) -> _LinearisedPosterior:
+        """Compute means and covariances from posterior samples of N - 1 Gaussians, (n, 6 N - 4)."""
         recording = below.recording
         used = recording.usable
         predicted = below.model.predict(theta, recording.plan)[:, used]
@@ -133,7 +133,7 @@ class _Linear:
         per_sd = 1.0 / np.maximum(np.sqrt(variance), sd_floor(recording))[scan]
         x = coordinates.enter(theta)
         off = x - x.mean(axis=0)
-        # Only the whole and the levels shift: how Gaussians share the light, the readings tell too little to say.
+        # Only the whole and the levels shift: the readings contain too little information on the Gaussians' shares.
         shifts = np.zeros(x.shape[1], dtype=np.bool_)
         shifts[1:6] = shifts[-2:] = True
         off[:, ~shifts] = 0.0
@@ -149,55 +149,55 @@ class _Linear:
             float((theta[:, -1] - theta[:, -2]).mean()) * per_sd,
         )
 
-    def answer(self, gaussian: FloatArray) -> Answer:
-        """Tell the answer to Gaussians, (n, 6), of any amplitude."""
+    def compensating_shift(self, gaussian: FloatArray) -> CompensatingShift:
+        """Return the shifts that compensate for Gaussians, (n, 6); their amplitude does not matter."""
         blocks = np.array_split(gaussian, max(1, -(-len(gaussian) // _AT_ONCE)))
-        parts = [self._answer(block) for block in blocks]
-        return Answer.joined(parts)
+        parts = [self._compensating_shift_of_block(block) for block in blocks]
+        return CompensatingShift.concatenate(parts)
 
-    def _answer(self, gaussian: FloatArray) -> Answer:
+    def _compensating_shift_of_block(self, gaussian: FloatArray) -> CompensatingShift:
         if not len(gaussian):
-            return Answer(np.empty((0, len(self.inverse))), np.empty(0), np.empty(0))
-        change = LoneResponses(self.alone).to(gaussian) * self.bright
+            return CompensatingShift(np.empty((0, len(self.inverse))), np.empty(0), np.empty(0))
+        change = SingleGaussianResponses(self.alone).responses_to(gaussian) * self.bright
         change -= self.dark
         told = np.einsum("ni,ni->n", change, change)
         both = change @ self.response
         shift = -both[:, 1:]
         told = np.maximum(told - np.einsum("ni,ni->n", shift @ self.inverse, shift), _LEAST_TOLD * told) + 1e-12
-        return Answer(shift, both[:, 0] / told, _WIDENED / np.sqrt(told))
+        return CompensatingShift(shift, both[:, 0] / told, _WIDENED / np.sqrt(told))
 
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """Shapes (places and widths) of one Gaussian more, and how those of N - 1 Gaussians shift to compensate for it.
+    """Shapes (places and widths) of one Gaussian more, and how the other N - 1 Gaussians shift to compensate for it.
 
-    Shapes are drawn from a large pool of the prior's, by their first-order evidence; some by the prior alone.
+    Shapes are drawn from a large pool of draws from the prior, by their first-order evidence; some by the prior alone.
 
     Attributes
     ----------
     coordinates
-        Of N - 1 Gaussians.
+        Coordinates of N - 1 Gaussians.
     linear
-        Tells the answer to a Gaussian.
+        Linearised posterior, which gives the shift for a new Gaussian.
     pool
         Gaussians drawn from the prior, (n_pool, 6).
     answers
-        To those of the pool.
+        Shifts for the Gaussians of the pool.
     most
         Share of the light up to which first-order evidences are integrated.
     log_norm
-        Log of their mean over the pool, tempered.
+        Log of the mean of their power 0.8 over the pool.
     """
 
     coordinates: MomentCoordinates | WholeCoordinates
-    linear: _Linear
+    linear: _LinearisedPosterior
     pool: FloatArray
-    answers: Answer
+    answers: CompensatingShift
     most: float
     log_norm: float
 
     @classmethod
-    def of(
+    def from_samples(
         cls,
         below: SensorProblem,
         coordinates: MomentCoordinates | WholeCoordinates,
@@ -207,29 +207,29 @@ class Compensation:
         rng: np.random.Generator,
         n_pool: int = _MOST_DRAWN,
     ) -> Compensation:
-        """Learn from the problem of N - 1 Gaussians and its samples, (n, 6 N - 4); from `n_pool` shapes at most."""
-        linear = _Linear.of(below, coordinates, alone, theta)
+        """Linearise a problem of N - 1 Gaussians about its samples, (n, 6 N - 4); pool at most `n_pool` shapes."""
+        linear = _LinearisedPosterior.from_samples(below, coordinates, alone, theta)
         prior = coordinates.prior
-        mass = light_of(theta)
+        mass = light_by_gaussian(theta)
         most = float(np.mean(mass.min(axis=1) / (mass.sum(axis=1) + mass.min(axis=1))))
         pools: list[FloatArray] = []
-        answers: list[Answer] = []
+        answers: list[CompensatingShift] = []
         log_asked = np.empty(0)
         while log_asked.size < n_pool and (not pools or n_effective(log_asked) < _EFFECTIVE):
             n_more = min(_N_DRAWN, n_pool - log_asked.size)
             pools.append(prior.from_unit_cube(rng.random((n_more, len(prior.names))))[:, :6])
-            answers.append(linear.answer(pools[-1]))
-            log_asked = np.concatenate([log_asked, _TEMPERED * answers[-1].log_evidence(most)])
+            answers.append(linear.compensating_shift(pools[-1]))
+            log_asked = np.concatenate([log_asked, _TEMPERED * answers[-1].log_bayes_factor(most)])
         log_norm = float(logsumexp(log_asked)) - math.log(log_asked.size)
-        return cls(coordinates, linear, np.concatenate(pools), Answer.joined(answers), most, log_norm)
+        return cls(coordinates, linear, np.concatenate(pools), CompensatingShift.concatenate(answers), most, log_norm)
 
-    def draw(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, Answer]:
-        """Draw shapes, (n, 6) with amplitudes to be replaced, and the answers to them."""
-        log_weight = self.log_tilt(self.answers)
-        rows = rng.permutation(resampled(np.exp(log_weight - log_weight.max()), n, rng))
+    def draw(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, CompensatingShift]:
+        """Draw shapes, (n, 6) with amplitudes to be replaced, and the shifts that compensate for them."""
+        log_weight = self.log_density_over_prior(self.answers)
+        rows = rng.permutation(resampled_rows(np.exp(log_weight - log_weight.max()), n, rng))
         return self.pool[rows], self.answers.take(rows)
 
-    def log_tilt(self, answer: Answer) -> FloatArray:
-        """Log of the density with which `draw` draws over the prior's, (n,)."""
-        asked = _TEMPERED * answer.log_evidence(self.most) - self.log_norm
+    def log_density_over_prior(self, answer: CompensatingShift) -> FloatArray:
+        """Log of the density from which `draw` draws, over the prior's, (n,)."""
+        asked = _TEMPERED * answer.log_bayes_factor(self.most) - self.log_norm
         return np.asarray(np.logaddexp(math.log(_PLAIN), math.log(1.0 - _PLAIN) + asked))

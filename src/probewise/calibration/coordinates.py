@@ -64,14 +64,14 @@ class MomentCoordinates:
         out[..., 3] = np.log(0.5 * g[..., 4] / det)
         out[..., 4] = np.log(0.5 * g[..., 3] / det)
         out[..., 5] = np.arctanh(-g[..., 5] / np.sqrt(g[..., 3] * g[..., 4]))
-        out[:, 0, 1:3] = np.einsum("nk,nkj->nj", _shares(out), g[..., 1:3])
+        out[:, 0, 1:3] = np.einsum("nk,nkj->nj", _mass_shares(out), g[..., 1:3])
         return np.concatenate([out.reshape(len(theta), 6 * n), theta[:, 6 * n :]], axis=1)
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates to parameters, (n_samples, 6 N + 2); also return the prior's log density, (n_samples,)."""
         n = self.prior.n_gaussians
         # One contiguous row per kind of coordinate, for speed.
-        g = np.ascontiguousarray(kinds_of(x))
+        g = np.ascontiguousarray(columns_by_kind(x))
         # A sampler may try extreme values, which must not overflow.
         log_variance = g[3:5].clip(-100.0, 100.0)
         log_first, log_ratio = g[0, 0].clip(-100.0, 50.0), g[0, 1:].clip(-100.0, 0.0)
@@ -92,7 +92,7 @@ class MomentCoordinates:
         out[1:3] = g[1:3]
         out[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
         theta = x.copy()
-        kinds_of(theta)[...] = out
+        columns_by_kind(theta)[...] = out
         # d(A, B, C) / d(log variances, arctanh r), d a / d log a, and the first centre from that of the whole.
         jacobian = log_a - 1.5 * both - 2.0 * log_rest
         log_density = self.prior.log_prob_by_kind(out, theta[:, -2], theta[:, -1])
@@ -104,12 +104,12 @@ class MomentCoordinates:
         return theta, np.where(usable, log_density, -np.inf)
 
 
-def kinds_of(columns: FloatArray) -> FloatArray:
+def columns_by_kind(columns: FloatArray) -> FloatArray:
     """View the Gaussians' parameters or coordinates, (n_samples, 6 N + 2), as (6 kinds, N, n_samples)."""
     return columns[:, :-2].reshape(len(columns), columns.shape[1] // 6, 6).transpose(2, 1, 0)
 
 
-def _shares(g: FloatArray) -> FloatArray:
+def _mass_shares(g: FloatArray) -> FloatArray:
     """Each Gaussian's share of the mass, from coordinates (n_samples, N, 6) -> (n_samples, N)."""
     ratio = np.concatenate([np.ones((len(g), 1)), np.exp(np.clip(g[:, 1:, 0], -100.0, 0.0))], axis=1)
     return np.asarray(ratio / ratio.sum(axis=1, keepdims=True))

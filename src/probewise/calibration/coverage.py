@@ -34,8 +34,8 @@ __all__ = [
     "Truth",
     "coverage",
     "draw_truth",
-    "intervals_that_hold",
-    "order_lead",
+    "interval_holds_truth",
+    "log_z_lead_of_one_gaussian",
     "simulate_truth",
 ]
 
@@ -129,7 +129,7 @@ def coverage(
     held: dict[str, int] = {}
     each = map if executor is None else executor.map
     for k, one in enumerate(
-        each(_intervals_hold, rng.spawn(n_recordings), [n_live] * n_recordings, [quick] * n_recordings)
+        each(_simulate_and_check_intervals, rng.spawn(n_recordings), [n_live] * n_recordings, [quick] * n_recordings)
     ):
         held = {name: held.get(name, 0) + int(inside) for name, inside in one.items()}
         if progress is not None:
@@ -137,26 +137,26 @@ def coverage(
     return Coverage(n_recordings, held, n_live)
 
 
-def _intervals_hold(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:
+def _simulate_and_check_intervals(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:
     """Simulate and calibrate one recording; return for each quantity whether its interval holds the truth."""
     truth = draw_truth(rng=rng)
     recording = simulate_truth(truth, rng=rng)
-    return intervals_that_hold(
+    return interval_holds_truth(
         truth, calibrate(recording, orders=(1,), n_live=n_live, quick=quick, rng=rng).sensor.samples
     )
 
 
-def intervals_that_hold(truth: Truth, samples: FloatArray) -> dict[str, bool]:
+def interval_holds_truth(truth: Truth, samples: FloatArray) -> dict[str, bool]:
     """Tell for each quantity whether the 95 % interval of samples of one Gaussian, (n, 8), holds the truth."""
     found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
     held = {}
-    for name, value in _quantities(truth).items():
-        low, high = _interval(found[name])
+    for name, value in _true_quantities(truth).items():
+        low, high = _central_interval(found[name])
         held[name] = bool(low <= value <= high)
     return held
 
 
-def order_lead(
+def log_z_lead_of_one_gaussian(
     truth: Truth, *, rng: np.random.Generator, n_live: int = 300, quick: bool = False
 ) -> tuple[float, float]:
     """Simulate a single-Gaussian recording; return log Z of one Gaussian minus that of two, and its error."""
@@ -165,8 +165,8 @@ def order_lead(
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
 
 
-def _drawn_lead(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
-    return order_lead(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
+def _lead_for_drawn_truth(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
+    return log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
 
 
 def main() -> None:
@@ -207,7 +207,7 @@ def main() -> None:
             return
         leads = []
         each = rng.spawn(asked.recordings), [asked.live] * asked.recordings, [asked.quick] * asked.recordings
-        for lead, error in executor.map(_drawn_lead, *each):
+        for lead, error in executor.map(_lead_for_drawn_truth, *each):
             leads.append((round(lead, 3), round(error, 3)))
             bar.update()
     preferred = sum(lead > 0 for lead, _ in leads)
@@ -221,7 +221,7 @@ def main() -> None:
     write_text_atomically(asked.out, json.dumps({**about, **rows}, indent=1) + "\n")
 
 
-def _quantities(truth: Truth) -> dict[str, float]:
+def _true_quantities(truth: Truth) -> dict[str, float]:
     return {
         "centre x'": truth.center_mm[0],
         "centre y'": truth.center_mm[1],
@@ -233,7 +233,7 @@ def _quantities(truth: Truth) -> dict[str, float]:
     }
 
 
-def _interval(samples: FloatArray) -> tuple[float, float]:
+def _central_interval(samples: FloatArray) -> tuple[float, float]:
     low, high = np.quantile(samples, [0.5 - _MASS / 2, 0.5 + _MASS / 2])
     return float(low), float(high)
 

@@ -52,7 +52,7 @@ def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray
     return {name: values[:, 0] for name, values in found.items()}
 
 
-def by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
+def sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
     """Sort the Gaussians of each sample by decreasing mass; field and predictions do not change.
 
     The prior is exchangeable, so the labels of a posterior sample are arbitrary; sorted by mass, means
@@ -132,12 +132,12 @@ def mean_field(
     kept = order[: int(np.searchsorted(np.cumsum(weight[order]), 0.999)) + 1]
     f, shares = _footprint(theta[kept], n_gaussians), weight[kept]
     mass = shares[:, None, None] * f.weight
-    low_u, high_u = _reach(f.u_mm, np.sqrt(f.var_u), mass)
-    low_v, high_v = _reach(f.v_mm, np.sqrt(f.var_v), mass)
+    low_u, high_u = _bounds_of_footprint(f.u_mm, np.sqrt(f.var_u), mass)
+    low_v, high_v = _bounds_of_footprint(f.v_mm, np.sqrt(f.var_v), mass)
     widest = max(high_u - low_u, high_v - low_v)
     if widest / pixel_mm > max_pixels - 2:
-        pixel_mm = _rounded_up(widest / (max_pixels - 2))
-    u_mm, v_mm = _centers(low_u, high_u, pixel_mm), _centers(low_v, high_v, pixel_mm)
+        pixel_mm = _pixel_rounded_up(widest / (max_pixels - 2))
+    u_mm, v_mm = _pixel_centres(low_u, high_u, pixel_mm), _pixel_centres(low_v, high_v, pixel_mm)
     return replace(field_of(f, u_mm=u_mm, v_mm=v_mm, weights=shares), pixel_mm=pixel_mm)
 
 
@@ -145,24 +145,26 @@ def _footprint(theta: FloatArray, n_gaussians: int) -> Footprint:
     return footprint_of(theta[:, : 6 * n_gaussians], n_gaussians)
 
 
-def _centers(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray:
+def _pixel_centres(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray:
     """Pixel centres, multiples of the pixel size, that cover `low_mm` to `high_mm`."""
     numbers = np.arange(math.floor(low_mm / pixel_mm), math.ceil(high_mm / pixel_mm) + 1, dtype=np.float64)
     return pixel_mm * numbers
 
 
-def _reach(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
-    """Bounds five sds beyond all centres except the outermost thousandth of the mass on either side."""
-    return -_highest_level(_SIGMAS * sd - center, mass), _highest_level(center + _SIGMAS * sd, mass)
+def _bounds_of_footprint(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
+    """Bounds five sds beyond the centres of all Gaussians but those with the outermost thousandth of the mass."""
+    return -_quantile_of_nearly_all_mass(_SIGMAS * sd - center, mass), _quantile_of_nearly_all_mass(
+        center + _SIGMAS * sd, mass
+    )
 
 
-def _highest_level(values: FloatArray, mass: FloatArray) -> float:
+def _quantile_of_nearly_all_mass(values: FloatArray, mass: FloatArray) -> float:
     flat, weight = values.ravel(), mass.ravel()
     order = np.argsort(flat)
     ladder = np.cumsum(weight[order])
     return float(flat[order][np.searchsorted(ladder, 0.999 * ladder[-1])])
 
 
-def _rounded_up(pixel_mm: float) -> float:
+def _pixel_rounded_up(pixel_mm: float) -> float:
     decade = 10.0 ** math.floor(math.log10(pixel_mm))
     return float(next(s * decade for s in (1.0, 2.0, 5.0, 10.0) if s * decade >= pixel_mm * (1 - 1e-9)))

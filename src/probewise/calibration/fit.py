@@ -16,14 +16,14 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_flag, require_rng, require_whole
-from probewise.calibration.climb import Climb
-from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field, mixture_moments
+from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments, sorted_by_mass
 from probewise.calibration.noise import noise_by_scan, pooled_sd
 from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.order_search import Found, Progress, search_order
+from probewise.calibration.order_search import OrderPosterior, Progress, search_order
 from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
 from probewise.calibration.quick_fit import fit_orders_quickly
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
+from probewise.calibration.smc import SMCResult
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
 from probewise.nested import NestedResult, StopRule, Weighted
@@ -42,12 +42,12 @@ class OrderFit:
 
     n_gaussians: int
     prior: SSFPrior
-    found: Found
+    found: OrderPosterior
     sensor: FittedSensor
 
     @property
-    def result(self) -> NestedResult | Climb:
-        """The posterior samples: a nested sampling run, or a climb of a quick calibration."""
+    def result(self) -> NestedResult | SMCResult:
+        """The posterior samples: of a nested sampling run, or of the SMC run (climb) of a quick calibration."""
         return self.found.result
 
     @property
@@ -58,12 +58,12 @@ class OrderFit:
     @property
     def log_z(self) -> float:
         """Natural log of the evidence: the refined estimate where it is sound."""
-        return self.found.evidence.log_z
+        return self.found.evidence_result.log_z
 
     @property
     def log_z_error(self) -> float:
         """Standard error of log Z."""
-        return self.found.evidence.log_z_error
+        return self.found.evidence_result.log_z_error
 
     @property
     def field(self) -> SSFField:
@@ -144,11 +144,11 @@ def calibrate(
         Source of randomness; spawned for each order.
     quick
         Whether to reach each order by sequential Monte Carlo, from the peak of its likelihood or from the order
-        below; one search of the prior vouches for the chosen order. An order whose climb is doubtful is searched by
-        nested sampling, and a note says so. `probewise.calibrate` does this by default.
+        below (a climb); one search of the prior checks the chosen order. An order whose climb is doubtful is searched
+        by nested sampling, and a note says so. `probewise.calibrate` does this by default.
     progress
-        Called with the order and a `RoundSummary` after every round, or a `Rung` after every temperature of a climb;
-        not with a process pool.
+        Called with the order and a `RoundSummary` after every round of nested sampling, or a `TemperatureSummary` after
+        every temperature of a climb; not with a process pool.
     prior
         Function that makes the prior from the recording and an order; `paper_prior` is the paper's.
     stop
@@ -184,7 +184,7 @@ def calibrate(
     require_described(recording.plan)
     require_rng(rng)
     require_whole("n_live", n_live)
-    wanted = _orders(orders)
+    wanted = _require_orders(orders)
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
     require_flag("quick", quick)
     if quick and not refined:
@@ -193,7 +193,7 @@ def calibrate(
     search = partial(search_order, problems, n_live=n_live, stop=stop, refined=refined, progress=progress)
     one = partial(_fit_order, problems, search, pixel_mm=pixel_mm, n_samples=n_samples)
     streams = dict(zip(wanted, rng.spawn(len(wanted)), strict=True))
-    climbed: dict[int, Found] = {}
+    climbed: dict[int, OrderPosterior] = {}
     why: tuple[str, ...] = ()
     if quick:
         climbing = rng.spawn(1)[0]
@@ -206,7 +206,7 @@ def calibrate(
         running = {n: executor.submit(each[n]) for n in sorted(wanted, reverse=True)}
         fits = [running[n].result() for n in wanted]
     table = tuple(OrderEvidence(fit.n_gaussians, fit.log_z, fit.log_z_error) for fit in fits)
-    close = _close_call(table)
+    close = _note_on_close_evidences(table)
     return Calibration(
         recording,
         tuple(
@@ -215,7 +215,7 @@ def calibrate(
     )
 
 
-def _orders(orders: object) -> tuple[int, ...]:
+def _require_orders(orders: object) -> tuple[int, ...]:
     """Return the numbers of Gaussians without duplicates."""
     allowed = "one or more whole numbers from 1, such as (1, 2)"
     if isinstance(orders, str) or not isinstance(orders, Iterable):
@@ -228,11 +228,11 @@ def _orders(orders: object) -> tuple[int, ...]:
 
 def _fit_order(
     problems: OrderProblems,
-    search: Callable[[int, np.random.Generator], Found],
+    search: Callable[[int, np.random.Generator], OrderPosterior],
     n_gaussians: int,
     rng: np.random.Generator,
     *,
-    found: Found | None,
+    found: OrderPosterior | None,
     why: tuple[str, ...],
     pixel_mm: float | None,
     n_samples: int,
@@ -248,7 +248,7 @@ def _fit_order(
     if found is None:
         found = search(n_gaussians, rng)
         notes = (*notes, *why)
-    sensor = _fitted_sensor(
+    sensor = _sensor_from_posterior(
         recording,
         problems.problem(n_gaussians),
         found.result,
@@ -261,10 +261,10 @@ def _fit_order(
     return OrderFit(n_gaussians, problems.prior_of(n_gaussians), found, sensor)
 
 
-def _fitted_sensor(
+def _sensor_from_posterior(
     recording: Recording,
     problem: SensorProblem,
-    result: NestedResult | Climb,
+    result: NestedResult | SMCResult,
     *,
     n_samples: int,
     pixel_mm: float | None,
@@ -272,18 +272,18 @@ def _fitted_sensor(
     notes: tuple[str, ...],
     rng: np.random.Generator,
 ) -> FittedSensor:
-    """Make the fitted sensor of posterior samples."""
+    """Make a fitted sensor from a posterior: its samples, noise and mean field."""
     prior = problem.prior
     if not isinstance(prior, SSFPrior):
         raise ParameterError("prior", prior, "an SSFPrior")
     n_gaussians = prior.n_gaussians
     plan, usable = recording.plan, recording.usable
-    samples = by_mass(result.samples(n_samples, rng=rng), n_gaussians)
+    samples = sorted_by_mass(result.samples(n_samples, rng=rng), n_gaussians)
     residuals = recording.readings[usable] - problem.model.predict(samples, plan)[:, usable]
     floor, ceiling = sd_floor(recording), sd_ceiling(recording)
     pixel = choose_pixel_mm(samples, n_gaussians, step_mm=step_mm) if pixel_mm is None else pixel_mm
-    # Samples of a climb weigh alike, so that those that are kept serve for the field.
-    theta, weight = (samples, None) if isinstance(result, Climb) else (result.theta, result.weight)
+    # Samples of an SMC run have equal weights, so those that are kept suffice for the field.
+    theta, weight = (samples, None) if isinstance(result, SMCResult) else (result.theta, result.weight)
     blind = blind_axis_rad(recording)
     silent = _unconstrained_moments(samples, prior, rng)
     if blind is not None:
@@ -323,7 +323,7 @@ def _unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: np.random.
     )
 
 
-def _close_call(table: tuple[OrderEvidence, ...]) -> tuple[str, ...]:
+def _note_on_close_evidences(table: tuple[OrderEvidence, ...]) -> tuple[str, ...]:
     """Return a note if the evidences of the two best orders agree within their errors."""
     if len(table) < 2:
         return ()

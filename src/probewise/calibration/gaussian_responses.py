@@ -1,4 +1,4 @@
-"""Responses to each Gaussian of a mixture by itself: those to the mixture are their mean, weighted by light."""
+"""Responses of readings to single Gaussians of an SSF: those to a mixture are their mean, weighted by light."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from probewise.inference import SensorProblem
 
 
 @dataclass(frozen=True, eq=False)
-class LoneResponses:
+class SingleGaussianResponses:
     """Responses of the usable readings, between 0 over black and 1 over white, to one Gaussian.
 
     Parameters
@@ -22,8 +22,8 @@ class LoneResponses:
 
     alone: SensorProblem
 
-    def to(self, gaussian: FloatArray) -> FloatArray:
-        """Respond to Gaussians of any amplitude, (n, 6) -> (n, n_used)."""
+    def responses_to(self, gaussian: FloatArray) -> FloatArray:
+        """Return the responses to Gaussians, whose amplitude does not matter, (n, 6) -> (n, n_used)."""
         if not len(gaussian):
             return np.empty((0, int(self.alone.recording.usable.sum())))
         levels = np.broadcast_to([0.0, 1.0], (len(gaussian), 2))
@@ -32,14 +32,14 @@ class LoneResponses:
         usable = self.alone.recording.usable
         return seen if usable.all() else seen[:, usable]
 
-    def to_each(self, theta: FloatArray) -> FloatArray:
-        """Respond to each Gaussian of mixtures, (n, 6 N + 2) -> (n, N, n_used)."""
+    def responses_by_gaussian(self, theta: FloatArray) -> FloatArray:
+        """Return the responses to each Gaussian of mixtures, (n, 6 N + 2) -> (n, N, n_used)."""
         n_gaussians = theta.shape[1] // 6
-        seen = self.to(theta[:, :-2].reshape(-1, 6))
+        seen = self.responses_to(theta[:, :-2].reshape(-1, 6))
         return seen.reshape(len(theta), n_gaussians, seen.shape[1])
 
 
-def light_of(theta: FloatArray) -> FloatArray:
-    """Light of each Gaussian, up to a factor that they have in common, (n, 6 N + 2) -> (n, N)."""
+def light_by_gaussian(theta: FloatArray) -> FloatArray:
+    """Light that each Gaussian holds, up to a common factor, (n, 6 N + 2) -> (n, N)."""
     g = theta[:, :-2].reshape(len(theta), -1, 6)
     return np.asarray(g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2))

@@ -1,7 +1,7 @@
-"""A density to start from in two parts: another density, such as that from the order below, and about peaks.
+"""A start density that mixes another one, such as that from the order below, with densities about peaks.
 
-The other density tells of most of a posterior, but its draws may leave out a peak that is narrow. A part of the
-particles starts about the peaks that least squares found, so that each is seen where it holds a part of the evidence.
+The other density covers most of a posterior, but its draws may leave out a peak that is narrow. A part of the particles
+starts about the peaks that least squares found, so that each is represented where it holds a part of the evidence.
 """
 
 from __future__ import annotations
@@ -13,58 +13,60 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.calibration.known_density import KnownDensity
 from probewise.calibration.peak_density import PeakDensity
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.start_density import StartDensity
 
 _SHARE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class MixedReference:
-    """A reference mixed with densities about peaks: a `KnownDensity`.
+    """A reference mixed with densities about peaks: a `StartDensity`.
 
     Parameters
     ----------
     reference
         The density that is mixed with them, of N Gaussians.
     peaks
-        Densities about the highest peaks of N, one or more.
+        Densities about the highest peaks of the likelihood of N, one or more.
     log_z_below
-        What `reference` counts beside its density: natural log of the evidence of N - 1, or 0.
+        What `reference` adds to its log density: natural log of the evidence of N - 1, or 0.
     """
 
-    reference: KnownDensity
+    reference: StartDensity
     peaks: tuple[PeakDensity, ...]
     log_z_below: float
 
     @property
     def prior(self) -> SSFPrior:
-        """Of N Gaussians."""
+        """The prior of N Gaussians."""
         return self.reference.prior
 
-    def log_over_prior(self, theta: FloatArray) -> FloatArray:
+    def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
         each = math.log(_SHARE / len(self.peaks)) + self.log_z_below
-        parts = [each + peak.log_over_prior(theta) for peak in self.peaks]
-        return np.asarray(logsumexp([math.log(1.0 - _SHARE) + self.reference.log_over_prior(theta), *parts], axis=0))
+        parts = [each + peak.log_density_over_prior(theta) for peak in self.peaks]
+        return np.asarray(
+            logsumexp([math.log(1.0 - _SHARE) + self.reference.log_density_over_prior(theta), *parts], axis=0)
+        )
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw one for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
+        """Draw parameters of N for each sample `rest` of N - 1, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
         out = np.empty((len(rest), len(self.prior.names)))
-        for density, rows in self._shared_out(len(rest), rng):
+        for density, rows in self._rows_by_density(len(rest), rng):
             out[rows] = density.draw(rest[rows], rng=rng)
         return out
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose afresh by either, as `KnownDensity.propose` says."""
+        """Propose new parameters by one of the densities, chosen at random for each particle; see `StartDensity`."""
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
-        for density, rows in self._shared_out(len(here), rng):
+        for density, rows in self._rows_by_density(len(here), rng):
             there[rows], log_drawn[rows] = density.propose(here[rows], rng=rng)
         return there, log_drawn
 
-    def _shared_out(self, n: int, rng: np.random.Generator) -> list[tuple[KnownDensity, IntArray]]:
-        """Share out rows at random: to the peaks, then to the reference."""
+    def _rows_by_density(self, n: int, rng: np.random.Generator) -> list[tuple[StartDensity, IntArray]]:
+        """Assign each of `n` rows to one of the densities at random: pairs of a density and its rows."""
         which = np.minimum((rng.random(n) * len(self.peaks) / _SHARE).astype(np.int64), len(self.peaks))
-        densities: tuple[KnownDensity, ...] = (*self.peaks, self.reference)
+        densities: tuple[StartDensity, ...] = (*self.peaks, self.reference)
         return [(density, np.flatnonzero(which == k)) for k, density in enumerate(densities)]

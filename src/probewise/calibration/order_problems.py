@@ -1,4 +1,4 @@
-"""The calibration of one order as an inference problem."""
+"""The calibration of each order, that is of each number of Gaussians, as an inference problem."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.calibration.distinct_rows import DistinctRows
+from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError, ShapeError
-from probewise.inference import SensorProblem, student_t
+from probewise.inference import SensorProblem, student_t_of
 from probewise.recordings import Recording
 from probewise.scene import KnownScene
 from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
@@ -59,4 +59,4 @@ def problem_for(
     if groups.shape != (len(plan),):
         raise ShapeError(f"data_sets have shape {groups.shape}; allowed: ({len(plan)},), one per row")
     chain = Chain(FreeMixture(prior.n_gaussians), FreeLevels(), KnownScene(plan.patterns), n_nodes=n_nodes)
-    return SensorProblem(prior, DistinctRows(chain, plan), student_t(recording, groups), recording)
+    return SensorProblem(prior, DeduplicatedModel(chain, plan), student_t_of(recording, groups), recording)

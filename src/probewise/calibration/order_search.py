@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise.calibration.climb import Climb, Rung
 from probewise.calibration.order_problems import OrderProblems
+from probewise.calibration.smc import SMCResult, TemperatureSummary
 from probewise.nested import NestedResult, RoundSummary, StopRule, Weighted, refine, run
 
-Progress = Callable[[int, RoundSummary | Rung], None]
+Progress = Callable[[int, RoundSummary | TemperatureSummary], None]
 
 _N_DRAWS = 8000
 # Two estimates of the evidence this many errors apart disagree: one false alarm in 16 000.
@@ -20,23 +20,28 @@ _DISAGREE = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class OrderPosterior:
     """Posterior samples and evidence of an order, before a sensor is made of them.
 
-    `result` is a nested run or a climb; `refined` the evidence of a nested run by importance sampling.
+    `result` is a nested sampling run or an SMC run; `refined` the evidence of a nested run by importance sampling.
     """
 
-    result: NestedResult | Climb
+    result: NestedResult | SMCResult
     refined: Weighted | None
     notes: tuple[str, ...] = ()
 
     @property
-    def evidence(self) -> NestedResult | Climb | Weighted:
+    def evidence_result(self) -> NestedResult | SMCResult | Weighted:
         """The result whose log Z is used: the refined one if it is reliable."""
         return self.refined if self.refined is not None and self.refined.sound else self.result
 
+    evidence = evidence_result  # its earlier name
 
-Search = Callable[[int, np.random.Generator], Found]
+
+Found = OrderPosterior  # its earlier name
+
+
+Search = Callable[[int, np.random.Generator], OrderPosterior]
 """Function that searches the whole prior of an order."""
 
 
@@ -49,19 +54,19 @@ def search_order(
     stop: StopRule | None = None,
     refined: bool = True,
     progress: Progress | None = None,
-) -> Found:
+) -> OrderPosterior:
     """Search the prior of an order by nested sampling, and refine the evidence unless asked not to."""
     problem = problems.problem(n_gaussians)
-    report = None if progress is None else report_of(progress, n_gaussians)
+    report = None if progress is None else round_reporter(progress, n_gaussians)
     result = run(problem, rng=rng, n_live=n_live, stop=stop, progress=report, max_cost=1.0, return_interrupted=False)
     if not refined:
         note = f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}"
-        return Found(result, None, (note,))
+        return OrderPosterior(result, None, (note,))
     more_precise = refine(result, problem, rng=rng, n_draws=_N_DRAWS, look=False)
-    return Found(result, more_precise, _disagreement(n_gaussians, result, more_precise))
+    return OrderPosterior(result, more_precise, _note_on_disagreement(n_gaussians, result, more_precise))
 
 
-def _disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
+def _note_on_disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
     """Return a warning if the two estimates of an evidence do not agree within their errors."""
     apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
     if apart <= _DISAGREE or not set(refined.doubts) <= set(refined.inherited):
@@ -72,6 +77,6 @@ def _disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> 
     )
 
 
-def report_of(progress: Progress, n_gaussians: int) -> Callable[[RoundSummary], None]:
-    """Tell `progress` of the rounds of an order's nested sampling."""
+def round_reporter(progress: Progress, n_gaussians: int) -> Callable[[RoundSummary], None]:
+    """Return a function that reports the rounds of an order's nested sampling to `progress`."""
     return lambda state: progress(n_gaussians, state)

@@ -22,21 +22,25 @@ _MOST_LOG = 60.0
 
 @dataclass(frozen=True)
 class PeakCoordinates:
-    """Coordinates of N Gaussians whose light is uniform from 0 to a unit; see `has_reference`."""
+    """Coordinates of N Gaussians whose light is uniform from 0 to a unit; see `has_uniform_light`."""
 
     prior: SSFPrior
 
     @cached_property
-    def _contrasts(self) -> FloatArray:
+    def _log_contrasts(self) -> FloatArray:
         """Orthonormal contrasts of N logs, (N - 1, N)."""
         n = self.prior.n_gaussians
         rows = [np.r_[np.ones(k), -float(k), np.zeros(n - k - 1)] / math.sqrt(k * (k + 1)) for k in range(1, n)]
         return np.array(rows).reshape(n - 1, n)
 
     @cached_property
-    def relabelled(self) -> tuple[tuple[IntArray, FloatArray], ...]:
-        """The N! changes of labels: for each the order of columns of shapes and levels, and the contrasts' matrix."""
-        n, c = self.prior.n_gaussians, self._contrasts
+    def label_permutations(self) -> tuple[tuple[IntArray, FloatArray], ...]:
+        """The N! permutations of labels.
+
+        Each has the order of the columns of shapes and levels, (5 N + 2,), and the matrix that turns the contrasts,
+        (N - 1, N - 1).
+        """
+        n, c = self.prior.n_gaussians, self._log_contrasts
         found = []
         for order in itertools.permutations(range(n)):
             columns = np.concatenate([*(np.arange(5 * k, 5 * k + 5) for k in order), [5 * n, 5 * n + 1]])
@@ -44,7 +48,7 @@ class PeakCoordinates:
         return tuple(found)
 
     def relabel(self, y: FloatArray, change: tuple[IntArray, FloatArray]) -> FloatArray:
-        """Change the labels, (n, 6 N + 1) both ways."""
+        """Permute the labels of the Gaussians in coordinates, (n, 6 N + 1) -> (n, 6 N + 1)."""
         columns, matrix = change
         k = self.prior.n_gaussians - 1
         return np.concatenate([y[:, :k] @ matrix.T, y[:, k:][:, columns]], axis=1)
@@ -60,10 +64,12 @@ class PeakCoordinates:
         shape[..., 2] = np.log(0.5 * g[..., 4] / det)
         shape[..., 3] = np.log(0.5 * g[..., 3] / det)
         shape[..., 4] = np.arctanh(-g[..., 5] / np.sqrt(g[..., 3] * g[..., 4]))
-        return np.concatenate([log_light @ self._contrasts.T, shape.reshape(len(theta), 5 * n), theta[:, -2:]], axis=1)
+        return np.concatenate(
+            [log_light @ self._log_contrasts.T, shape.reshape(len(theta), 5 * n), theta[:, -2:]], axis=1
+        )
 
     def leave(self, y: FloatArray, sum_of_logs: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters; also return the prior's log density there, labels counted apart.
+        """Map coordinates to parameters; also return the prior's log density in them, each labelling by itself.
 
         Parameters
         ----------
@@ -77,7 +83,7 @@ class PeakCoordinates:
         Parameters, (n, 6 N + 2), and log density, (n,); -inf outside the prior's support.
         """
         n = self.prior.n_gaussians
-        log_light = (y[:, : n - 1] @ self._contrasts).clip(-_MOST_LOG, _MOST_LOG)
+        log_light = (y[:, : n - 1] @ self._log_contrasts).clip(-_MOST_LOG, _MOST_LOG)
         most = log_light.max(axis=1)
         shape = y[:, n - 1 : -2].reshape(len(y), n, 5)
         log_variance = shape[..., 2:4].clip(-_MOST_LOG, _MOST_LOG)

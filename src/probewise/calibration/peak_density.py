@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import fdtri, gammaln, logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.calibration.known_density import independent_proposal
 from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.start_density import propose_independently
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested.weights import n_effective
@@ -32,7 +32,7 @@ _NEAR = 0.9
 
 @dataclass(frozen=True, eq=False)
 class StudentTDensity:
-    """Mean, (d,), and lower root of the covariance, (d, d), of a multivariate Student-t."""
+    """A multivariate Student-t of 8 degrees of freedom: mean, (d,), and Cholesky root of its scale matrix, (d, d)."""
 
     mean: FloatArray
     root: FloatArray
@@ -44,7 +44,7 @@ class StudentTDensity:
         return np.asarray(self.mean + white @ self.root.T)
 
     @property
-    def least_log_density(self) -> float:
+    def log_density_around_nine_tenths(self) -> float:
         """Log density above which nine tenths of the draws lie, by Fisher's distribution."""
         d = len(self.mean)
         at = self.mean + math.sqrt(d * float(fdtri(d, _DEGREES_OF_FREEDOM, _NEAR))) * self.root[:, 0]
@@ -61,99 +61,99 @@ class StudentTDensity:
 
 @dataclass(frozen=True, eq=False)
 class PeakDensity:
-    """A Student-t about a peak, averaged over the labels of the Gaussians: a `KnownDensity`."""
+    """A Student-t about a peak, averaged over the labels of the Gaussians: a `StartDensity`."""
 
     space: PeakCoordinates
     one: StudentTDensity
 
     @property
     def prior(self) -> SSFPrior:
-        """Of N Gaussians."""
+        """The prior of N Gaussians."""
         return self.space.prior
 
-    def drawn(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Draw within the prior: coordinates, parameters, log density over the prior's; at most n rows."""
+    def draw_within_prior(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Make `n` draws; return those within the prior: coordinates, parameters, log density over the prior's."""
         y = self.one.draw(n, rng)
         theta, log_prior = self.space.leave(y, rng.random(n))
         inside = np.isfinite(log_prior)
         return y[inside], theta[inside], self._log_density(y[inside]) - log_prior[inside]
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw as many as there are rows in `rest`, (n, 6 N + 2); nan where outside the prior."""
+        """Draw one for each row of `rest`, (n, 6 N + 2); nan where outside the prior."""
         y = self.one.draw(len(rest), rng)
         theta, log_prior = self.space.leave(y, rng.random(len(rest)))
         theta[~np.isfinite(log_prior)] = np.nan
         return theta
 
     def widened(self, factor: float) -> PeakDensity:
-        """Widen it by a factor."""
+        """Return the density with all sds multiplied by a factor."""
         return PeakDensity(self.space, StudentTDensity(self.one.mean, factor * self.one.root))
 
     def fitted_to(self, theta: FloatArray) -> PeakDensity:
-        """Fit a density to samples, (n, 6 N + 2), each with the labels that this one gives them."""
+        """Fit a density to samples, (n, 6 N + 2), each with the labels that are most probable under this one."""
         y = self.space.enter(theta)
-        labelled = np.stack([self.space.relabel(y, change) for change in self.space.relabelled])
+        labelled = np.stack([self.space.relabel(y, change) for change in self.space.label_permutations])
         best = np.argmax([self.one.log_density(each) for each in labelled], axis=0)
         own = labelled[best, np.arange(len(y))]
         root = np.linalg.cholesky(_WIDENED**2 * np.cov(own, rowvar=False))
         return PeakDensity(self.space, StudentTDensity(own.mean(axis=0), np.asarray(root, dtype=np.float64)))
 
-    def near(self, y: FloatArray) -> BoolArray:
-        """Whether coordinates, with any labels, are among the densest draws; (n, 6 N + 1) -> (n,)."""
-        each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.relabelled]
-        return np.asarray(np.max(each, axis=0) > self.one.least_log_density)
+    def is_near_peak(self, y: FloatArray) -> BoolArray:
+        """Mark coordinates that, with any labels, lie in the densest region of nine tenths of draws, (n, d) -> (n,)."""
+        each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.label_permutations]
+        return np.asarray(np.max(each, axis=0) > self.one.log_density_around_nine_tenths)
 
-    def log_over_prior(self, theta: FloatArray) -> FloatArray:
+    def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log density over the prior's, (n, 6 N + 2) -> (n,)."""
         y = self.space.enter(theta)
         return self._log_density(y) - self.space.leave(y)[1]
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose draws of it, as `independent_proposal` says."""
-        return independent_proposal(self, here, rng=rng)
+        """Propose a draw for each particle; see `propose_independently`."""
+        return propose_independently(self, here, rng=rng)
 
     def _log_density(self, y: FloatArray) -> FloatArray:
-        each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.relabelled]
+        each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.label_permutations]
         return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
 
 
-def density_about_peak(
+def fit_density_about_peak(
     problem: SensorProblem, peak: FloatArray, *, rng: np.random.Generator, n_pilots: int = _N_PILOTS
 ) -> tuple[PeakDensity, int]:
-    """Shape a density to the posterior about a peak.
+    """Fit a density to the posterior about a peak.
 
     Parameters
     ----------
     problem
-        With an `SSFPrior` of uniform light and a `StudentT` likelihood.
+        Has an `SSFPrior` of uniform light and a `StudentT` likelihood.
     peak
-        Where the likelihood is greatest, (6 N + 2,).
+        Parameters at which the likelihood is greatest, (6 N + 2,).
     rng
         Source of randomness.
     n_pilots
-        Draws of each round that shapes it.
+        Draws of each round of fitting.
 
     Returns
     -------
-    The density, and likelihood evaluations.
+    The density, and the number of likelihood evaluations.
     """
     prior = problem.prior
     if not isinstance(prior, SSFPrior):
         raise ParameterError("problem.prior", prior, "an SSFPrior")
     space = PeakCoordinates(prior)
-    density, n_calls = _laplace(problem, space, peak), 0
+    density, n_calls = _laplace_density(problem, space, peak), 0
     for _ in range(_N_ROUNDS):
-        y, theta, log_density = PeakDensity(space, density).drawn(n_pilots, rng=rng)
+        y, theta, log_density = PeakDensity(space, density).draw_within_prior(n_pilots, rng=rng)
         n_calls += len(y)
         if len(y) < 2 * y.shape[1]:
             density = StudentTDensity(density.mean, 0.5 * density.root)
             continue
         log_weight = problem.log_likelihood(theta) - log_density
-        density = _fitted_density(y, _tempered(log_weight, _LEAST_PER_COORDINATE * y.shape[1]), density)
+        density = _refitted_density(y, _tempered_log_weights(log_weight, _LEAST_PER_COORDINATE * y.shape[1]), density)
     return PeakDensity(space, density), n_calls
 
 
-def share_missed_about(
+def share_missed_about_peak(
     problem: SensorProblem,
     density: PeakDensity,
     theta: FloatArray,
@@ -162,34 +162,34 @@ def share_missed_about(
     n_draws: int,
     rng: np.random.Generator,
 ) -> float:
-    """Tell which share of the evidence lies about a peak and has no samples, two errors below its estimate.
+    """Estimate the share of the evidence that lies about a peak but has no samples, minus two standard errors.
 
     Parameters
     ----------
     problem
-        With an `SSFPrior` of uniform light.
+        Has an `SSFPrior` of uniform light.
     density
-        About the peak.
+        A density about the peak.
     theta
         Samples of the posterior, (n, 6 N + 2).
     log_z
-        Natural log of the evidence as they tell it.
+        Natural log of the evidence according to these samples.
     n_draws
-        Draws by which the peak is weighed.
+        Number of draws by which the evidence about the peak is estimated.
     rng
         Source of randomness.
     """
-    y, drawn, log_density = density.drawn(n_draws, rng=rng)
-    near = density.near(y)
+    y, drawn, log_density = density.draw_within_prior(n_draws, rng=rng)
+    near = density.is_near_peak(y)
     weight = np.exp(problem.log_likelihood(drawn[near]) - log_density[near] - log_z) if near.any() else np.zeros(1)
     about = float(weight.sum()) / n_draws
     error = math.sqrt(max(float((weight**2).sum()) / n_draws - about**2, 0.0) / n_draws)
-    missed = max(about - 2.0 * error - float(density.near(density.space.enter(theta)).mean()), 0.0)
+    missed = max(about - 2.0 * error - float(density.is_near_peak(density.space.enter(theta)).mean()), 0.0)
     return missed / (1.0 + missed)
 
 
-def _laplace(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -> StudentTDensity:
-    """Shape a density by the peak's curvature, and by the prior's width where the readings say little."""
+def _laplace_density(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -> StudentTDensity:
+    """Make a density of the peak's curvature, and of the prior's width where there is little information."""
     prior, likelihood, recording = space.prior, problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):
         raise ParameterError("problem.likelihood", likelihood, "a StudentT")
@@ -204,7 +204,7 @@ def _laplace(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -
     return StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance), dtype=np.float64))
 
 
-def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
+def _tempered_log_weights(log_weight: FloatArray, least: float) -> FloatArray:
     """Scale log weights by the largest power, at most 1, that leaves an effective sample size of `least` or more."""
     low, high = 0.0, 1.0
     if n_effective(log_weight) >= least:
@@ -215,8 +215,8 @@ def _tempered(log_weight: FloatArray, least: float) -> FloatArray:
     return low * log_weight
 
 
-def _fitted_density(y: FloatArray, log_weight: FloatArray, before: StudentTDensity) -> StudentTDensity:
-    """Fit a density to weighted draws; with few of them it keeps some of the one before."""
+def _refitted_density(y: FloatArray, log_weight: FloatArray, before: StudentTDensity) -> StudentTDensity:
+    """Fit a density to weighted draws; the fewer are effective, the more of the former covariance is kept."""
     weight = np.exp(log_weight - logsumexp(log_weight))
     mean = weight @ y
     off = y - mean

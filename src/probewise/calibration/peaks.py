@@ -1,7 +1,7 @@
 """Find the peaks of a likelihood by least squares from many starts (Levenberg 1944, Marquardt 1963).
 
-The starts are spread over the prior, and made from the peaks of the orders below and above: a Gaussian split, added,
-taken away. All of them take their steps together. Each data set's noise sd is that of its residuals, so that the
+The starts are spread over the prior, and made from the peaks of the orders below and above: a Gaussian is split, added
+or taken away. All starts take their steps together. Each data set's noise sd is that of its residuals, so that the
 steps follow the Student-t likelihood.
 """
 
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from probewise._arrays import FloatArray
-from probewise.calibration.gaussian_responses import LoneResponses, light_of
+from probewise.calibration.gaussian_responses import SingleGaussianResponses, light_by_gaussian
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
@@ -37,7 +37,7 @@ _SAME, _HARDLY_LOWER, _N_OTHERS = 0.05, 6.0, 3
 
 @dataclass(frozen=True, eq=False)
 class Peak:
-    """The highest place found, (n_params,), ln L there, and other peaks that are hardly lower, (n_others, n_params)."""
+    """The highest peak found, (n_params,), ln L there, and other peaks that are hardly lower, (n_others, n_params)."""
 
     theta: FloatArray
     log_likelihood: float
@@ -50,33 +50,36 @@ def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np
     Parameters
     ----------
     problem
-        Gives that of an order, with an `SSFPrior` of uniform light and a `StudentT` likelihood.
+        Function from an order to its problem, with an `SSFPrior` of uniform light and a `StudentT` likelihood.
     highest
-        Number of Gaussians to go to.
+        Greatest number of Gaussians.
     rng
         Source of randomness.
     """
     found: dict[int, Peak] = {}
-    responses = LoneResponses(problem(1))
+    responses = SingleGaussianResponses(problem(1))
     for n in range(1, highest + 1):
-        prior = _prior(problem(n))
+        prior = _require_ssf_prior(problem(n))
         drawn = prior.from_unit_cube(rng.random((_N_DRAWS, len(prior.names))))
         n_free, n_split, n_added = _STARTS if n <= 2 else _FEWER_STARTS
         starts = [drawn[np.argsort(-problem(n).log_likelihood(drawn))[:n_free]]]
         if n > 1:
             below = np.repeat(found[n - 1].theta[None], n_split + n_added, axis=0)
             lone = drawn[:n_added, :6]
-            starts += [_split_gaussian(below[:n_split], rng), _with_lone_gaussian(prior, below[n_split:], lone, rng)]
-        found[n] = _local_maxima(problem(n), responses, np.concatenate(starts))
+            starts += [
+                _split_gaussian(below[:n_split], rng),
+                _with_light_gaussian_added(prior, below[n_split:], lone, rng),
+            ]
+        found[n] = _ascend_from_starts(problem(n), responses, np.concatenate(starts))
     for n in range(highest - 1, 0, -1):
         above = found[n + 1].theta
         lacking = [np.delete(above, slice(6 * k, 6 * k + 6)) for k in range(n + 1)]
-        again = _local_maxima(problem(n), responses, np.array(lacking))
+        again = _ascend_from_starts(problem(n), responses, np.array(lacking))
         found[n] = max(found[n], again, key=lambda peak: peak.log_likelihood)
     return found
 
 
-def _prior(problem: SensorProblem) -> SSFPrior:
+def _require_ssf_prior(problem: SensorProblem) -> SSFPrior:
     if not isinstance(problem.prior, SSFPrior):
         raise ParameterError("problem.prior", problem.prior, "an SSFPrior")
     return problem.prior
@@ -108,17 +111,19 @@ def _split_gaussian(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
     return np.concatenate([out[:, :-2], parts[1], out[:, -2:]], axis=1)
 
 
-def _with_lone_gaussian(prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Add a Gaussian that holds a fifth of the light of the first, or less, (n, 6 N + 2), (n, 6) -> (n, 6 N + 8)."""
+def _with_light_gaussian_added(
+    prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Add a Gaussian with at most a fifth of the first one's light, (n, 6 N + 2), (n, 6) -> (n, 6 N + 8)."""
     one, first = lone.copy(), theta[:, :6]
     light = first[:, 0] / prior.amplitude_scale(first[:, 3] * first[:, 4] - first[:, 5] ** 2)
     one[:, 0] = light * rng.uniform(0.01, 0.2, len(one)) * prior.amplitude_scale(one[:, 3] * one[:, 4] - one[:, 5] ** 2)
     return np.concatenate([theta[:, :-2], one, theta[:, -2:]], axis=1)
 
 
-def _local_maxima(problem: SensorProblem, responses: LoneResponses, starts: FloatArray) -> Peak:
+def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianResponses, starts: FloatArray) -> Peak:
     """Ascend from each start, (n_starts, n_params); the worse half gives up after some steps."""
-    prior, likelihood, recording = _prior(problem), problem.likelihood, problem.recording
+    prior, likelihood, recording = _require_ssf_prior(problem), problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):
         raise ParameterError("problem.likelihood", likelihood, "a StudentT")
     usable = recording.usable
@@ -141,11 +146,11 @@ def _local_maxima(problem: SensorProblem, responses: LoneResponses, starts: Floa
         if not rows.size:
             break
         here, own = z[rows], off[rows]
-        slope = _slopes(prior, responses, here)
+        slope = _prediction_slopes(prior, responses, here)
         weighted = slope * likelihood.weights(own)[:, None, :]
         curvature = weighted @ slope.transpose(0, 2, 1)
         gradient = np.einsum("ndp,np->nd", weighted, own)
-        # Where the readings say nothing, about the curvature of the logistic prior holds the step.
+        # Without information in the readings, about the curvature of the logistic prior limits the step.
         scale = np.einsum("ndd->nd", curvature) + _PRIOR_CURVATURE
         damped = curvature + (damping[rows, None] * scale)[:, None, :] * np.eye(d) + 0.01 * _PRIOR_CURVATURE * np.eye(d)
         step = np.linalg.solve(damped, gradient[..., None])[..., 0].clip(-_LONGEST, _LONGEST)
@@ -165,11 +170,11 @@ def _local_maxima(problem: SensorProblem, responses: LoneResponses, starts: Floa
     return Peak(theta[0], float(high[0]), theta[others])
 
 
-def _slopes(prior: SSFPrior, responses: LoneResponses, z: FloatArray) -> FloatArray:
-    """Slopes of the predictions by the logits of the prior's cube, (n, d) -> (n, d, n_used).
+def _prediction_slopes(prior: SSFPrior, responses: SingleGaussianResponses, z: FloatArray) -> FloatArray:
+    """Differentiate the predictions by the logits `z` of the prior's cube, (n, d) -> (n, d, n_used).
 
-    A change of one Gaussian leaves the responses to the others as they are, so that one kind of parameter is changed
-    for all Gaussians at once; a change of light asks for no response at all.
+    A change of one Gaussian leaves the responses to the others as they are, so one kind of parameter is changed for all
+    Gaussians at once; a change of light needs no new response.
     """
     n, n_gaussians = len(z), prior.n_gaussians
     changed = np.repeat(z[None], 7, axis=0)
@@ -177,8 +182,8 @@ def _slopes(prior: SSFPrior, responses: LoneResponses, z: FloatArray) -> FloatAr
         changed[1 + kind, :, kind:-2:6] += _DIFFERENCE
     theta = prior.from_unit_cube(expit(changed.reshape(7 * n, -1)))
     # The light is the first kind, with the responses of no change.
-    seen = responses.to_each(np.concatenate([theta[:n], theta[2 * n :]])).reshape(6, n, n_gaussians, -1)
-    light = light_of(theta).reshape(7, n, n_gaussians)
+    seen = responses.responses_by_gaussian(np.concatenate([theta[:n], theta[2 * n :]])).reshape(6, n, n_gaussians, -1)
+    light = light_by_gaussian(theta).reshape(7, n, n_gaussians)
     theta = theta[:n]
     whole = light[0].sum(axis=1)
     lit = light[0][..., None] * seen[0]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray, floats
-from probewise.calibration.distinct_rows import DistinctRows
+from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.calibration.sensor_file import FittedSensor, require_sensor
 from probewise.effects import PredictiveMixture
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
@@ -83,15 +83,15 @@ def predict(
     scored = Recording(plan, recorded).usable
     step = plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
-    model = chain if sensor.effects else DistinctRows(chain, plan)
-    for effect in sensor.carried_effects:
+    model = chain if sensor.effects else DeduplicatedModel(chain, plan)
+    for effect in sensor.effects_on_new_scans:
         for column in {*getattr(effect, "reads", ())} - {*plan.covariates}:
             warnings.warn(
                 f"the plan has no column {column}, which {effect.name} reads: predicted as for its reference value",
                 DoubtfulResultWarning,
                 stacklevel=2,
             )
-    theta = sensor.carried_samples
+    theta = sensor.samples_for_new_scans
     n_samples, n_points = len(theta), len(plan)
     per_block = max(1, _BLOCK // max(1, n_points * sensor.n_gaussians))
 
@@ -101,4 +101,4 @@ def predict(
         block = slice(first, first + per_block)
         level = chain.noise_level(theta[block], plan, sensor.noise_sd[block, None])
         mixture.add(model.predict(theta[block], plan), level)
-    return Prediction(plan, *mixture.finished(), recorded)
+    return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)

@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.coordinates import MomentCoordinates, kinds_of
+from probewise.calibration.coordinates import MomentCoordinates, columns_by_kind
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Uniform, checked_columns
 from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
@@ -133,10 +133,10 @@ class SSFPrior:
         """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
         theta = checked_columns(theta, self.names)
         # One contiguous row per kind of parameter, for speed.
-        return self.log_prob_by_kind(np.ascontiguousarray(kinds_of(theta)), theta[:, -2], theta[:, -1])
+        return self.log_prob_by_kind(np.ascontiguousarray(columns_by_kind(theta)), theta[:, -2], theta[:, -1])
 
     def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
-        """Return `log_prob` for Gaussians arranged by `kinds_of`, (6, N, n_samples), and their levels, (n_samples,)."""
+        """Return `log_prob` for Gaussians from `columns_by_kind`, (6, N, n_samples), and levels, (n_samples,) each."""
         precisions = np.maximum(g[3:5], 0.0)
         product, c = precisions[0] * precisions[1], g[5]
         scale = np.sqrt(product)
@@ -238,7 +238,7 @@ def scan_geometry(recording: Recording) -> ScanGeometry:
     span = float(np.median(lengths)) if lengths else extent
     # Places far apart, such as those a robot chooses, do not bound the footprint from below: use a factor of 50.
     step = min(float(np.median(np.concatenate(moves))) if moves else span, span / 50)
-    albedo = _albedo_under(recording)[usable]
+    albedo = _albedo_at_commanded_places(recording)[usable]
     albedo_low, albedo_high = float(albedo.min()), float(albedo.max())
     if not albedo_low < albedo_high:
         raise ParameterError(
@@ -340,7 +340,7 @@ def blind_axis_rad(recording: Recording) -> float | None:
     return float((np.angle(seen[0]) / 2 + math.pi / 2) % math.pi)
 
 
-def _albedo_under(recording: Recording) -> FloatArray:
+def _albedo_at_commanded_places(recording: Recording) -> FloatArray:
     """Albedo at the commanded places, (n_points,)."""
     plan = recording.plan
     regions = KnownScene(plan.patterns).regions(np.empty((1, 0)))

@@ -1,10 +1,11 @@
-"""Fit one order after another: from the peak of its likelihood, or from the posterior of the order below.
+"""Fit one order after another by SMC: from the peak of its likelihood, or from the posterior of the order below.
 
 Where one Gaussian more raises the likelihood much, its posterior lies about the highest peak, and particles start from
-a density fitted there. Where it does not, each part of the posterior, by its number of bright Gaussians, is reached by
-itself: from that part of the order below with a faint Gaussian more, whose two evidences are bridged by taking
-Gaussians away and adding them; or, where all are bright, from a wide density. At every order ascents from all over the
-prior look for a peak that the particles missed; a search of the whole prior vouches for the order that is chosen.
+a density fitted there. Where it does not, each part of the posterior, by its number of bright Gaussians, is sampled by
+itself. Where some Gaussians are faint, particles start from that part of the order below with a faint Gaussian more,
+and a bridge gives the ratio of the two evidences (`light_integral`). Where all are bright, they start from a wide
+density. At every order ascents from all over the prior look for a peak that the particles missed. A search of the whole
+prior checks the order that is chosen.
 """
 
 from __future__ import annotations
@@ -17,43 +18,49 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.climb import N_CLOUDS, N_SNAPSHOTS, Climb, Rung, climb
+from probewise.calibration.check_by_search import missed_part_in_words
 from probewise.calibration.compensation import Compensation
-from probewise.calibration.known_density import KnownDensity
+from probewise.calibration.light_integral import LightIntegral, bridge_evidences
 from probewise.calibration.mixed_reference import MixedReference
 from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.order_search import Found, Progress, Search
-from probewise.calibration.parts import Part, WholeFrame, held_shares, joined, split_by_bright
-from probewise.calibration.peak_density import PeakDensity, density_about_peak, share_missed_about
+from probewise.calibration.order_search import OrderPosterior, Progress, Search
+from probewise.calibration.peak_density import PeakDensity, fit_density_about_peak, share_missed_about_peak
 from probewise.calibration.peaks import Peak, find_peaks
-from probewise.calibration.reference import Reference, has_reference
-from probewise.calibration.removal import Removal, bridged
+from probewise.calibration.posterior_parts import (
+    FootprintPlaceAndSize,
+    PosteriorPart,
+    evidence_shares,
+    join_parts,
+    split_by_n_bright,
+)
+from probewise.calibration.reference import FaintGaussianReference, has_uniform_light
 from probewise.calibration.shared_light import SharedLightDensity
-from probewise.calibration.vouching import part_missed
+from probewise.calibration.smc import N_CLOUDS, N_SNAPSHOTS, SMCResult, TemperatureSummary, run_smc
+from probewise.calibration.start_density import StartDensity
 from probewise.calibration.whole_coordinates import count_bright
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
-# Quadrature nodes over curved edges where a Gaussian more is answered to first order: mostly within 0.001 of the span.
+# Quadrature nodes over curved edges for the first-order shifts of `Compensation`: mostly within 0.001 of the span.
 _FEW_NODES = 8
 _N_PARTICLES = 1000
-# Gain in ln L per Gaussian from which the peak is taken for where the posterior lies.
+# Gain in ln L by one Gaussian above which the posterior is assumed to lie about the highest peak.
 _NEEDED = 20.0
 # Least effective share of the samples in a bridge.
 _LEAST_SHARE = 0.05
-# The first climb from a peak starts from a density so much wider: particles gather more easily than they spread.
+# Factor by which the density of the first run from a peak is widened: particles gather more easily than they spread.
 _WIDENED = 1.6
-# From a peak: moves at each temperature; once the posterior is reached, at the first climb and at the second.
+# Runs from a peak: moves at each temperature; moves once the posterior is reached, in the first and the second run.
 _STEPS, _FEW_MOVES, _MANY_MOVES = 5, 6, 60
 # Draws of a density fitted to the samples about a peak.
 _N_FITTED = 6000
-# Two evidences this many errors apart disagree, if it is this far: few clouds tell their own scatter roughly.
+# Two evidences disagree beyond this many errors and this many nats: the scatter of few clouds is only rough.
 _DISAGREE, _APART = 4.0, 1.0
-# A peak is looked at where it is so much higher than all samples; it was missed where it holds this share of Z.
+# A peak higher than all samples by this many nats is checked; it was missed if it holds this share of Z.
 _HIGHER, _MISSED = 2.0, 0.2
 _N_PILOTS, _N_WEIGHED = 400, 2000
 _AT_ONCE_FROM = 3
-# A part of the posterior below is followed where it holds this share of it; by many particles where it holds much.
+# A part of the posterior of the order below is used if it holds the first share, by many particles above the second.
 _LEAST_HELD, _MUCH_HELD, _FEW_PARTICLES = 0.005, 0.3, 400
 _POOL, _SMALL_POOL = 24_000, 6_000
 # All Gaussians may be bright where those of the order below are so with this share.
@@ -70,53 +77,56 @@ def fit_orders_quickly(
     search: Search,
     rng: np.random.Generator,
     progress: Progress | None = None,
-) -> tuple[dict[int, Found], tuple[str, ...]]:
-    """Climb as far as the greatest of the orders; `search` serves those that must be searched in full.
+) -> tuple[dict[int, OrderPosterior], tuple[str, ...]]:
+    """Fit all orders up to the greatest by SMC; `search` fits those whose SMC run is doubtful.
 
     Returns
     -------
-    What was found, by order; and why an order that is lacking must be searched in full.
+    The posterior of each order, and notes. Where SMC does not apply there are no posteriors, and the note says why all
+    orders must be searched in full.
     """
     highest = max(orders)
     n_usable = int(problems.recording.usable.sum())
     if n_usable < _LEAST_READINGS:
         return {}, (f"searched in full: {n_usable} usable readings, fewer than {_LEAST_READINGS}",)
-    unlike = _why_not_climbable(problems, highest)
+    unlike = _why_smc_does_not_apply(problems, highest)
     if unlike:
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
     peaks = find_peaks(problems.problem, highest, rng=climbing)
-    whole = WholeFrame.of(peaks[1].theta)
-    found: dict[int, Found] = {}
-    parts: dict[int, Part] = {}
+    whole = FootprintPlaceAndSize.from_gaussian(peaks[1].theta)
+    found: dict[int, OrderPosterior] = {}
+    parts: dict[int, PosteriorPart] = {}
     for n in range(1, highest + 1):
         needed = n == 1 or peaks[n].log_likelihood - peaks[n - 1].log_likelihood > _NEEDED
-        found[n], parts = next_order(
+        found[n], parts = fit_next_order(
             problems, n, parts, peaks[n], climbing, whole=whole, needed=needed, search=search, progress=progress
         )
-    return _vouched_for(problems, {n: found[n] for n in orders}, climbing, search=search, progress=progress), ()
+    return _with_chosen_order_checked(
+        problems, {n: found[n] for n in orders}, climbing, search=search, progress=progress
+    ), ()
 
 
-def _vouched_for(
+def _with_chosen_order_checked(
     problems: OrderProblems,
-    found: dict[int, Found],
+    found: dict[int, OrderPosterior],
     rng: np.random.Generator,
     *,
     search: Search,
     progress: Progress | None,
-) -> dict[int, Found]:
-    """Let a search of the prior vouch for the chosen order; where it does not, search that and those above in full.
+) -> dict[int, OrderPosterior]:
+    """Check the chosen order by a search of the prior; if it missed a peak, search it and those above in full.
 
-    The orders above may have started from its samples. Where another order is then chosen, it is asked about too.
+    The orders above may have started from its samples. Where another order is then chosen, it is checked too.
     """
     asked: set[int] = set()
     while True:
-        chosen = max(found, key=lambda n: found[n].evidence.log_z)
+        chosen = max(found, key=lambda n: found[n].evidence_result.log_z)
         made = found[chosen].result
-        if chosen in asked or not isinstance(made, Climb):
+        if chosen in asked or not isinstance(made, SMCResult):
             return found
         asked.add(chosen)
-        why = part_missed(problems, chosen, made, rng=rng, progress=progress)
+        why = missed_part_in_words(problems, chosen, made, rng=rng, progress=progress)
         if why:
             note = f"searched in full, since the quick way missed a peak of order {chosen}: {why}"
             for n in (n for n in found if n >= chosen):
@@ -124,34 +134,34 @@ def _vouched_for(
                 found[n] = replace(full, notes=(*full.notes, f"order {n} was {note}"))
 
 
-def _why_not_climbable(problems: OrderProblems, highest: int) -> str:
-    """Say why no order can be climbed to, if so."""
+def _why_smc_does_not_apply(problems: OrderProblems, highest: int) -> str:
+    """Return in words why SMC does not apply to this prior; empty if it does."""
     priors = [problems.prior_of(n) for n in range(1, highest + 1)]
-    if not all(has_reference(prior) for prior in priors):
+    if not all(has_uniform_light(prior) for prior in priors):
         return "searched in full: the prior of a Gaussian's light is not uniform from 0"
     if any(replace(prior, n_gaussians=1) != priors[0] for prior in priors):
         return "searched in full: the prior of a Gaussian differs from order to order"
     return ""
 
 
-def next_order(
+def fit_next_order(
     problems: OrderProblems,
     n: int,
-    below: dict[int, Part],
+    below: dict[int, PosteriorPart],
     peak: Peak,
     rng: np.random.Generator,
     *,
-    whole: WholeFrame,
+    whole: FootprintPlaceAndSize,
     needed: bool,
     search: Search,
     progress: Progress | None,
-) -> tuple[Found, dict[int, Part]]:
-    """Climb to an order; search it in full where the climb is doubtful.
+) -> tuple[OrderPosterior, dict[int, PosteriorPart]]:
+    """Fit an order by SMC; search it in full where that is doubtful.
 
     Parameters
     ----------
     problems
-        Of the recording.
+        Problems of the recording, by order.
     n
         Number of Gaussians.
     below
@@ -161,21 +171,21 @@ def next_order(
     rng
         Source of randomness.
     whole
-        Where the sensor is, and how large.
+        Place and size of the whole footprint.
     needed
         Whether the readings need the last Gaussian, so that the posterior lies about the peak.
     search
-        Searches it in full.
+        Function that searches an order in full.
     progress
-        Told of each temperature.
+        Called with the order after each temperature.
 
     Returns
     -------
-    What was found, and the parts of its posterior.
+    The posterior of the order, and its parts.
     """
-    told: Callable[[Rung], None] | None = None if progress is None else partial(progress, n)
-    about = partial(_about_peak, problems, n, peak, rng, told)
-    from_below = partial(_from_below, problems, n, below, peak, whole, rng, told) if below else None
+    report: Callable[[TemperatureSummary], None] | None = None if progress is None else partial(progress, n)
+    about = partial(_smc_from_peak, problems, n, peak, rng, report)
+    from_below = partial(_smc_from_order_below, problems, n, below, peak, whole, rng, report) if below else None
     ways = [about, from_below] if needed else [from_below, about]
     notes: list[str] = []
     for way in ways:
@@ -184,26 +194,30 @@ def next_order(
         made, parts = way()
         made = _with_doubt_of_missed_peaks(problems, n, made, peak, rng)
         if not made.warnings:
-            return Found(made, None), parts or split_by_bright(made, rng)
+            return OrderPosterior(made, None), parts or split_by_n_bright(made, rng)
         notes.extend(made.warnings)
     full = search(n, rng)
     note = f"order {n} was searched in full, since the climb to it is doubtful: {'; '.join(dict.fromkeys(notes))}"
     found = replace(full, notes=(*full.notes, note))
-    return found, split_by_bright(found.evidence, rng)
+    return found, split_by_n_bright(found.evidence_result, rng)
 
 
-def _about_peak(
-    problems: OrderProblems, n: int, peak: Peak, rng: np.random.Generator, told: Callable[[Rung], None] | None
-) -> tuple[Climb, dict[int, Part]]:
-    """Carry particles from a density about the peak to the posterior."""
+def _smc_from_peak(
+    problems: OrderProblems,
+    n: int,
+    peak: Peak,
+    rng: np.random.Generator,
+    report: Callable[[TemperatureSummary], None] | None,
+) -> tuple[SMCResult, dict[int, PosteriorPart]]:
+    """Sample the posterior of `n`, starting from a density about the peak."""
     problem = problems.problem(n)
-    density, n_calls = density_about_peak(problem, peak.theta, rng=rng)
+    density, n_calls = fit_density_about_peak(problem, peak.theta, rng=rng)
     density = density.widened(_WIDENED)
     nothing = np.empty((_N_PARTICLES, 0))
     clouds = np.zeros(N_CLOUDS)
     # Once more from a density fitted to the samples: it is nearer, and proposes moves that are accepted.
     for n_more in (_FEW_MOVES, _FEW_MOVES if n == 1 else _MANY_MOVES):
-        made = climb(
+        made = run_smc(
             problem,
             density,
             nothing,
@@ -213,7 +227,7 @@ def _about_peak(
             n_steps=_STEPS,
             n_more=n_more,
             rng=rng,
-            told=told,
+            progress=report,
         )
         density, n_calls = density.fitted_to(made.theta), made.n_calls
     if made.warnings:
@@ -222,56 +236,64 @@ def _about_peak(
     drawn = fitted.draw(np.empty((_N_FITTED, 0)), rng=rng)
     log_weight = np.full(_N_FITTED, -np.inf)
     inside = np.flatnonzero(np.isfinite(drawn).all(axis=1))
-    log_weight[inside] = problem.log_likelihood(drawn[inside]) - fitted.log_over_prior(drawn[inside])
-    taken = (made.log_likelihood - fitted.log_over_prior(made.theta))[:, None]
+    log_weight[inside] = problem.log_likelihood(drawn[inside]) - fitted.log_density_over_prior(drawn[inside])
+    taken = (made.log_likelihood - fitted.log_density_over_prior(made.theta))[:, None]
     return _with_bridged_evidence(made, clouds, log_weight, taken), {}
 
 
-def _from_below(
+def _smc_from_order_below(
     problems: OrderProblems,
     n: int,
-    below: dict[int, Part],
+    below: dict[int, PosteriorPart],
     peak: Peak,
-    whole: WholeFrame,
+    whole: FootprintPlaceAndSize,
     rng: np.random.Generator,
-    told: Callable[[Rung], None] | None,
-) -> tuple[Climb, dict[int, Part]]:
-    """Climb to each part of the posterior: from that below with a faint Gaussian more, or to where all are bright."""
+    report: Callable[[TemperatureSummary], None] | None,
+) -> tuple[SMCResult, dict[int, PosteriorPart]]:
+    """Sample each part of the posterior of `n`: those with faint Gaussians, and the one where all are bright.
+
+    The former start from the same part of the order below, with a faint Gaussian more.
+    """
     tops = [peak.theta, *peak.others]
-    about = [density_about_peak(problems.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in tops]
+    about = [fit_density_about_peak(problems.problem(n), theta, rng=rng, n_pilots=_N_PILOTS)[0] for theta in tops]
     bright = count_bright(np.array(tops))
-    held = held_shares(below)
-    made: dict[int, Climb] = {}
+    held = evidence_shares(below)
+    made: dict[int, SMCResult] = {}
     for m, part in below.items():
         near = tuple(density for density, own in zip(about, bright, strict=True) if own == m)
         if held[m] > _LEAST_HELD:
             many = held[m] > _MUCH_HELD
-            made[m] = _one_faint_more(problems, n, m, part, near, whole, many=many, rng=rng, told=told)
+            made[m] = _smc_with_faint_gaussian_added(
+                problems, n, m, part, near, whole, many=many, rng=rng, report=report
+            )
     if held.get(n - 1, 0.0) > _BRIGHT_HELD:
         near = tuple(density for density, own in zip(about, bright, strict=True) if own == n)
-        made[n] = _all_bright(problems, n, below[n - 1], near, whole, rng=rng, told=told)
-    return joined(made, rng), {m: Part.of(climbed) for m, climbed in made.items()}
+        made[n] = _smc_with_all_gaussians_bright(problems, n, below[n - 1], near, whole, rng=rng, report=report)
+    return join_parts(made, rng), {m: PosteriorPart.from_smc(climbed) for m, climbed in made.items()}
 
 
-def _one_faint_more(
+def _smc_with_faint_gaussian_added(
     problems: OrderProblems,
     n: int,
     n_bright: int,
-    below: Part,
+    below: PosteriorPart,
     about: tuple[PeakDensity, ...],
-    whole: WholeFrame,
+    whole: FootprintPlaceAndSize,
     *,
     many: bool,
     rng: np.random.Generator,
-    told: Callable[[Rung], None] | None,
-) -> Climb:
-    """Carry particles from a part of the posterior of n - 1, and some from peaks; bridge the two parts."""
+    report: Callable[[TemperatureSummary], None] | None,
+) -> SMCResult:
+    """Sample the part of `n` with `n_bright` bright Gaussians, from that of n - 1 with a faint one more, or from peaks.
+
+    The evidence comes from a bridge between the two parts.
+    """
     problem_below = problems.problem(n - 1)
     coordinates = whole.coordinates(problems.prior_of(n - 1), n_bright)
     rest = below.theta
     n_particles = _N_PARTICLES if many else _FEW_PARTICLES
     few = rest[np.arange(n_particles) * len(rest) // n_particles]
-    compensation = Compensation.of(
+    compensation = Compensation.from_samples(
         problem_below,
         coordinates,
         problems.problem(1, n_nodes=_FEW_NODES),
@@ -279,10 +301,10 @@ def _one_faint_more(
         rng=rng,
         n_pool=_POOL if many else _SMALL_POOL,
     )
-    reference: KnownDensity = Reference(problems.prior_of(n), problem_below, compensation, n_bright)
+    reference: StartDensity = FaintGaussianReference(problems.prior_of(n), problem_below, compensation, n_bright)
     if about:
         reference = MixedReference(reference, about, below.log_z)
-    made = climb(
+    made = run_smc(
         problems.problem(n),
         reference,
         few,
@@ -291,34 +313,36 @@ def _one_faint_more(
         rng=rng,
         space=whole.coordinates(problems.prior_of(n), n_bright),
         at_once_from=_AT_ONCE_FROM,
-        told=told,
+        progress=report,
     )
-    removal = Removal(problems.prior_of(n), problems.problem(1), n_bright)
+    integral = LightIntegral(problems.prior_of(n), problems.problem(1), n_bright)
     gaussian = problems.prior_of(1).from_unit_cube(rng.random((len(rest), 8)))[:, :6]
     # Any of the n - n_bright faint Gaussians may be the one that is added.
     labels = math.log(n / (n - n_bright))
     log_z = below.log_z_of_clouds + labels
-    return _with_bridged_evidence(made, log_z, removal.added(rest, gaussian), removal.taken(made.theta))
+    return _with_bridged_evidence(
+        made, log_z, integral.log_ratio_when_added(rest, gaussian), integral.log_ratio_when_taken_away(made.theta)
+    )
 
 
-def _all_bright(
+def _smc_with_all_gaussians_bright(
     problems: OrderProblems,
     n: int,
-    below: Part,
+    below: PosteriorPart,
     about: tuple[PeakDensity, ...],
-    whole: WholeFrame,
+    whole: FootprintPlaceAndSize,
     *,
     rng: np.random.Generator,
-    told: Callable[[Rung], None] | None,
-) -> Climb:
-    """Carry particles from a wide density to where all Gaussians are bright."""
+    report: Callable[[TemperatureSummary], None] | None,
+) -> SMCResult:
+    """Sample the part of the posterior of `n` where all Gaussians are bright, from a wide density."""
     space = whole.coordinates(problems.prior_of(n), n)
     fewer = whole.coordinates(problems.prior_of(n - 1), n - 1).enter(below.theta)
-    reference: KnownDensity = SharedLightDensity.of(space, fewer)
+    reference: StartDensity = SharedLightDensity.from_samples_below(space, fewer)
     if about:
         reference = MixedReference(reference, about, 0.0)
     n_steps, least_effective = _TWO_BRIGHT if n == 2 else _MORE_BRIGHT
-    return climb(
+    return run_smc(
         problems.problem(n),
         reference,
         np.empty((_N_PARTICLES if n == 2 else _FEW_PARTICLES, 0)),
@@ -329,25 +353,25 @@ def _all_bright(
         n_steps=n_steps,
         n_more=_FEW_MOVES,
         least_effective=least_effective,
-        told=told,
+        progress=report,
     )
 
 
-def _with_bridged_evidence(made: Climb, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> Climb:
-    """Take the evidence from a bridge, where enough samples lie on it; doubt where it disagrees with the climb's."""
+def _with_bridged_evidence(made: SMCResult, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> SMCResult:
+    """Replace the evidence by that of a bridge if enough samples are effective; add a doubt if the two disagree."""
     if made.temperatures[-1] < 1.0:
         return made
-    ratio, share = bridged(added, taken)
+    ratio, share = bridge_evidences(added, taken)
     if share < _LEAST_SHARE:
         return made
     # What each cloud adds to the bridge of all (jackknife): by itself a cloud that is stuck would outweigh the others.
     own = np.repeat(np.arange(N_CLOUDS), len(taken) // N_CLOUDS)
     of_added = np.repeat(np.arange(N_CLOUDS), len(added) // N_CLOUDS)
-    without = np.array([bridged(added[of_added != k], taken[own != k])[0] for k in range(N_CLOUDS)])
-    # Samples of the posterior that still drift tell another evidence late than early.
+    without = np.array([bridge_evidences(added[of_added != k], taken[own != k])[0] for k in range(N_CLOUDS)])
+    # Samples of the posterior that still drift give another evidence late than early.
     by_time = taken.reshape(N_CLOUDS, N_SNAPSHOTS, -1, taken.shape[1])
     early, late = (half.reshape(-1, taken.shape[1]) for half in np.split(by_time, 2, axis=1))
-    drift = bridged(added, late)[0] - bridged(added, early)[0]
+    drift = bridge_evidences(added, late)[0] - bridge_evidences(added, early)[0]
     found = replace(
         made,
         log_z_of_clouds=log_z + N_CLOUDS * ratio - (N_CLOUDS - 1) * without,
@@ -363,14 +387,14 @@ def _with_bridged_evidence(made: Climb, log_z: FloatArray, added: FloatArray, ta
 
 
 def _with_doubt_of_missed_peaks(
-    problems: OrderProblems, n: int, made: Climb, peak: Peak, rng: np.random.Generator
-) -> Climb:
-    """Doubt a climb that missed a peak which holds a part of the evidence."""
+    problems: OrderProblems, n: int, made: SMCResult, peak: Peak, rng: np.random.Generator
+) -> SMCResult:
+    """Add a doubt to an SMC run that missed a peak which holds a part of the evidence."""
     if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:
         return made
     problem = problems.problem(n)
-    density, _ = density_about_peak(problem, peak.theta, rng=rng, n_pilots=_N_PILOTS)
-    share = share_missed_about(problem, density, made.theta, made.log_z, n_draws=_N_WEIGHED, rng=rng)
+    density, _ = fit_density_about_peak(problem, peak.theta, rng=rng, n_pilots=_N_PILOTS)
+    share = share_missed_about_peak(problem, density, made.theta, made.log_z, n_draws=_N_WEIGHED, rng=rng)
     if share < _MISSED:
         return made
     higher = peak.log_likelihood - float(made.log_likelihood.max())

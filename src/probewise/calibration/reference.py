@@ -1,7 +1,7 @@
-"""A density of N Gaussians to start from: a part of the posterior of N - 1 with one more, faint Gaussian.
+"""A start density of N Gaussians: a part of the posterior of N - 1 with one more, faint Gaussian.
 
-The new one is added to the others as they are; or added while the others shift to compensate for it; or taken out of
-a bright one so that light, centre and covariance of the two stay (split and merge moves: Richardson & Green 1997).
+The new one is added to the others as they are; or added while the others shift to compensate for it; or split off a
+bright one so that light, centre and covariance of the two stay (split and merge moves: Richardson & Green 1997).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
-from probewise.calibration.compensation import Answer, Compensation
+from probewise.calibration.compensation import CompensatingShift, Compensation
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.whole_coordinates import FAINT, count_bright
 from probewise.errors import ParameterError
@@ -36,19 +36,19 @@ _LEAST_RATIO = 1e-4
 _SHAPE = slice(1, 6)
 # Shares of the draws that are added as they are, and that are split; the others are compensated for.
 _ADDED, _SPLIT = 0.2, 0.3
-# Share of the moves afresh that take the light from a bright one.
+# Share of the independent proposals that split the new Gaussian off a bright one.
 _RESPLIT = 0.5
 # Share of the compensated ones whose light follows the first-order posterior.
 _TOLD = 0.7
 _TINY = float(np.finfo(float).tiny)
 
 
-def has_reference(prior: SSFPrior) -> bool:
-    """Whether the light that a Gaussian holds is uniform from nothing: what `Reference` is made for."""
+def has_uniform_light(prior: SSFPrior) -> bool:
+    """Whether the light that a Gaussian holds is uniform from nothing: what `FaintGaussianReference` is made for."""
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
 
 
-class _Draw(Protocol):
+class _AddGaussian(Protocol):
     def __call__(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray: ...
 
 
@@ -59,21 +59,21 @@ class JumpProposal:
     Attributes
     ----------
     share
-        Of the draws.
+        Share of the draws.
     draw
-        One Gaussian more for each, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible.
+        Adds one Gaussian to each sample, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible.
     back
-        What `draw` started from, and the log of the density over the prior's but for likelihood and N,
-        (n, 6 N + 2) -> (n, 6 N - 4), (n,).
+        Inverse of `draw`, (n, 6 N + 2) -> (n, 6 N - 4). It also returns the log of the density over the prior's, (n,),
+        without the likelihood of N - 1 Gaussians and the factor 1 / N.
     """
 
     share: float
-    draw: _Draw
+    draw: _AddGaussian
     back: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True)
-class Reference:
+class FaintGaussianReference:
     """A part of the posterior of N - 1 Gaussians with one more, lighter than each of them, and faint.
 
     Gaussians have no labels, so they are sorted by mass here as in `MomentCoordinates`, the lightest last. With p_N
@@ -94,7 +94,7 @@ class Reference:
     Parameters
     ----------
     prior
-        Of N Gaussians, 2 or more, with uniform mass; see `has_reference`.
+        Prior of N Gaussians, 2 or more, with uniform mass; see `has_uniform_light`.
     below
         Problem of N - 1 Gaussians.
     compensation
@@ -109,25 +109,31 @@ class Reference:
     n_bright: int
 
     def __post_init__(self) -> None:
-        if self.prior.n_gaussians < 2 or not has_reference(self.prior):
+        if self.prior.n_gaussians < 2 or not has_uniform_light(self.prior):
             raise ParameterError("prior", self.prior, "a prior of 2 Gaussians or more, with masses uniform from 0 to 1")
 
     @cached_property
     def proposals(self) -> tuple[JumpProposal, ...]:
-        """The ways that are mixed."""
+        """The proposals that the density mixes."""
         return (
             *(
                 JumpProposal(
-                    _SPLIT / self.n_bright, partial(self.split, label=label), partial(self.merged, label=label)
+                    _SPLIT / self.n_bright,
+                    partial(self.split_bright_gaussian, label=label),
+                    partial(self.merge_into_bright_gaussian, label=label),
                 )
                 for label in range(self.n_bright)
             ),
-            JumpProposal(_ADDED, self.with_last, lambda theta: (self.without_last(theta), self.log_added(theta))),
-            JumpProposal(1.0 - _ADDED - _SPLIT, self.with_compensated, self.uncompensated),
+            JumpProposal(
+                _ADDED,
+                self.with_drawn_gaussian,
+                lambda theta: (self.without_last_gaussian(theta), self.log_density_of_drawn_gaussian(theta)),
+            ),
+            JumpProposal(1.0 - _ADDED - _SPLIT, self.with_compensated_gaussian, self.without_compensated_gaussian),
         )
 
-    def log_over_prior(self, theta: FloatArray) -> FloatArray:
-        """Log of the density over the prior's sorted one, plus ln Z of N - 1; sorted (n, 6 N + 2) -> (n,)."""
+    def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
+        """Log of the density over the prior's, plus ln Z of N - 1; Gaussians sorted by mass, (n, 6 N + 2) -> (n,)."""
         parts = np.empty((len(self.proposals), len(theta)))
         for part, proposal in zip(parts, self.proposals, strict=True):
             rest, part[:] = proposal.back(theta)
@@ -137,7 +143,7 @@ class Reference:
         return np.asarray(logsumexp(parts, axis=0) - math.log(self.prior.n_gaussians))
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw one Gaussian more for each of N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
+        """Add a Gaussian to each sample of N - 1, sorted by mass, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
         which = rng.choice(len(self.proposals), size=len(rest), p=[proposal.share for proposal in self.proposals])
         out = np.empty((len(rest), rest.shape[1] + 6))
         for k, proposal in enumerate(self.proposals):
@@ -145,18 +151,21 @@ class Reference:
         return out
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Draw one faint Gaussian afresh: the others shift to compensate, or a bright one gives way.
+        """Replace one faint Gaussian: the others shift to compensate, or the new one is split off a bright one.
 
-        Returns the new parameters, (n, 6 N + 2), nan where there are none; and the log of the density of the old over
-        that of the new, both over the prior's, (n,); -inf where the move is impossible.
+        Returns the new parameters, (n, 6 N + 2), nan where there are none; and the log of the density over the prior's
+        at the old parameters, minus that at the new ones, (n,); -inf where the move is impossible.
         """
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
         split = rng.random(len(here)) < _RESPLIT
-        for rows, move in ((np.flatnonzero(split), self._resplit), (np.flatnonzero(~split), self._recompensated)):
+        for rows, move in (
+            (np.flatnonzero(split), self._with_faint_one_split_elsewhere),
+            (np.flatnonzero(~split), self._with_faint_one_replaced),
+        ):
             there[rows], log_drawn[rows] = move(here[rows], rng=rng)
         return there, log_drawn
 
-    def _recompensated(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def _with_faint_one_replaced(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Take away any Gaussian but the first, undo the shift of the others, add another one and shift them for it.
 
         The new one may be as heavy as the first, so that all others are moved, not the lightest alone. `here` is
@@ -169,116 +178,128 @@ class Reference:
         others = g[np.arange(n) != label[:, None]].reshape(m, 6 * (n - 1))
         rest = np.concatenate([others, here[:, -2:]], axis=1)
         old = g[np.arange(m), label]
-        before, log_here = self._uncompensated(rest, old, self.compensation.linear.answer(old), False)
+        before, log_here = self._undo_compensation(rest, old, self.compensation.linear.compensating_shift(old), False)
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         rows = np.flatnonzero(np.isfinite(log_here))
         if rows.size:
-            after, last, answer = self._compensated(before[rows], False, rng)
+            after, last, answer = self._draw_compensated(before[rows], False, rng)
             real = np.isfinite(after).all(axis=1)
             rows, after, last, answer = rows[real], after[real], last[real], answer.take(np.flatnonzero(real))
             there[rows] = _insert_gaussian(after, last)
-            log_there = self._uncompensated(after, last, answer, False)[1]
+            log_there = self._undo_compensation(after, last, answer, False)[1]
             log_drawn[rows] = np.where(np.isfinite(log_there), log_here[rows] - log_there, -np.inf)
         return there, log_drawn
 
-    def without_last(self, theta: FloatArray) -> FloatArray:
+    def without_last_gaussian(self, theta: FloatArray) -> FloatArray:
         """Leave out the last Gaussian, (n, 6 N + 2) -> (n, 6 N - 4)."""
         return np.concatenate([theta[:, :-8], theta[:, -2:]], axis=1)
 
-    def with_last(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+    def with_drawn_gaussian(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Add a Gaussian drawn from r to N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2)."""
         n = len(rest)
         near = rng.random(n) < _NEAR
         last = self.prior.from_unit_cube(rng.random((n, len(self.prior.names))))[:, :6]
-        last[near] = self._drawn_near_one(rest[near], rng)
-        ratio = np.where(near, 1.0 - rng.random(len(rest)), _drawn_ratio(len(rest), rng))
-        last[:, 0] = ratio * self._most(self._masses(rest), last_of_all=True) * self._scale(last)
+        last[near] = self._draw_shapes_near_others(rest[near], rng)
+        ratio = np.where(near, 1.0 - rng.random(len(rest)), _draw_mass_ratios(len(rest), rng))
+        last[:, 0] = (
+            ratio * self._greatest_faint_mass(self._masses(rest), last_of_all=True) * self._amplitude_scale(last)
+        )
         return _insert_gaussian(rest, last)
 
-    def log_added(self, theta: FloatArray) -> FloatArray:
+    def log_density_of_drawn_gaussian(self, theta: FloatArray) -> FloatArray:
         """Log of r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
         mass = self._masses(theta)
-        least = self._most(mass[:, :-1], last_of_all=True)
-        near = self._log_near_one(theta[:, -8:-2], self.without_last(theta))
-        anywhere = _log_ratio_density(mass[:, -1] / least)
+        least = self._greatest_faint_mass(mass[:, :-1], last_of_all=True)
+        near = self._log_density_near_others(theta[:, -8:-2], self.without_last_gaussian(theta))
+        anywhere = _log_density_of_mass_ratio(mass[:, -1] / least)
         return np.asarray(np.logaddexp(math.log(1.0 - _NEAR) + anywhere, math.log(_NEAR) + near) - np.log(least))
 
-    def with_compensated(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+    def with_compensated_gaussian(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Add a Gaussian to N - 1 sorted ones and shift these, (n, 6 N - 4) -> (n, 6 N + 2)."""
-        return _insert_gaussian(*self._compensated(rest, True, rng)[:2])
+        return _insert_gaussian(*self._draw_compensated(rest, True, rng)[:2])
 
-    def uncompensated(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Undo `with_compensated`; also the log density as `JumpProposal.back` has it."""
+    def without_compensated_gaussian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Undo `with_compensated_gaussian`; also return the log density as `JumpProposal.back` does."""
         last = theta[:, -8:-2]
-        return self._uncompensated(self.without_last(theta), last, self.compensation.linear.answer(last), True)
+        answer = self.compensation.linear.compensating_shift(last)
+        return self._undo_compensation(self.without_last_gaussian(theta), last, answer, True)
 
-    def _compensated(
+    def _draw_compensated(
         self, rest: FloatArray, last_of_all: bool, rng: np.random.Generator
-    ) -> tuple[FloatArray, FloatArray, Answer]:
-        """Shift N - 1 sorted Gaussians for one of a mass up to `most_of` theirs; that one, (n, 6), and the answer."""
+    ) -> tuple[FloatArray, FloatArray, CompensatingShift]:
+        """Draw a Gaussian and shift N - 1 others, sorted by mass, to compensate for it.
+
+        Returns the others, (n, 6 N - 4), the new one, (n, 6), and its compensating shift.
+        """
         last, answer = self.compensation.draw(len(rest), rng=rng)
         near = np.flatnonzero(rng.random(len(rest)) < _NEAR)
-        last[near] = self._drawn_near_one(rest[near], rng)
-        answer = answer.put(near, self.compensation.linear.answer(last[near]))
+        last[near] = self._draw_shapes_near_others(rest[near], rng)
+        answer = answer.with_rows_replaced(near, self.compensation.linear.compensating_shift(last[near]))
         masses = self._masses(rest)
-        whole, most = masses.sum(axis=1), self._most(masses, last_of_all=last_of_all)
+        whole, most = masses.sum(axis=1), self._greatest_faint_mass(masses, last_of_all=last_of_all)
         told = answer.draw_share(most / (whole + most), rng=rng)
         by_share = rng.random(len(rest)) < _TOLD
-        ratio = np.where(by_share, told / (1.0 - told) * whole / most, _drawn_ratio(len(rest), rng))
-        last[:, 0] = ratio * most * self._scale(last)
+        ratio = np.where(by_share, told / (1.0 - told) * whole / most, _draw_mass_ratios(len(rest), rng))
+        last[:, 0] = ratio * most * self._amplitude_scale(last)
         share = ratio * most / (whole + ratio * most)
         coordinates = self.compensation.coordinates
         after, log_prior = coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)
         return np.where(np.isfinite(log_prior)[:, None], after, np.nan), last, answer
 
-    def _uncompensated(
-        self, after: FloatArray, last: FloatArray, answer: Answer, last_of_all: bool
+    def _undo_compensation(
+        self, after: FloatArray, last: FloatArray, answer: CompensatingShift, last_of_all: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Undo `_compensated`; also the log of its density over the prior's, but for likelihood and N."""
+        """Undo `_draw_compensated`; also return the log density as `JumpProposal.back` does."""
         coordinates = self.compensation.coordinates
-        masses, mass = self._masses(after), last[:, 0] / self._scale(last)
-        whole, most = masses.sum(axis=1), self._most(masses, last_of_all=last_of_all)
+        masses, mass = self._masses(after), last[:, 0] / self._amplitude_scale(last)
+        whole, most = masses.sum(axis=1), self._greatest_faint_mass(masses, last_of_all=last_of_all)
         share, ratio = mass / (whole + mass), mass / most
         x = coordinates.enter(after)
         log_after = coordinates.leave(x)[1]
         before, log_before = coordinates.leave(x - share[:, None] * answer.shift)
         log_share = answer.log_share_density(share, most / (whole + most))
         log_share += np.log(most * whole) - 2.0 * np.log(whole + mass)  # d share / d ratio
-        log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_ratio_density(ratio), math.log(_TOLD) + log_share)
-        near = self._log_near_one(last, np.where(np.isfinite(log_before)[:, None], before, after))
-        log_shape = np.logaddexp(math.log(1.0 - _NEAR) + self.compensation.log_tilt(answer), math.log(_NEAR) + near)
+        log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_density_of_mass_ratio(ratio), math.log(_TOLD) + log_share)
+        near = self._log_density_near_others(last, np.where(np.isfinite(log_before)[:, None], before, after))
+        log_shape = np.logaddexp(
+            math.log(1.0 - _NEAR) + self.compensation.log_density_over_prior(answer), math.log(_NEAR) + near
+        )
         with np.errstate(invalid="ignore"):  # where both are impossible
             found = log_shape + log_ratio - np.log(most) + log_before - log_after
         return before, np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
 
-    def _drawn_near_one(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Draw Gaussians of no certain mass near one of the others, (n, 6 N - 4) -> (n, 6)."""
+    def _draw_shapes_near_others(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draw Gaussians near one of the others, their mass to be replaced, (n, 6 N - 4) -> (n, 6)."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
-        centre, width = self._places(rest)
+        centre, width = self._cube_places_and_kernel_widths(rest)
         chosen = np.arange(n), rng.integers(self.prior.n_gaussians - 1, size=n)
-        u[:, _SHAPE] = _drawn_near(centre[chosen], width[chosen], rng)
+        u[:, _SHAPE] = _draw_truncated_normal(centre[chosen], width[chosen], rng)
         return self.prior.from_unit_cube(u)[:, :6]
 
-    def _log_near_one(self, last: FloatArray, rest: FloatArray) -> FloatArray:
+    def _log_density_near_others(self, last: FloatArray, rest: FloatArray) -> FloatArray:
         """Log density of shapes, (n, 6), near one of the others, over the prior's, (n,)."""
-        centre, width = self._places(rest)
-        at = self._places(_insert_gaussian(rest[:, -2:], last))[0]
-        return np.asarray(logsumexp(_log_near(at, centre, width), axis=1) - math.log(self.prior.n_gaussians - 1))
+        centre, width = self._cube_places_and_kernel_widths(rest)
+        at = self._cube_places_and_kernel_widths(_insert_gaussian(rest[:, -2:], last))[0]
+        return np.asarray(
+            logsumexp(_log_truncated_normal_density(at, centre, width), axis=1) - math.log(self.prior.n_gaussians - 1)
+        )
 
-    def split(self, rest: FloatArray, label: int, *, rng: np.random.Generator) -> FloatArray:
-        """Take the last Gaussian out of a bright one, (n, 6 N - 4) -> (n, 6 N + 2); nan where that one is used up."""
-        last = self._drawn_beside(rest, label, self._most(self._masses(rest), last_of_all=True), rng)
-        return self._without_light(rest, label, last)
+    def split_bright_gaussian(self, rest: FloatArray, label: int, *, rng: np.random.Generator) -> FloatArray:
+        """Split a Gaussian off a bright one, (n, 6 N - 4) -> (n, 6 N + 2); nan where nothing of that one is left."""
+        last = self._draw_near_bright(rest, label, self._greatest_faint_mass(self._masses(rest), last_of_all=True), rng)
+        return self._split_off(rest, label, last)
 
-    def merged(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
-        """Undo `split`; also the log density as `JumpProposal.back` has it."""
-        rest = self._with_light(self.without_last(theta), label, theta[:, -8:-2])
-        most = self._most(self._masses(rest), last_of_all=True)
-        return rest, self._log_split(rest, self.without_last(theta), label, theta[:, -8:-2], most)
+    def merge_into_bright_gaussian(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
+        """Undo `split_bright_gaussian`; also return the log density as `JumpProposal.back` does."""
+        rest = self._merge_into_bright(self.without_last_gaussian(theta), label, theta[:, -8:-2])
+        most = self._greatest_faint_mass(self._masses(rest), last_of_all=True)
+        return rest, self._log_density_of_split(rest, self.without_last_gaussian(theta), label, theta[:, -8:-2], most)
 
-    def _resplit(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Give a faint Gaussian's light to a bright one, and take another out of a bright one; as `propose`."""
+    def _with_faint_one_split_elsewhere(
+        self, here: FloatArray, *, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Merge a faint Gaussian into a bright one, and split another off a bright one; returns as `propose`."""
         m, n = len(here), self.prior.n_gaussians
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         label = rng.integers(self.n_bright, n, size=m)
@@ -292,12 +313,12 @@ class Reference:
             old = here[rows]
             last = old[:, 6 * faint : 6 * faint + 6]
             others = np.delete(old, slice(6 * faint, 6 * faint + 6), axis=1)
-            rest = self._with_light(others, to_bright, last)
-            most = self._most(self._masses(rest), last_of_all=False)
-            log_here = self._log_split(rest, others, to_bright, last, most)
-            new_last = self._drawn_beside(rest, of_bright, most, rng)
-            new = self._without_light(rest, of_bright, new_last)
-            log_there = self._log_split(rest, self.without_last(new), of_bright, new_last, most)
+            rest = self._merge_into_bright(others, to_bright, last)
+            most = self._greatest_faint_mass(self._masses(rest), last_of_all=False)
+            log_here = self._log_density_of_split(rest, others, to_bright, last, most)
+            new_last = self._draw_near_bright(rest, of_bright, most, rng)
+            new = self._split_off(rest, of_bright, new_last)
+            log_there = self._log_density_of_split(rest, self.without_last_gaussian(new), of_bright, new_last, most)
             there[rows] = new
             with np.errstate(invalid="ignore"):
                 log_drawn[rows] = np.where(
@@ -305,43 +326,47 @@ class Reference:
                 )
         return there, log_drawn
 
-    def _drawn_beside(self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def _draw_near_bright(self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draw a Gaussian near a bright one, (n, 6), of a mass up to `most`."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
-        centre, width = self._places(rest)
-        u[:, _SHAPE] = _drawn_near(centre[:, label], width[:, label], rng)
+        centre, width = self._cube_places_and_kernel_widths(rest)
+        u[:, _SHAPE] = _draw_truncated_normal(centre[:, label], width[:, label], rng)
         last = self.prior.from_unit_cube(u)[:, :6]
-        last[:, 0] = _drawn_ratio(n, rng) * most * self._scale(last)
+        last[:, 0] = _draw_mass_ratios(n, rng) * most * self._amplitude_scale(last)
         return last
 
-    def _without_light(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
-        """Take a Gaussian's moments from those of a bright one, and add it; nan where nothing would be left."""
+    def _split_off(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
+        """Subtract a Gaussian's moments from those of a bright one, and append it; nan where nothing would be left."""
         own = slice(6 * label, 6 * label + 6)
         left = self._from_moments(self._moments(rest[:, own]) - self._moments(last))
         out = _insert_gaussian(rest, last)
         out[:, own] = left
         return np.where(np.isfinite(left).all(axis=1, keepdims=True), out, np.nan)
 
-    def _with_light(self, others: FloatArray, label: int, last: FloatArray) -> FloatArray:
+    def _merge_into_bright(self, others: FloatArray, label: int, last: FloatArray) -> FloatArray:
         """Add a Gaussian's moments to those of a bright one, keeping light, centre and covariance of the two."""
         own = slice(6 * label, 6 * label + 6)
         out = others.copy()
         out[:, own] = self._from_moments(self._moments(others[:, own]) + self._moments(last))
         return out
 
-    def _log_split(
+    def _log_density_of_split(
         self, rest: FloatArray, others: FloatArray, label: int, last: FloatArray, most: FloatArray
     ) -> FloatArray:
-        """Log density of a split over the prior's, but for likelihood and N, (n,); -inf where it is impossible."""
+        """Log density of a split over the prior's, (n,), without the factors that `JumpProposal` names; may be -inf."""
         own = slice(6 * label, 6 * label + 6)
-        centre, width = self._places(rest)
-        ratio = last[:, 0] / self._scale(last) / np.maximum(most, _TINY)
-        at = self._places(_insert_gaussian(rest[:, -2:], last))[0][:, 0]
+        centre, width = self._cube_places_and_kernel_widths(rest)
+        ratio = last[:, 0] / self._amplitude_scale(last) / np.maximum(most, _TINY)
+        at = self._cube_places_and_kernel_widths(_insert_gaussian(rest[:, -2:], last))[0][:, 0]
         # At a fixed last Gaussian the moments of the bright one are shifted, so volumes in them stay.
         with np.errstate(divide="ignore", invalid="ignore"):
             found = self._log_prior_of_moments(rest[:, own], rest) - self._log_prior_of_moments(others[:, own], rest)
-            found += _log_near(at, centre[:, label], width[:, label]) + _log_ratio_density(ratio) - np.log(most)
+            found += (
+                _log_truncated_normal_density(at, centre[:, label], width[:, label])
+                + _log_density_of_mass_ratio(ratio)
+                - np.log(most)
+            )
         possible = (ratio < 1.0) & (ratio > 0.0) & np.isfinite(found)
         possible[possible] = count_bright(rest[possible]) == self.n_bright
         return np.where(possible, found, -np.inf)
@@ -350,7 +375,7 @@ class Reference:
         """Log of one Gaussian's prior density over its moments, up to a constant, (n, 6) -> (n,)."""
         alone = replace(self.prior, n_gaussians=1)
         log_det = np.log(np.maximum(g[:, 3] * g[:, 4] - g[:, 5] ** 2, _TINY))
-        log_mass = np.log(g[:, 0] / self._scale(g))
+        log_mass = np.log(g[:, 0] / self._amplitude_scale(g))
         log_prob = alone.log_prob_by_kind(g.T[:, None].copy(), levels_of[:, -2], levels_of[:, -1])
         return np.asarray(log_prob - 5.0 * log_mass + 3.5 * log_det)
 
@@ -360,34 +385,34 @@ class Reference:
         u, v = g[:, 1], g[:, 2]
         ones = np.ones(len(g))
         each = [ones, u, v, 0.5 * g[:, 4] / det + u * u, 0.5 * g[:, 3] / det + v * v, -0.5 * g[:, 5] / det + u * v]
-        return np.stack(each, axis=1) * (g[:, 0] / self._scale(g))[:, None]
+        return np.stack(each, axis=1) * (g[:, 0] / self._amplitude_scale(g))[:, None]
 
     def _from_moments(self, m: FloatArray) -> FloatArray:
-        """Take a Gaussian from its moments, (n, 6) both ways; nan where there is none."""
+        """Compute a Gaussian's parameters from its moments, (n, 6) -> (n, 6); nan where no Gaussian has them."""
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = m[:, 1] / m[:, 0], m[:, 2] / m[:, 0]
             uu, vv, uv = m[:, 3] / m[:, 0] - u * u, m[:, 4] / m[:, 0] - v * v, m[:, 5] / m[:, 0] - u * v
             det = uu * vv - uv * uv
             real = (m[:, 0] > 0) & (uu > 0) & (vv > 0) & (det > 0)
             g = np.stack([m[:, 0], u, v, 0.5 * vv / det, 0.5 * uu / det, -0.5 * uv / det], axis=1)
-            g[:, 0] *= self._scale(g)
+            g[:, 0] *= self._amplitude_scale(g)
         return np.where(real[:, None], g, np.nan)
 
-    def _most(self, masses: FloatArray, *, last_of_all: bool) -> FloatArray:
-        """Most mass that a faint Gaussian may have beside others, (n, N - 1) -> (n,); or one that is the lightest."""
+    def _greatest_faint_mass(self, masses: FloatArray, *, last_of_all: bool) -> FloatArray:
+        """Greatest mass of a faint Gaussian beside others, (n, N - 1) -> (n,); `last_of_all`: as the lightest one."""
         most = FAINT * masses.max(axis=1)
         return np.asarray(np.minimum(most, masses.min(axis=1)) if last_of_all else most)
 
-    def _scale(self, g: FloatArray) -> FloatArray:
+    def _amplitude_scale(self, g: FloatArray) -> FloatArray:
         return self.prior.amplitude_scale(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
 
     def _masses(self, theta: FloatArray) -> FloatArray:
         """Masses in the prior's unit, (n, 6 N' + 2) -> (n, N')."""
         g = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
-        return np.asarray(g[..., 0] / self._scale(g))
+        return np.asarray(g[..., 0] / self._amplitude_scale(g))
 
-    def _places(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Place of each Gaussian in its five sides of the prior's cube, (n, N', 5), and the kernel's widths there."""
+    def _cube_places_and_kernel_widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Place of each Gaussian in the prior's cube, without its mass, (n, N', 5), and the widths of kernels there."""
         prior = self.prior
         g = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
         a, b = g[..., 3], g[..., 4]
@@ -414,7 +439,7 @@ def _insert_gaussian(rest: FloatArray, last: FloatArray) -> FloatArray:
     return np.concatenate([rest[:, :-2], last, rest[:, -2:]], axis=1)
 
 
-def _drawn_ratio(n: int, rng: np.random.Generator) -> FloatArray:
+def _draw_mass_ratios(n: int, rng: np.random.Generator) -> FloatArray:
     """Draw ratios of a new mass to the greatest that it may have, (n,)."""
     ratio = 1.0 - rng.random(n)
     light = rng.random(n) >= _EVEN_MASS
@@ -422,19 +447,19 @@ def _drawn_ratio(n: int, rng: np.random.Generator) -> FloatArray:
     return ratio
 
 
-def _log_ratio_density(ratio: FloatArray) -> FloatArray:
+def _log_density_of_mass_ratio(ratio: FloatArray) -> FloatArray:
     light = (1.0 - _EVEN_MASS) / (-math.log(_LEAST_RATIO) * np.maximum(ratio, _TINY))
     return np.asarray(np.log(_EVEN_MASS + np.where(ratio > _LEAST_RATIO, light, 0.0)))
 
 
-def _drawn_near(centre: FloatArray, width: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Draw from normal kernels cut off at the cube, (n, 5)."""
+def _draw_truncated_normal(centre: FloatArray, width: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Draw from normal kernels truncated at the unit cube, (n, 5)."""
     low, high = ndtr(-centre / width), ndtr((1.0 - centre) / width)
     return np.asarray((centre + width * ndtri(low + rng.random(centre.shape) * (high - low))).clip(1e-9, 1.0 - 1e-9))
 
 
-def _log_near(at: FloatArray, centre: FloatArray, width: FloatArray) -> FloatArray:
-    """Log density of such a kernel, (..., 5) -> (...,)."""
+def _log_truncated_normal_density(at: FloatArray, centre: FloatArray, width: FloatArray) -> FloatArray:
+    """Log density of a normal kernel truncated at the unit cube, (..., 5) -> (...,)."""
     kept = ndtr((1.0 - centre) / width) - ndtr(-centre / width)
     return np.asarray(
         (-0.5 * ((at - centre) / width) ** 2 - np.log(width * math.sqrt(2.0 * math.pi) * kept)).sum(axis=-1)

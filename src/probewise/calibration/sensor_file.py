@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_kind, require_path
-from probewise._posterior_samples import NamedSamples, interval_table, require_absent, require_samples
+from probewise._posterior_samples import NamedSamples, interval_table, require_masks_of_absent_effects, require_samples
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -23,7 +23,7 @@ from probewise.calibration.priors import PriorRow
 from probewise.calibration.ssf_summary import Quantity, ssf_quantities
 from probewise.effects import EFFECTS, EdgeShadow
 from probewise.errors import FileError, ParameterError, ProbewiseError, shown
-from probewise.recordings import Instrumentation, json_of, read_text, write_text_atomically
+from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
 from probewise.scene import KnownScene, Scene
 from probewise.sensor import (
     AnyEffect,
@@ -136,7 +136,7 @@ class FittedSensor(NamedSamples):
         stray = [name for name in self.patterns if name not in self.effects or name not in _BOUND_TO_PATTERNS]
         if stray:
             raise ParameterError("patterns", stray[0], f"effects of the model among {sorted(_BOUND_TO_PATTERNS)}")
-        require_absent(self.absent, self.effects, len(samples))
+        require_masks_of_absent_effects(self.absent, self.effects, len(samples))
         if not 1 <= self.n_gaussians <= len(self.names) // 6:
             allowed = f"1 to {len(self.names) // 6}, for {len(self.names)} parameters"
             raise ParameterError("n_gaussians", self.n_gaussians, allowed)
@@ -144,7 +144,7 @@ class FittedSensor(NamedSamples):
         if self.names[: len(wanted)] != wanted:
             raise ParameterError("names", self.names, f"{wanted} first, for n_gaussians = {self.n_gaussians}")
         owners = {name.partition(".")[0] for name in self.names[len(wanted) :]}
-        columns = {f"{effect.name}.{p}" for effect in self.carried_effects for p in effect.prior.names}
+        columns = {f"{effect.name}.{p}" for effect in self.effects_on_new_scans for p in effect.prior.names}
         if owners != set(self.effects) or not columns <= set(self.names):
             raise ParameterError(
                 "names", self.names, f"after I_max the columns of the effects {self.effects}: {sorted(columns)}"
@@ -156,7 +156,7 @@ class FittedSensor(NamedSamples):
         object.__setattr__(self, "noise_sd", noise_sd)
 
     @property
-    def carried_effects(self) -> tuple[AnyEffect, ...]:
+    def effects_on_new_scans(self) -> tuple[AnyEffect, ...]:
         """The effects that also apply to new scans."""
         return tuple(
             _BOUND_TO_PATTERNS[name](patterns=self.patterns[name]) if name in self.patterns else EFFECTS[name]()
@@ -165,33 +165,37 @@ class FittedSensor(NamedSamples):
         )
 
     @property
-    def carried_samples(self) -> FloatArray:
+    def samples_for_new_scans(self) -> FloatArray:
         """Samples with the columns of `chain`, without the effects of single scans."""
         return self.samples[:, [self.names.index(name) for name in self.chain(KnownScene({})).names]]
+
+    carried_effects, carried_samples = effects_on_new_scans, samples_for_new_scans  # their earlier names
 
     def chain(self, scene: Scene) -> Chain:
         """Build the model that predicts new readings over a scene, with the effects that apply to new scans.
 
-        Its parameters are the columns of `carried_samples`, unless the scene has parameters.
+        Its parameters are the columns of `samples_for_new_scans`, unless the scene has parameters.
         """
-        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.carried_effects)
+        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, self.effects_on_new_scans)
 
     @property
-    def free_form(self) -> bool:
+    def is_free_form(self) -> bool:
         """Whether its SSF is a free form (`probewise.sensor.free_form`) rather than a mixture of a few Gaussians."""
         return is_free_form(self.samples[:, : 6 * self.n_gaussians])
 
+    free_form = is_free_form  # its earlier name
+
     def mixture(self) -> FixedMixture:
         """Return the mean SSF as a mixture of `n_gaussians` positive Gaussians; four for a free form."""
-        if self.free_form:
+        if self.is_free_form:
             return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
         n = self.n_gaussians
         return mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
 
-    def leading(self) -> FittedSensor:
-        """Return the sensor under the most probable combination of effects, where a diagnosis left several open.
+    def with_leading_effects(self) -> FittedSensor:
+        """Return the sensor with the most probable combination of effects, where a diagnosis left several possible.
 
-        Its samples are repeated to the original number; the sensor itself if there is only one combination.
+        Its samples are repeated to the original number. If there is only one combination, return the sensor itself.
         """
         if not self.absent:
             return self
@@ -212,18 +216,24 @@ class FittedSensor(NamedSamples):
             absent={},
         )
 
+    leading = with_leading_effects  # its earlier name
+
     def ssf(self) -> tuple[Quantity, ...]:
         """Summarise the SSF by centre, widths and angle; also each Gaussian, unless it is a free form."""
-        return ssf_quantities(self.samples, self.n_gaussians, each=not self.free_form)
+        return ssf_quantities(self.samples, self.n_gaussians, each=not self.is_free_form)
 
     def summary(self) -> str:
         """Describe the sensor in plain text."""
         unit, n = self.instrumentation.unit, self.n_gaussians
-        bending = frozenset(mixture_names(n)[6:] if self.free_form else ())  # twenty Gaussians would not be readable
+        bending = frozenset(mixture_names(n)[6:] if self.is_free_form else ())  # twenty Gaussians would not be readable
         form = "an SSF of free form" if bending else f"{n} Gaussian{'s' if n > 1 else ''}"
         lines = [
             f"{form}, {len(self.samples)} posterior samples"
-            + (f", with {', '.join(self._how_often(name) for name in self.effects)}" if self.effects else ""),
+            + (
+                f", with {', '.join(self._effect_with_frequency(name) for name in self.effects)}"
+                if self.effects
+                else ""
+            ),
             f"noise of a new reading  {self.noise_sd.mean():.4g} ± {self.noise_sd.std():.2g} {unit}",
         ]
         if self.orders:
@@ -240,7 +250,7 @@ class FittedSensor(NamedSamples):
         rows += [(name, median[name], interval[name]) for name in told]
         return "\n".join([*lines, *interval_table(rows), *(f"note: {note}" for note in self.notes)])
 
-    def _how_often(self, effect: str) -> str:
+    def _effect_with_frequency(self, effect: str) -> str:
         share = 1.0 - self.absent[effect].mean() if effect in self.absent else 1.0
         return effect if share == 1.0 else f"{effect} in {share:.0%} of them"
 
@@ -305,7 +315,7 @@ class FittedSensor(NamedSamples):
         FileError
             If the text is damaged, incomplete, or of another format or version.
         """
-        document = json_of(path, _GAIN_STEP.sub('"gain_jump', text), _ALLOWED)
+        document = parse_json_file_text(path, _GAIN_STEP.sub('"gain_jump', text), _ALLOWED)
         found = document.get("format") if isinstance(document, dict) else None
         if found != FORMAT:
             raise FileError(
@@ -315,24 +325,26 @@ class FittedSensor(NamedSamples):
         samples = read.array("samples", ndim=2)
         try:
             sensor = cls(
-                names=tuple(_text(read, p, "name", "parameters") for p in read.items("parameters")),
+                names=tuple(_text_of_item(read, p, "name", "parameters") for p in read.items("parameters")),
                 samples=samples,
-                n_gaussians=read.whole("n_gaussians"),
+                n_gaussians=read.whole_number("n_gaussians"),
                 noise_sd=read.array("noise", "sd", ndim=1),
                 field=SSFField(
                     read.array("field", "values", ndim=2),
                     read.number("field", "pixel_mm"),
-                    _pair(read.array("field", "origin_mm", ndim=1), read),
+                    _require_pair(read.array("field", "origin_mm", ndim=1), read),
                 ),
-                instrumentation=_instrumentation(read),
+                instrumentation=_read_instrumentation(read),
                 effects=tuple(read.texts("effects")),
                 patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
-                absent={name: read.marks(len(samples), "absent", name) for name in document.get("absent", {})},
-                scan_noise=tuple(_record(read, ScanNoise, s, "noise.scans") for s in read.items("noise", "scans")),
+                absent={name: read.mask(len(samples), "absent", name) for name in document.get("absent", {})},
+                scan_noise=tuple(
+                    _dataclass_of_item(read, ScanNoise, s, "noise.scans") for s in read.items("noise", "scans")
+                ),
                 fingerprint=read.text("recording", "fingerprint"),
                 source=read.text("recording", "source"),
-                orders=tuple(_record(read, OrderEvidence, o, "orders") for o in read.items("orders")),
-                priors=tuple(_record(read, PriorRow, p, "priors") for p in read.items("priors")),
+                orders=tuple(_dataclass_of_item(read, OrderEvidence, o, "orders") for o in read.items("orders")),
+                priors=tuple(_dataclass_of_item(read, PriorRow, p, "priors") for p in read.items("priors")),
                 notes=tuple(read.texts("notes")),
                 version=read.text("version"),
             )
@@ -413,37 +425,37 @@ class _Reader:
             at = at[key]
         return at
 
-    def wrong(self, place: str, found: object, allowed: str) -> FileError:
+    def error_for(self, place: str, found: object, allowed: str) -> FileError:
         return FileError(self.path, f"{place} is {shown(found)}", allowed)
 
     def text(self, *keys: str) -> str:
         found = self.value(*keys)
         if not isinstance(found, str):
-            raise self.wrong(".".join(keys), found, "a text")
+            raise self.error_for(".".join(keys), found, "a text")
         return found
 
     def texts(self, *keys: str) -> list[str]:
         found = self.value(*keys)
         if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
-            raise self.wrong(".".join(keys), found, "a list of texts")
+            raise self.error_for(".".join(keys), found, "a list of texts")
         return found
 
     def items(self, *keys: str) -> list[dict[str, Any]]:
         found = self.value(*keys)
         if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
-            raise self.wrong(".".join(keys), found, "a list of objects")
+            raise self.error_for(".".join(keys), found, "a list of objects")
         return found
 
     def number(self, *keys: str) -> float:
         found = self.value(*keys)
         if isinstance(found, bool) or not isinstance(found, int | float) or not math.isfinite(found):
-            raise self.wrong(".".join(keys), found, "a finite number")
+            raise self.error_for(".".join(keys), found, "a finite number")
         return float(found)
 
-    def whole(self, *keys: str) -> int:
+    def whole_number(self, *keys: str) -> int:
         found = self.value(*keys)
         if isinstance(found, bool) or not isinstance(found, int):
-            raise self.wrong(".".join(keys), found, "a whole number")
+            raise self.error_for(".".join(keys), found, "a whole number")
         return found
 
     def array(self, *keys: str, ndim: int) -> FloatArray:
@@ -451,35 +463,35 @@ class _Reader:
         try:
             array = np.array(found, dtype=np.float64)
         except (TypeError, ValueError) as error:
-            raise self.wrong(".".join(keys), found, f"numbers in {ndim} equal dimensions") from error
+            raise self.error_for(".".join(keys), found, f"numbers in {ndim} equal dimensions") from error
         if array.ndim != ndim or not np.isfinite(array).all():
-            raise self.wrong(".".join(keys), found, f"finite numbers in {ndim} equal dimensions")
+            raise self.error_for(".".join(keys), found, f"finite numbers in {ndim} equal dimensions")
         return array
 
-    def marks(self, n: int, *keys: str) -> BoolArray:
+    def mask(self, n: int, *keys: str) -> BoolArray:
         """Read a list of row numbers as a mask, (n,)."""
         found = self.array(*keys, ndim=1)
         if not np.isin(found, np.arange(n)).all():
-            raise self.wrong(".".join(keys), found.tolist(), f"whole numbers from 0 to {n - 1}")
+            raise self.error_for(".".join(keys), found.tolist(), f"whole numbers from 0 to {n - 1}")
         out = np.zeros(n, dtype=np.bool_)
         out[found.astype(np.int64)] = True
         return out
 
 
-def _text(read: _Reader, item: Mapping[str, Any], key: str, place: str) -> str:
+def _text_of_item(read: _Reader, item: Mapping[str, Any], key: str, place: str) -> str:
     found = item.get(key)
     if not isinstance(found, str):
-        raise read.wrong(f"{place}.{key}", found, "a text")
+        raise read.error_for(f"{place}.{key}", found, "a text")
     return found
 
 
-def _pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
+def _require_pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
     if values.shape != (2,):
-        raise read.wrong("field.origin_mm", values.tolist(), "two numbers")
+        raise read.error_for("field.origin_mm", values.tolist(), "two numbers")
     return float(values[0]), float(values[1])
 
 
-def _record(read: _Reader, kind: type[T], item: Mapping[str, Any], place: str) -> T:
+def _dataclass_of_item(read: _Reader, kind: type[T], item: Mapping[str, Any], place: str) -> T:
     """Build a dataclass of texts, numbers and counts, checked by the types of its fields."""
     kinds: dict[str, type | tuple[type, ...]] = {"str": str, "int": int, "float": (int, float)}
     values: dict[str, object] = {}
@@ -487,12 +499,12 @@ def _record(read: _Reader, kind: type[T], item: Mapping[str, Any], place: str) -
         found = item.get(field.name)
         wrong = isinstance(found, bool) or not isinstance(found, kinds[str(field.type)])
         if wrong or (isinstance(found, int | float) and not math.isfinite(found)):
-            raise read.wrong(f"{place}.{field.name}", found, f"a value of kind {field.type}")
+            raise read.error_for(f"{place}.{field.name}", found, f"a value of kind {field.type}")
         values[field.name] = found
     return kind(**values)
 
 
-def _instrumentation(read: _Reader) -> Instrumentation:
+def _read_instrumentation(read: _Reader) -> Instrumentation:
     def optional(key: str) -> float | None:
         return None if read.value("instrumentation", key) is None else read.number("instrumentation", key)
 

@@ -1,8 +1,8 @@
-"""A density to start from where all Gaussians hold much of the light: a Student-t about the posterior below.
+"""A start density for the part of a posterior where all Gaussians are bright: a Student-t fitted to the order below.
 
-Where N Gaussians share the light of one footprint, its moments are those that N - 1 Gaussians have; of what is left,
-each Gaussian's share, place and width, the readings say little. Such a part of the posterior is broad, is far from
-that of N - 1 Gaussians with a faint one more, and has no peak of its own.
+Where N Gaussians share the light of one footprint, its moments are those that N - 1 Gaussians have. The readings
+contain little information on the rest: each Gaussian's share, place and width. Such a part of the posterior is broad,
+far from that of N - 1 Gaussians with a faint one more, and has no peak of its own.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.known_density import independent_proposal
 from probewise.calibration.peak_density import StudentTDensity
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.start_density import propose_independently
 from probewise.calibration.whole_coordinates import WholeCoordinates
 
 # Of the others' log ratios to the heaviest: mean and sd; in units of the whole: variance of places, sd of the logs.
@@ -26,18 +26,18 @@ _WIDENED = 2.0
 
 @dataclass(frozen=True, eq=False)
 class SharedLightDensity:
-    """A Student-t in coordinates of the whole: a `KnownDensity`."""
+    """A Student-t in `WholeCoordinates`: a `StartDensity`."""
 
     space: WholeCoordinates
     one: StudentTDensity
 
     @classmethod
-    def of(cls, space: WholeCoordinates, fewer: FloatArray) -> SharedLightDensity:
-        """Make it of N Gaussians from samples of N - 1 in coordinates of their whole, (n, 6 N - 4)."""
+    def from_samples_below(cls, space: WholeCoordinates, fewer: FloatArray) -> SharedLightDensity:
+        """Make the density of N Gaussians from samples `fewer` of N - 1 in their `WholeCoordinates`, (n, 6 N - 4)."""
         d = fewer.shape[1] + 6
         own, last = np.r_[: d - 8, d - 2, d - 1], np.arange(d - 8, d - 2)
         mean, covariance = fewer.mean(axis=0), _WIDENED**2 * np.cov(fewer, rowvar=False)
-        # No reading tells the light of all.
+        # The readings do not depend on the total light.
         covariance[0] = covariance[:, 0] = 0.0
         mean[0], covariance[0, 0] = _LOG_LIGHT, _LOG_LIGHT_SD**2
         middle, root = np.empty(d), np.zeros((d, d))
@@ -52,17 +52,17 @@ class SharedLightDensity:
         """The prior of N Gaussians."""
         return self.space.prior
 
-    def log_over_prior(self, theta: FloatArray) -> FloatArray:
+    def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
         """Log density over the prior's sorted one, (n, 6 N + 2) -> (n,)."""
         x = self.space.enter(theta)
         return np.asarray(self.one.log_density(x) - self.space.leave(x)[1])
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw as many as there are rows in `rest`, (n, 6 N + 2); nan where outside the prior."""
+        """Draw one for each row of `rest`, (n, 6 N + 2); nan where outside the prior."""
         theta, log_prior = self.space.leave(self.one.draw(len(rest), rng))
         theta[~np.isfinite(log_prior)] = np.nan
         return theta
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose draws of it, as `independent_proposal` says."""
-        return independent_proposal(self, here, rng=rng)
+        """Propose a draw for each particle; see `propose_independently`."""
+        return propose_independently(self, here, rng=rng)

@@ -37,13 +37,13 @@ def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) 
         Whether to summarise each of several Gaussians too.
     """
     f = footprint_of(samples[:, : 6 * n_gaussians], n_gaussians)
-    found = _quantities("", *_whole_moments(f))
+    found = _quantities_of_moments("", *_whole_moments(f))
     if n_gaussians > 1 and each:
         for k in range(n_gaussians):
             prefix = f"gaussian_{k + 1}."
             own = (f.u_mm, f.v_mm, f.var_u, f.var_v, f.cov_uv)
-            found += (_quantity(f"{prefix}share", "1", f.weight[:, 0, k]),)
-            found += _quantities(prefix, *(values[:, 0, k] for values in own))
+            found += (_quantity_of_samples(f"{prefix}share", "1", f.weight[:, 0, k]),)
+            found += _quantities_of_moments(prefix, *(values[:, 0, k] for values in own))
     return found
 
 
@@ -55,7 +55,7 @@ def _whole_moments(f: Footprint) -> tuple[FloatArray, ...]:
     return u, v, *((f.weight[:, 0] * (own[:, 0] + off)).sum(axis=-1) for own, off in spread)
 
 
-def _quantities(
+def _quantities_of_moments(
     prefix: str, u: FloatArray, v: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[Quantity, ...]:
     middle, half = (var_u + var_v) / 2, np.hypot((var_u - var_v) / 2, cov_uv)
@@ -64,14 +64,14 @@ def _quantities(
     about = 0.5 * np.angle(np.exp(2j * angle).mean())
     unwrapped = about + (angle - about + np.pi / 2) % np.pi - np.pi / 2
     return (
-        _quantity(f"{prefix}centre_u_mm", "mm", u),
-        _quantity(f"{prefix}centre_v_mm", "mm", v),
-        _quantity(f"{prefix}sd_long_mm", "mm", np.sqrt(middle + half)),
-        _quantity(f"{prefix}sd_short_mm", "mm", np.sqrt(np.maximum(middle - half, 0.0))),
-        _quantity(f"{prefix}angle_deg", "degree", np.degrees(unwrapped)),
+        _quantity_of_samples(f"{prefix}centre_u_mm", "mm", u),
+        _quantity_of_samples(f"{prefix}centre_v_mm", "mm", v),
+        _quantity_of_samples(f"{prefix}sd_long_mm", "mm", np.sqrt(middle + half)),
+        _quantity_of_samples(f"{prefix}sd_short_mm", "mm", np.sqrt(np.maximum(middle - half, 0.0))),
+        _quantity_of_samples(f"{prefix}angle_deg", "degree", np.degrees(unwrapped)),
     )
 
 
-def _quantity(name: str, unit: str, values: FloatArray) -> Quantity:
+def _quantity_of_samples(name: str, unit: str, values: FloatArray) -> Quantity:
     low, median, high = (float(q) for q in np.quantile(values, [0.025, 0.5, 0.975]))
     return Quantity(name, unit, median, (low, high))

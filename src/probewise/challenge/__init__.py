@@ -4,29 +4,41 @@ The paper judges a sensor model by the inferences made with it (section "Efficac
 judged here the same way, on recordings of an independent simulator whose truth it never sees.
 """
 
-from probewise.challenge.case import Investigated, Task, run_case
-from probewise.challenge.confusion import confusion
+from probewise.challenge.case import RunCaseInRounds, Task, run_case
+from probewise.challenge.confusion import confusion_counts
 from probewise.challenge.estimates import Estimate
 from probewise.challenge.null_refit import NullRefit
-from probewise.challenge.reliability import Bin, calibration_error, reliability
+from probewise.challenge.reliability import Bin, calibration_error, reliability_bins
 from probewise.challenge.rounds import score_rounds
 from probewise.challenge.run import run_challenge
-from probewise.challenge.table import Decision, Row, by_effect, score
+from probewise.challenge.table import Decision, Row, detected_and_named_by_effect, score
 
 __all__ = [
     "Bin",
     "Decision",
     "Estimate",
-    "Investigated",
     "NullRefit",
     "Row",
+    "RunCaseInRounds",
     "Task",
-    "by_effect",
     "calibration_error",
-    "confusion",
-    "reliability",
+    "confusion_counts",
+    "detected_and_named_by_effect",
+    "reliability_bins",
     "run_case",
     "run_challenge",
     "score",
     "score_rounds",
 ]
+
+confusion = confusion_counts
+"""The old name of `confusion_counts`."""
+
+by_effect = detected_and_named_by_effect
+"""The old name of `detected_and_named_by_effect`."""
+
+Investigated = RunCaseInRounds
+"""The old name of `RunCaseInRounds`."""
+
+reliability = reliability_bins
+"""The old name of `reliability_bins`."""

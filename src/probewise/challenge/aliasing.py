@@ -22,7 +22,7 @@ _STARTS = 3  # variants of an effect of a pair that are refitted
 _LIKE_AN_SSF = ("halo", "edge_blur")  # aliases of these may be an SSF with one more Gaussian
 
 
-def cosines(
+def cosines_with_vocabulary(
     refit: NullRefit,
     clean: Recording,
     changed: Recording,
@@ -55,15 +55,15 @@ def cosines(
         effect = kind.for_extent(extent)
         if effect is None or effect.stage is Stage.NOISE:
             continue
-        templates, explained = _explained_by_entry(problem, found, effect, usable)
+        templates, explained = _templates_and_explained_squares(problem, found, effect, usable)
         best = int(np.argmax(explained))
         rho = float(np.sqrt(min(explained[best] / float(problem.residual @ problem.residual), 1.0)))
         if rho > _WORTH_A_REFIT:
             adjusted = refit.without_null_residuals(clean, changed)
-            rho = _cosine(found, _with_effect(problem, found, effect, templates, best, adjusted))
+            rho = _cosine_of_fits(found, _refit_with_effect(problem, found, effect, templates, best, adjusted))
         out[name] = rho
     if max(out.get(name, 0.0) for name in _LIKE_AN_SSF) > _WORTH_A_REFIT:
-        out["ssf_order"] = _cosine(found, refit.with_one_more(found, clean, changed))
+        out["ssf_order"] = _cosine_of_fits(found, refit.with_one_more_gaussian(found, clean, changed))
     return out
 
 
@@ -94,17 +94,17 @@ def residual_with_one_named(
         effect = VOCABULARY[name].for_extent(Extent.of(clean))
         fits = [found]
         if effect is not None:
-            templates, explained = _explained_by_entry(problem, found, effect, usable)
+            templates, explained = _templates_and_explained_squares(problem, found, effect, usable)
             best = {
                 int(templates.choice[k]): int(k) for k in np.argsort(explained)
             }  # fits of each variant, the best last
             starts = [*best.values()][-_STARTS:]
-            fits += [_with_effect(problem, found, effect, templates, at, adjusted) for at in starts]
+            fits += [_refit_with_effect(problem, found, effect, templates, at, adjusted) for at in starts]
         out[name] = min(float(np.linalg.norm(by.residuals)) for by in fits)
     return out
 
 
-def _explained_by_entry(
+def _templates_and_explained_squares(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
 ) -> tuple[EffectTemplates, FloatArray]:
     """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
@@ -113,7 +113,7 @@ def _explained_by_entry(
     return templates, np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
 
 
-def _with_effect(
+def _refit_with_effect(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], templates: EffectTemplates, at: int, adjusted: Recording
 ) -> Fit:
     """Refit the null and an effect from an entry of its bank."""
@@ -129,7 +129,7 @@ def _with_effect(
     return fit(model, adjusted, start_z, white_noise(len(found.residuals), least=floor), tolerance=0.02)
 
 
-def _cosine(found: Fit, by: Fit) -> float:
+def _cosine_of_fits(found: Fit, by: Fit) -> float:
     """Return the square root of the share of one fit's residual sum of squares that another fit explains."""
     left = float(by.residuals @ by.residuals) / float(found.residuals @ found.residuals)
     return float(np.sqrt(np.clip(1 - left, 0.0, 1.0)))

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from probewise.challenge.aliasing import cosines, residual_with_one_named
+from probewise.challenge.aliasing import cosines_with_vocabulary, residual_with_one_named
 from probewise.challenge.coverage import place_overlap, sensor_truths_and_intervals, truths_and_intervals
-from probewise.challenge.held_out import log_densities
+from probewise.challenge.held_out import log_densities_of_scans
 from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
 from probewise.errors import DoubtfulResultWarning, ProbewiseError
 from probewise.investigation import investigate
 from probewise.recordings.plan import Plan, Recording
-from probewise.world.challenge import Case, EffectSizer, Hidden, draw_case, stratum_of
+from probewise.world.challenge import Case, EffectSizer, HiddenEffect, draw_case, stratum_of
 from probewise.world.challenge.effect_samplers import CleanSetup
 from probewise.world.concealed import Disturbs, Quantisation
 
@@ -46,7 +46,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Investigated:
+class RunCaseInRounds:
     """A function that runs a case in up to `rounds` rounds: record, diagnose, then take the advised readings.
 
     It is a dataclass instead of a closure, so that it can be pickled for another process.
@@ -105,7 +105,7 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
     }
 
 
-def _concealed_effects(hidden: Sequence[Hidden], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
+def _concealed_effects(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
     """Describe the effects; for a pair also "size_beside", the size of each effect when the other is in the model."""
     each = [_effect_result(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
@@ -116,11 +116,11 @@ def _concealed_effects(hidden: Sequence[Hidden], sizer: EffectSizer, refit: Null
     return each
 
 
-def _effect_result(hidden: Hidden, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
+def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -> dict[str, Any]:
     """Describe one effect; "cosines" holds similar effects in this plan, by name, with their cosines."""
     # The world counts rounding apart from noise, but the diagnosis names it among the noise effects.
     on_noise = isinstance(hidden.effect, Disturbs | Quantisation)
-    like = {} if on_noise else cosines(refit, sizer.clean, sizer.recording(hidden.effect))
+    like = {} if on_noise else cosines_with_vocabulary(refit, sizer.clean, sizer.recording(hidden.effect))
     return {
         "name": hidden.name,
         "size_lambda": hidden.size_lambda,
@@ -145,7 +145,7 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
         "parameters": {h.name: truths_and_intervals(h.parameters, found[h.name]) for h in named},
         "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
-        "held_out": log_densities(case, diagnosis, rng=files),
+        "held_out": log_densities_of_scans(case, diagnosis, rng=files),
         "settled": _diagnosed_after_advice(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
         "cpu_s": cpu_s,
     }

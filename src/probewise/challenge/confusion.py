@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise.challenge.scoring import NOISE, acts_on_mean, effects_to_name, leading, names_match
+from probewise.challenge.scoring import NOISE, acts_on_mean, effects_to_name, leading_hypothesis, names_match
 from probewise.world.challenge import SINGLES
 
 OUTSIDE, SEVERAL = "outside", "several"
 
 
-def confusion(
+def confusion_counts(
     results: Sequence[Mapping[str, Any]], *, label: Callable[[str], str] = str
 ) -> tuple[tuple[str, ...], tuple[str, ...], IntArray]:
     """Count answers by truth, for cases that conceal nothing, one effect, or one outside the vocabulary.
@@ -42,7 +42,7 @@ def confusion(
 
 
 def _stated_name(result: Mapping[str, Any], truth: str) -> str:
-    names = leading(result, clean=True)[0]
+    names = leading_hypothesis(result, clean=True)[0]
     if acts_on_mean(result):
         names = tuple(name for name in names if name not in NOISE)
     if truth not in ("clean", OUTSIDE) and names_match(

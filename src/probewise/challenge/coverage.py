@@ -41,7 +41,7 @@ def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str
     """
     mean, covariance = world.spot.moments()
     n_ssf = 6 * samples.n_gaussians
-    of_samples = _moments(samples.theta[:, :n_ssf], samples.n_gaussians)
+    of_samples = _footprint_moments(samples.theta[:, :n_ssf], samples.n_gaussians)
     truths = {
         "u_mm": mean[0],
         "v_mm": mean[1],
@@ -58,7 +58,7 @@ def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str
     }
 
 
-def _moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
+def _footprint_moments(theta: FloatArray, n_gaussians: int) -> FloatArray:
     """Return means, variances and covariance of the whole mixture, (n_samples, 5)."""
     f = footprint_of(theta, n_gaussians)
 

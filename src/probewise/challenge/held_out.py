@@ -13,10 +13,12 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.effects.density import log_gaussian_density
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
-from probewise.world.challenge import NO_PHYSICS, Case, held_out
+from probewise.world.challenge import NO_PHYSICS, Case, held_out_recordings
 
 
-def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator) -> dict[str, dict[str, float]]:
+def log_densities_of_scans(
+    case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator
+) -> dict[str, dict[str, float]]:
     """Return the log predictive density of each held-out scan under four models, in nats.
 
     "null" and "repaired" are the sensors that `probewise diagnose` writes. "right", if all concealed effects are in the
@@ -36,7 +38,7 @@ def log_densities(case: Case, diagnosis: Diagnosis, *, rng: np.random.Generator)
     if showing and len(showing) == len(case.truth.hidden):
         with suppress(ParameterError):  # under a model with dropouts, none of these readings was lost
             models["right"] = model_with(case.recording, showing, rng=fitting)
-    scans = held_out(case)
+    scans = held_out_recordings(case)
     scores: dict[str, dict[str, float]] = {}
     for (name, samples), child in zip(models.items(), drawing, strict=False):
         if name == "repaired" and samples is diagnosis.null:  # nothing is concealed: the right model is the null

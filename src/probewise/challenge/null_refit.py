@@ -39,9 +39,9 @@ class NullRefit:
         null = self.null(clean)
         return _white_noise_fit(null.model, self.without_null_residuals(clean, changed), null.z)
 
-    def with_one_more(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
+    def with_one_more_gaussian(self, found: Fit, clean: Recording, changed: Recording) -> Fit:
         """Refit the same readings with one Gaussian more than `refit`, which is not a physical effect."""
-        fits = _with_one_more(found, self.without_null_residuals(clean, changed), Extent.of(clean))
+        fits = _fits_with_one_more_gaussian(found, self.without_null_residuals(clean, changed), Extent.of(clean))
         return min(fits, key=lambda f: float(np.linalg.norm(f.residuals)))
 
     def without_null_residuals(self, clean: Recording, changed: Recording) -> Recording:
@@ -66,7 +66,7 @@ def _best_order(clean: Recording) -> Fit:
     )
     best, best_log_z = found, weigh(found, noise).log_z
     for _ in range(_MOST_GAUSSIANS - 1):
-        found = min(_with_one_more(found, clean, extent), key=lambda f: f.objective)
+        found = min(_fits_with_one_more_gaussian(found, clean, extent), key=lambda f: f.objective)
         log_z = weigh(found, noise).log_z
         if log_z > best_log_z:
             best, best_log_z = found, log_z
@@ -75,7 +75,7 @@ def _best_order(clean: Recording) -> Fit:
     return best
 
 
-def _with_one_more(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
+def _fits_with_one_more_gaussian(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
     """Fit with one more Gaussian, starting from every way to split the heaviest."""
     wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
     for z in start_with_more_gaussians(found.model.sensor, found.z, wanted):

@@ -57,7 +57,7 @@ def oracle_set_size(hidden: Hidden) -> float:
     return float(np.mean(inside.sum(axis=1) - np.maximum(n_right - 1, 0)))
 
 
-def readings_by_repeating(result: Mapping[str, Any]) -> float:
+def readings_to_separate_alias(result: Mapping[str, Any]) -> float:
     """Return how many readings of the same plan would separate an aliased pair by 3 nats (inf if identical)."""
     size, rho = float(result["hidden"][0]["size_lambda"]), float(result["cosine"])
     apart = size**2 * (1 - rho**2) / 2

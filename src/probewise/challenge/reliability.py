@@ -23,10 +23,10 @@ class Bin:
     right: Estimate
 
 
-def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
+def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
     """Bin cases by the probability of their leading hypothesis into ten bins; empty bins are left out."""
     said = [leading_probability(result) for result in results]
-    of_case = _bins_of(np.array([p for p, _ in said]))
+    of_case = _bin_numbers(np.array([p for p, _ in said]))
     return tuple(
         Bin(
             float(np.mean([p for (p, _), at in zip(said, of_case, strict=True) if at == k])),
@@ -39,16 +39,17 @@ def reliability(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
 def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
     """Estimate the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
     found = bootstrapped(
-        np.array([leading_probability(result) for result in results], dtype=np.float64).reshape(-1, 2), _error_of_rows
+        np.array([leading_probability(result) for result in results], dtype=np.float64).reshape(-1, 2),
+        _calibration_error_of_rows,
     )
     return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found
 
 
-def _error_of_rows(said: FloatArray) -> float:
+def _calibration_error_of_rows(said: FloatArray) -> float:
     """Return the calibration error of rows (probability, right or not), (n, 2)."""
-    off = np.bincount(_bins_of(said[:, 0]), said[:, 0] - said[:, 1])
+    off = np.bincount(_bin_numbers(said[:, 0]), said[:, 0] - said[:, 1])
     return float(np.abs(off).sum()) / len(said)
 
 
-def _bins_of(probability: FloatArray) -> IntArray:
+def _bin_numbers(probability: FloatArray) -> IntArray:
     return np.clip(np.searchsorted(_EDGES, probability, side="right") - 1, 0, len(_EDGES) - 2)

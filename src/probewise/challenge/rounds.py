@@ -9,13 +9,13 @@ import numpy as np
 
 from probewise.challenge.estimates import Estimate, mean, share
 from probewise.challenge.scoring import Result, acts_on_mean, credible_set_covers, has_false_extra, leading_name_right
-from probewise.challenge.table import Row, names_physics, rejection_rate, singles_of
+from probewise.challenge.table import Row, cases_with_one_effect, names_effect_on_mean, rejection_rate
 
 _BOOTSTRAPS = 2000
 
 
 def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
-    """Score the results of `Investigated`: one row per target after the last round and, below it, after the first."""
+    """Score the results of `RunCaseInRounds`: a row per target after the last round and, below it, after the first."""
     last = [r for r in results if "failed" not in r]
     first = [r | r["rounds"][0] for r in last]
     return (
@@ -26,16 +26,18 @@ def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
             last, first, "right name first, lambda 12", lambda rs: _share_named(rs, 12.0), least=0.995
         ),
         *_rows_before_and_after(
-            last, first, "size of the credible set, lambda 8", lambda rs: _set_size(rs, 8.0), most=1.15
+            last, first, "size of the credible set, lambda 8", lambda rs: _mean_set_size(rs, 8.0), most=1.15
         ),
         *_rows_before_and_after(
-            last, first, "size of the credible set, lambda 12", lambda rs: _set_size(rs, 12.0), most=1.05
+            last, first, "size of the credible set, lambda 12", lambda rs: _mean_set_size(rs, 12.0), most=1.05
         ),
-        *_rows_before_and_after(last, first, "95 % credible set holds the truth", _share_covered, least=0.95),
+        *_rows_before_and_after(
+            last, first, "95 % credible set holds the truth", _share_of_sets_with_truth, least=0.95
+        ),
         *_rows_before_and_after(last, first, "detection, alpha .01, lambda 8", _share_detected, least=0.995),
-        *_rows_before_and_after(last, first, "two effects: both named", _pairs_named, least=0.96),
-        *_rows_before_and_after(last, first, "two effects: a false extra", _pairs_extra, most=0.03),
-        *_rows_before_and_after(last, first, "physics named, clean", _physics_on_clean, most=0.005),
+        *_rows_before_and_after(last, first, "two effects: both named", _share_of_pairs_named, least=0.96),
+        *_rows_before_and_after(last, first, "two effects: a false extra", _share_of_pairs_with_false_extra, most=0.03),
+        *_rows_before_and_after(last, first, "physics named, clean", _share_of_clean_with_effect_named, most=0.005),
         Row("extra readings, median of those not settled at once", _median_further_readings(last), most=80.0),
         Row("settled at last", share([r["rounds"][-1]["settled"] for r in last])),
         Row("processor time of an investigation (s)", mean([r["cpu_s"] for r in last])),
@@ -56,35 +58,35 @@ def _rows_before_and_after(
 
 
 def _share_named(results: list[Result], size: float) -> Estimate:
-    return share([leading_name_right(r) for r in singles_of(results, size)])
+    return share([leading_name_right(r) for r in cases_with_one_effect(results, size)])
 
 
-def _set_size(results: list[Result], size: float) -> Estimate:
-    return mean([float(len(r["credible_set"])) for r in singles_of(results, size)])
+def _mean_set_size(results: list[Result], size: float) -> Estimate:
+    return mean([float(len(r["credible_set"])) for r in cases_with_one_effect(results, size)])
 
 
-def _share_covered(results: list[Result]) -> Estimate:
+def _share_of_sets_with_truth(results: list[Result]) -> Estimate:
     return share([credible_set_covers(r, merged=False) for r in results])
 
 
 def _share_detected(results: list[Result]) -> Estimate:
-    return rejection_rate([r for r in singles_of(results, 8.0) if acts_on_mean(r)], 0.01)
+    return rejection_rate([r for r in cases_with_one_effect(results, 8.0) if acts_on_mean(r)], 0.01)
 
 
 def _pair_results(results: list[Result]) -> list[Result]:
     return [r for r in results if r["kind"] == "pair"]
 
 
-def _pairs_named(results: list[Result]) -> Estimate:
+def _share_of_pairs_named(results: list[Result]) -> Estimate:
     return share([leading_name_right(r) for r in _pair_results(results)])
 
 
-def _pairs_extra(results: list[Result]) -> Estimate:
+def _share_of_pairs_with_false_extra(results: list[Result]) -> Estimate:
     return share([has_false_extra(r) for r in _pair_results(results)])
 
 
-def _physics_on_clean(results: list[Result]) -> Estimate:
-    return share([names_physics(r) for r in results if r["kind"] == "clean"])
+def _share_of_clean_with_effect_named(results: list[Result]) -> Estimate:
+    return share([names_effect_on_mean(r) for r in results if r["kind"] == "clean"])
 
 
 def _median_further_readings(results: list[Result]) -> Estimate:

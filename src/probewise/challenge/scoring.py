@@ -64,12 +64,12 @@ def names_match(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> bool:
 def credible_set_covers(result: Result, *, merged: bool) -> bool:
     """Return whether the credible set holds the truth; `merged`: whether an alias of an effect will do."""
     wanted = effects_to_name(result, merged=merged)
-    return any(names_match(names_of(label), wanted) for label in result["credible_set"])
+    return any(names_match(names_in_label(label), wanted) for label in result["credible_set"])
 
 
 def has_false_extra(result: Result) -> bool:
     """Return whether the leading hypothesis names an effect on the mean that is neither the truth nor an alias."""
-    named = [name for name in leading(result, clean=True)[0] if name not in NOISE]
+    named = [name for name in leading_hypothesis(result, clean=True)[0] if name not in NOISE]
     return count_extras(named, effects_to_name(result, merged=True, noise=False)) > 0
 
 
@@ -82,7 +82,7 @@ def count_extras(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
     return len(names) - most
 
 
-def is_physics(result: Result) -> bool:
+def is_distinguishable_from_ssf(result: Result) -> bool:
     """Return whether a concealed effect can be told from one more Gaussian in the SSF with this many readings."""
     return any(not right & NO_PHYSICS for right in effects_to_name(result, merged=True))
 
@@ -97,7 +97,7 @@ def acts_on_mean(result: Result) -> bool:
     return not any(h["on_noise"] for h in result["hidden"])
 
 
-def leading(result: Result, *, clean: bool) -> tuple[Names, float]:
+def leading_hypothesis(result: Result, *, clean: bool) -> tuple[Names, float]:
     """Return the most probable hypothesis and its probability; `clean`: whether the clean one is included."""
     options = [(tuple(names), p) for names, p in result["hypotheses"] if names or clean]
     return max(options, key=lambda option: option[1], default=((), 0.0))
@@ -110,8 +110,8 @@ def leading_name_right(result: Result) -> bool:
     clean is right too.
     """
     if not acts_on_mean(result):
-        return names_match(leading(result, clean=False)[0], effects_to_name(result, merged=True))
-    due = is_physics(result)
+        return names_match(leading_hypothesis(result, clean=False)[0], effects_to_name(result, merged=True))
+    due = is_distinguishable_from_ssf(result)
     joined: dict[Names, float] = {}
     for names, p in result["hypotheses"]:
         key = tuple(name for name in names if name not in NOISE)
@@ -123,10 +123,10 @@ def leading_name_right(result: Result) -> bool:
 
 def leading_probability(result: Result) -> tuple[float, bool]:
     """Return the probability of the leading hypothesis, which may be clean, and whether it is exactly the truth."""
-    names, probability = leading(result, clean=True)
+    names, probability = leading_hypothesis(result, clean=True)
     return probability, names_match(names, effects_to_name(result, merged=False))
 
 
-def names_of(label: str) -> Names:
+def names_in_label(label: str) -> Names:
     """Split a label of a credible set into names."""
     return () if label == "clean" else tuple(label.split("+"))

@@ -16,7 +16,7 @@ from probewise.challenge.oracle_baseline import (
     oracle_covariate_rate,
     oracle_name_rate,
     oracle_set_size,
-    readings_by_repeating,
+    readings_to_separate_alias,
 )
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
@@ -26,13 +26,13 @@ from probewise.challenge.scoring import (
     credible_set_covers,
     effects_to_name,
     has_false_extra,
+    is_distinguishable_from_ssf,
     is_out_of_vocabulary,
-    is_physics,
-    leading,
+    leading_hypothesis,
     leading_name_right,
     leading_probability,
+    names_in_label,
     names_match,
-    names_of,
 )
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
@@ -90,9 +90,9 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
     )
 
 
-def by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
+def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -> dict[str, tuple[Estimate, Estimate]]:
     """Estimate, for each effect concealed alone at a size, how often it was detected at alpha .01 and named first."""
-    singles = singles_of([r for r in results if "failed" not in r], size)
+    singles = cases_with_one_effect([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
     return {name: (rejection_rate(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
@@ -107,10 +107,10 @@ def _clean_rows(done: list[Result]) -> list[Row]:
         Row("false alarms, clean, alpha .01", rejection_rate(white, 0.01), 0.006, 0.015),
         Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
         *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
-        Row("physics named, clean", share([names_physics(r) for r in clean]), most=0.005),
+        Row("physics named, clean", share([names_effect_on_mean(r) for r in clean]), most=0.005),
         Row(
             "physics named, one Gaussian more",
-            share([names_physics(r) for r in done if r["kind"] == "ssf_order"]),
+            share([names_effect_on_mean(r) for r in done if r["kind"] == "ssf_order"]),
             most=0.01,
         ),
     ]
@@ -121,24 +121,24 @@ def _detection_rows(done: list[Result]) -> list[Row]:
     rows = [
         Row(
             f"detection, alpha .01, lambda {size:g}",
-            rejection_rate(_distinguishable_from_ssf(singles_of(done, size)), 0.01),
+            rejection_rate(_cases_distinguishable_from_ssf(cases_with_one_effect(done, size)), 0.01),
             least,
         )
         for size, least in targets.items()
     ]
-    each = [detected for detected, _ in by_effect(_distinguishable_from_ssf(done)).values()]
+    each = [detected for detected, _ in detected_and_named_by_effect(_cases_distinguishable_from_ssf(done)).values()]
     worst = min(each, key=lambda e: (e.value, e.high), default=share([]))
     return [*rows, Row("detection, lambda 8, least of all effects", worst, 0.9)]
 
 
 def _naming_rows(done: list[Result]) -> list[Row]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
-    found = {size: share([leading_name_right(r) for r in singles_of(done, size)]) for size in targets}
-    falls = [_difference(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
+    found = {size: share([leading_name_right(r) for r in cases_with_one_effect(done, size)]) for size in targets}
+    falls = [_difference_of_shares(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
     rows = []
     for size, least in targets.items():
-        like = [oracle_name_rate(r["hidden"][0]) for r in singles_of(done, size)]
+        like = [oracle_name_rate(r["hidden"][0]) for r in cases_with_one_effect(done, size)]
         rows.append(Row(f"right name first, lambda {size:g}", found[size], least))
         rows.append(Row(f"  oracle against the hardest rival, lambda {size:g}", mean(like)))
     return [
@@ -147,7 +147,7 @@ def _naming_rows(done: list[Result]) -> list[Row]:
     ]
 
 
-def _difference(before: Estimate, after: Estimate) -> Estimate:
+def _difference_of_shares(before: Estimate, after: Estimate) -> Estimate:
     """Return the difference of two proportions, with Newcombe's interval."""
     fall = before.value - after.value
     down = math.hypot(before.value - before.low, after.high - after.value)
@@ -158,7 +158,7 @@ def _difference(before: Estimate, after: Estimate) -> Estimate:
 def _probability_rows(done: list[Result]) -> list[Row]:
     rows = []
     for size, most in ((8.0, 1.25), (12.0, 1.1)):
-        singles = singles_of(done, size)
+        singles = cases_with_one_effect(done, size)
         like = [oracle_set_size(r["hidden"][0]) for r in singles]
         rows += [
             Row(
@@ -166,27 +166,34 @@ def _probability_rows(done: list[Result]) -> list[Row]:
                 mean([float(len(r["credible_set"])) for r in singles]),
                 most=most,
             ),
-            Row(f"  the truth and its aliases as one, lambda {size:g}", mean([merged_size(r) for r in singles])),
+            Row(
+                f"  the truth and its aliases as one, lambda {size:g}",
+                mean([set_size_with_aliases_merged(r) for r in singles]),
+            ),
             Row(f"  oracle, aliases as one, lambda {size:g}", mean(like)),
         ]
     return [
         Row("95 % credible set holds the truth", share([credible_set_covers(r, merged=False) for r in done]), 0.95),
         *rows,
         Row("expected calibration error", calibration_error(done), most=0.02),
-        Row("wrong name stated above .9", share([confidently_wrong(r) for r in done]), most=0.005),
+        Row("wrong name stated above .9", share([is_confidently_wrong(r) for r in done]), most=0.005),
     ]
 
 
-def merged_size(result: Result) -> float:
+def set_size_with_aliases_merged(result: Result) -> float:
     """Count the hypotheses of a credible set; the right one and its aliases count as one."""
-    right = sum(names_match(names_of(label), effects_to_name(result, merged=True)) for label in result["credible_set"])
+    right = sum(
+        names_match(names_in_label(label), effects_to_name(result, merged=True)) for label in result["credible_set"]
+    )
     return float(len(result["credible_set"]) - max(right - 1, 0))
 
 
 def _place_rows(done: list[Result]) -> list[Row]:
     targets = {12.0: 0.8, 20.0: 0.9}
-    local = {size: [r["overlap"] for r in singles_of(done, size) if r["overlap"] is not None] for size in targets}
-    shown = [r for r in singles_of(done, 8.0) if acts_on_mean(r)]
+    local = {
+        size: [r["overlap"] for r in cases_with_one_effect(done, size) if r["overlap"] is not None] for size in targets
+    }
+    shown = [r for r in cases_with_one_effect(done, 8.0) if acts_on_mean(r)]
     first = [bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
@@ -205,12 +212,12 @@ def _interval_rows(done: list[Result]) -> list[Row]:
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
     sensors = [interval for r in gaussian for interval in r["sensor"].values()]
     return [
-        Row("95 % intervals of effect parameters cover", share_covered(stated_of), 0.93, 0.97),
-        Row("95 % intervals of SSF and levels cover", share_covered(sensors), 0.93),
+        Row("95 % intervals of effect parameters cover", share_of_intervals_with_truth(stated_of), 0.93, 0.97),
+        Row("95 % intervals of SSF and levels cover", share_of_intervals_with_truth(sensors), 0.93),
     ]
 
 
-def share_covered(intervals: list[list[float]]) -> Estimate:
+def share_of_intervals_with_truth(intervals: list[list[float]]) -> Estimate:
     """Estimate the share of intervals, [truth, low, high] each, that cover the truth."""
     return share([low <= truth <= high for truth, low, high in intervals])
 
@@ -253,7 +260,7 @@ def _ratio_of_gains(gains: FloatArray) -> float:
 def _pair_rows(done: list[Result]) -> list[Row]:
     pairs = [r for r in done if r["kind"] == "pair"]
     both = [leading_name_right(r) for r in pairs]
-    shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_its_size(r)]
+    shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_size_beside_other(r)]
     return [
         Row("two effects: both named", share(both), 0.95),
         Row("  where neither hides the other", share(shown)),
@@ -261,7 +268,7 @@ def _pair_rows(done: list[Result]) -> list[Row]:
     ]
 
 
-def _each_keeps_its_size(result: Result) -> bool:
+def _each_keeps_size_beside_other(result: Result) -> bool:
     """Return whether each of two effects keeps at least `_BESIDE` of its size when the other is in the model."""
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
@@ -288,11 +295,11 @@ def _alias_rows(done: list[Result]) -> list[Row]:
     settled = [r | r["settled"] if r["settled"] else r for r in aliased]
     return [
         Row("aliased pair: cannot tell", share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
-        Row("aliased pair: sure of the wrong name", share([confidently_wrong(r) for r in aliased]), most=0.01),
+        Row("aliased pair: sure of the wrong name", share([is_confidently_wrong(r) for r in aliased]), most=0.01),
         Row("right name after the advised readings", share([leading_probability(r)[1] for r in settled]), 0.95),
         Row(
             "  readings advised, of those that repeating the plan needs",
-            mean([r["settled"]["readings"] / readings_by_repeating(r) for r in aliased if r["settled"]]),
+            mean([r["settled"]["readings"] / readings_to_separate_alias(r) for r in aliased if r["settled"]]),
             most=0.25,
         ),
     ]
@@ -310,17 +317,17 @@ def _time_rows(done: list[Result]) -> list[Row]:
     ]
 
 
-def singles_of(done: Sequence[Result], size: float) -> list[Result]:
+def cases_with_one_effect(done: Sequence[Result], size: float) -> list[Result]:
     """List the cases with one effect of this size."""
     return [r for r in done if r["kind"] == "single" and r["size"] == size]
 
 
-def _distinguishable_from_ssf(results: Sequence[Result]) -> list[Result]:
+def _cases_distinguishable_from_ssf(results: Sequence[Result]) -> list[Result]:
     """Keep the cases that should raise an alarm: those that one more Gaussian in the SSF cannot absorb."""
-    return [r for r in _on_mean(results) if is_physics(r)]
+    return [r for r in _cases_with_mean_effects(results) if is_distinguishable_from_ssf(r)]
 
 
-def _on_mean(results: Sequence[Result]) -> list[Result]:
+def _cases_with_mean_effects(results: Sequence[Result]) -> list[Result]:
     """Keep the cases that the p-value tests: effects on the mean."""
     return [r for r in results if acts_on_mean(r)]
 
@@ -330,13 +337,13 @@ def rejection_rate(results: Sequence[Result], alpha: float) -> Estimate:
     return share([r["p_value"] <= alpha for r in results])
 
 
-def names_physics(result: Result) -> bool:
+def names_effect_on_mean(result: Result) -> bool:
     """Return whether an effect on the mean is named."""
     return bool(set(result["combination"]) - NOISE - {"unknown"})
 
 
-def confidently_wrong(result: Result) -> bool:
+def is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong effect is stated above .9; `clean` and `unknown` do not count."""
     probability, right = leading_probability(result)
-    names = leading(result, clean=True)[0]
+    names = leading_hypothesis(result, clean=True)[0]
     return probability > 0.9 and not right and names not in ((), ("unknown",))

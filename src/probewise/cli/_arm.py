@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Literal, Self
 
 from probewise._kinds import did_you_mean
-from probewise.cli._common import CommandError, add_path, caution
+from probewise.cli._common import CommandError, add_path, print_warning
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -110,11 +110,11 @@ def open_emulated(
     The emulator reads its own true geometry: `geometry_file`, or the shipped one.
     """
     from probewise.arm.nxt import Brick, BrickMachine, Link
-    from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up, shipped_geometry
+    from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry
 
     clock = VirtualClock()
     numbers = read_geometry(geometry_file or shipped_geometry())
-    bench = set_up(numbers, world, surface, clock, seed=seed, sleep_min=0)
+    bench = set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
     brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
     machine = BrickMachine(brick, geometry)
     return emulated_arm(machine, geometry, bench, clock=clock, start_s=start_s), bench
@@ -133,7 +133,7 @@ def emulated_arm(
             super().__exit__(kind, error, trace)
             lowest = bench.arm.lowest
             if lowest.height_mm < 0:
-                caution(
+                print_warning(
                     f"the emulated arm's sensor went {-lowest.height_mm:.1f} mm through the table, at "
                     f"({lowest.x_mm:.0f}, {lowest.y_mm:.0f}) mm"
                 )
@@ -151,7 +151,7 @@ def warn_of_clearance(geometry: Geometry) -> None:
         if geometry.accuracy is None
         else "by its [accuracy] the arm may hang lower by"
     )
-    caution(
+    print_warning(
         f"the sensor may touch the table: it reads {geometry.read_height_mm:g} mm above it, and {known} "
         f"{doubt_mm:.0f} mm; fit the geometry (probewise arm fit-geometry), or look how it comes down "
         "(probewise arm jog X,Y --down --steps)"
@@ -163,7 +163,7 @@ def warn_of_place_sd(geometry: Geometry, stop_sd_mm: float) -> None:
     accuracy = geometry.accuracy
     if accuracy is None or accuracy.place_sd_mm < stop_sd_mm:
         return
-    caution(
+    print_warning(
         f"lengths will not be known to {stop_sd_mm:g} mm: the arm knows its place to {accuracy.place_sd_mm:.1f} mm, "
         "which no reading lowers; `probewise arm fit-geometry` does, with more marks or with marks met more closely"
     )
@@ -257,7 +257,7 @@ def require_declared(
 
 def prompter(arm: Instrument) -> Callable[[str], None]:
     """Return a function that prompts a person and waits for Enter, while keeping the arm awake."""
-    answer_to = questioner(arm)
+    answer_to = prompter_for_answer(arm)
 
     def ask(text: str) -> None:
         answer_to(f"{text[0].upper()}{text[1:]}, then press Enter: ")
@@ -273,7 +273,7 @@ def _read_line() -> str:
         return ""
 
 
-def questioner(arm: Instrument) -> Callable[[str], str]:
+def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
     """Return a function that asks a person for a line, while keeping the arm awake."""
     keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
 

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probewise.arm import LegoArm, LegoScale, OwnInstrument, Reading, Request, SimulatedArm
+from probewise.arm import LegoArm, OwnInstrument, Reading, ReadingScale, Request, SimulatedArm
 from probewise.cli._arm import SCENE, ArmName, open_emulated, open_nxt, open_own_instrument
 from probewise.cli._common import DEFAULT_SEED
-from probewise.emulator import Table, parse_scene
+from probewise.emulator import Tabletop, parse_scene
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
 
@@ -47,12 +47,12 @@ class Bench:
         Number of readings of an earlier session, after which the noise continues.
     """
 
-    def __init__(self, world: World, scene: str, *, scale: LegoScale, seed: int, n_taken: int = 0) -> None:
+    def __init__(self, world: World, scene: str, *, scale: ReadingScale, seed: int, n_taken: int = 0) -> None:
         self._world, self._scale, self._seed, self._n_taken = world, scale, seed, n_taken
-        self._table = Table(parse_scene(scene))
+        self._table = Tabletop(parse_scene(scene))
         self._stand: Callable[[], Stand] | None = None
 
-    def simulated(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
+    def open_simulated_arm(self, geometry: Geometry | None, *, start_s: float = 0.0) -> SimulatedArm:
         """Return the simulated arm over the table; its sensor takes any orientation."""
         number = itertools.count(self._n_taken)
 
@@ -65,7 +65,7 @@ class Bench:
         rest = make().pose
         return make(last=Reading(math.nan, rest, start_s))
 
-    def emulated(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
+    def open_emulated_arm(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
         """Return the LEGO arm over the table, on an emulated brick."""
         surface, seed = self._table.surface, self._seed + self._n_taken
         arm, bench = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
@@ -96,7 +96,7 @@ class Bench:
             words.append(f"down {max(min(gap_mm - _TOUCHES_MM / 2, gap_mm / 2 if gap_mm > 8 else gap_mm), 0.2):.1f}")
         return " ".join(words)
 
-    def lay(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
+    def carry_out_request(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if isinstance(request, Request) and request.pattern is not None:
             self._table.surface = moved_pattern(patterns[request.pattern], origin_mm)
@@ -142,11 +142,11 @@ def open_arm(
     world, instrumentation = world_of(sensor)
     if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
-    scale = LegoScale() if instrumentation is None else scale_of(instrumentation)
+    scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
     bench = Bench(world, scene, scale=scale, seed=seed, n_taken=n_taken)
     if chosen.is_lego:
-        return bench.emulated(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
-    return bench.simulated(None if geometry_file is None else geometry, start_s=start_s), bench
+        return bench.open_emulated_arm(geometry, chosen.true_geometry_file(geometry_file), start_s=start_s), bench
+    return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
 
 
 def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:

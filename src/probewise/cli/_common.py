@@ -143,20 +143,22 @@ def positive_number(unit: str) -> Callable[[str], float]:
     return read
 
 
-def say(text: str, *, quiet: bool = False) -> None:
+def print_result(text: str, *, quiet: bool = False) -> None:
     """Write a result to standard output."""
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
 
 
-def caution(text: str) -> None:
+def print_warning(text: str) -> None:
     """Write a warning to standard error, even with --quiet."""
     sys.stderr.write(f"warning: {text}\n")
     sys.stderr.flush()
 
 
-def kept_message(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
+def message_of_kept_results(
+    path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1
+) -> str:
     """Return a message: how much of a run a file holds, and the command that resumes the run."""
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from probewise.cli._common import say
-from probewise.cli._output import Stage, check_out_directory, staged
+from probewise.cli._common import print_result
+from probewise.cli._output import Stage, check_out_directory, staged_output
 from probewise.cli._simulator import read_tables, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -47,12 +47,12 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         drawn = report.figures(diagnosis)
         page = report.write_page(diagnosis, drawn, source=diagnosis.recording.source, seed=arguments.seed)
-    with staged(out, inputs=_files_to_keep(arguments, out, simulator.reading), outdated=_OF_ONE_RUN) as stage:
+    with staged_output(out, inputs=_files_to_keep(arguments, out, simulator.reading), outdated=_OF_ONE_RUN) as stage:
         write_results(diagnosis, drawn, stage)
         stage.write("report.html", page)
     for note in (*notes, *notes_on_calls(diagnosis), *stage.notes):
-        say(f"note: {note}", quiet=arguments.quiet)
-    say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+        print_result(f"note: {note}", quiet=arguments.quiet)
+    print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 

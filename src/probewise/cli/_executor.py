@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
 
-from probewise.cli._common import kept_message, positive_int
+from probewise.cli._common import message_of_kept_results, positive_int
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError
 from probewise.progress import Progress
@@ -24,15 +24,15 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
 
 
 @contextlib.contextmanager
-def _executor_of(arguments: argparse.Namespace) -> Iterator[Executor | None]:
+def _open_executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
     """Yield the executor; None for this process."""
     if arguments.scheduler is not None:
         with _cluster_executor(arguments.scheduler) as executor:
             yield executor
     elif arguments.workers > 1:
-        from probewise.cli._workers import workers
+        from probewise.cli._workers import worker_pool
 
-        with workers(arguments.workers) as pool:
+        with worker_pool(arguments.workers) as pool:
             yield pool
     else:
         yield None
@@ -46,19 +46,19 @@ def campaign_running(
     from probewise._progress import progress_shown
 
     with (
-        reporting_what_is_kept(lambda: campaign_kept_message(path, noun, arguments)),
+        reporting_what_is_kept(lambda: message_of_kept_campaign(path, noun, arguments)),
         progress_shown(quiet=arguments.quiet) as progress,
-        _executor_of(arguments) as executor,
+        _open_executor(arguments) as executor,
     ):
         yield executor, progress
 
 
-def campaign_kept_message(path: Path, noun: str, arguments: argparse.Namespace) -> str:
+def message_of_kept_campaign(path: Path, noun: str, arguments: argparse.Namespace) -> str:
     """Return a message: how many finished tasks a campaign's file holds, and the command that resumes it."""
     from probewise.campaign import read_campaign
 
     return (
-        kept_message(path, len(read_campaign(path).results), noun, arguments)
+        message_of_kept_results(path, len(read_campaign(path).results), noun, arguments)
         if path.exists()
         else "nothing was written"
     )

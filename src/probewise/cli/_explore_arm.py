@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Site:
+class ArmAndTruth:
     """An arm over a field, with the true shape if it is simulated.
 
     `outline_mm` is the true outline, (n_points, 2), `known` the shape's true parameters by name, and `about` the
@@ -32,7 +32,7 @@ class Site:
     about: Mapping[str, Any] = field(default_factory=dict)
 
 
-def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> Site:
+def open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Reading, ...]) -> ArmAndTruth:
     """Open the chosen arm, to continue after the readings `taken`.
 
     Raises ParameterError, FileError or ArmError if a truth was given with a real arm, or the arm cannot be opened.
@@ -42,9 +42,9 @@ def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Readin
         if arguments.truth is not None:
             raise ParameterError("--truth", arguments.truth, "none with a real arm, whose target is unknown")
         if chosen.kind == "file":
-            return Site(open_own_instrument(chosen.where, start_s=start_s))
+            return ArmAndTruth(open_own_instrument(chosen.where, start_s=start_s))
         assert geometry is not None
-        return Site(open_nxt(chosen.where, geometry, start_s=start_s))
+        return ArmAndTruth(open_nxt(chosen.where, geometry, start_s=start_s))
     hidden = parse_truth(arguments.truth, arguments.shape, inputs.field, rng=inputs.streams.truth)
     world, surface = posing.world_like(inputs.sensor), posing.with_cards(hidden.surface, inputs.cards)
     arm: Instrument
@@ -61,5 +61,5 @@ def open_site(arguments: argparse.Namespace, inputs: Inputs, taken: tuple[Readin
             workspace=geometry,
             scale=posing.scale_of(inputs.sensor.instrumentation),
         )
-    known = hidden.named_as(inputs.experiment.names)
-    return Site(arm, hidden.outline_mm, known, {"hidden": hidden.document})
+    known = hidden.parameters_by_names(inputs.experiment.names)
+    return ArmAndTruth(arm, hidden.outline_mm, known, {"hidden": hidden.journal_entry})

@@ -21,7 +21,7 @@ from probewise.scene import Field
 
 if TYPE_CHECKING:
     from probewise.arm import Geometry
-    from probewise.experiment import Experiment, Model, Streams
+    from probewise.experiment import Experiment, Model, RandomStreams
     from probewise.inference import Naive
     from probewise.scene import Card
 
@@ -43,7 +43,7 @@ class Inputs:
     model: Model
     other: Experiment | None
     other_model: Model
-    streams: Streams
+    streams: RandomStreams
 
     @property
     def levels(self) -> tuple[float, float]:
@@ -52,7 +52,7 @@ class Inputs:
         return means["I_min"], means["I_max"]
 
 
-def inputs_of(arguments: argparse.Namespace) -> Inputs:
+def checked_inputs(arguments: argparse.Namespace) -> Inputs:
     """Read and check the options.
 
     Raises ParameterError or FileError if an option contradicts another, or a file cannot be read.
@@ -65,7 +65,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     sensor = read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
-    streams = posing.Streams.of(np.random.default_rng(arguments.seed))
+    streams = posing.RandomStreams.of(np.random.default_rng(arguments.seed))
     shape = posing.shape_named(arguments.shape, field)
     orientations_rad, heights_mm, repeats = _choices_of_settings(arguments, geometry)
     cards = parse_cards(arguments.reference, field)
@@ -74,7 +74,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
         raise ParameterError("--reference", arguments.reference[0], allowed)
     levels = _naive_levels(arguments, chosen, sensor, rng=streams.levels)
     pose = partial(
-        posing.pose_experiment,
+        posing.experiment_from_names,
         sensor,
         shape,
         field,
@@ -95,7 +95,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     )
     if chosen.may_differ_from_geometry and geometry is not None and geometry.accuracy is not None:
         experiment = dataclasses.replace(experiment, fitted_arm=posing.FittedArm.of(geometry, sensor))
-    other, other_model = None, _other_model(arguments.model)
+    other, other_model = None, _model_to_compare_with(arguments.model)
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)
     return Inputs(
@@ -112,7 +112,7 @@ def inputs_of(arguments: argparse.Namespace) -> Inputs:
     )
 
 
-def _other_model(model: Model) -> Model:
+def _model_to_compare_with(model: Model) -> Model:
     return "naive" if model == "ssf" else "ssf"
 
 
@@ -156,7 +156,7 @@ def _naive_levels(
     if arguments.levels is not None:
         if not wanted:
             raise ParameterError("--levels", str(arguments.levels), "only with --method paper and --model naive")
-        return posing.levels_from(read_recording(arguments.levels), sensor)
+        return posing.naive_levels_from_recording(read_recording(arguments.levels), sensor)
     if not wanted:
         return None
     if chosen.kind in ("nxt", "file"):
@@ -165,4 +165,4 @@ def _naive_levels(
             "none",
             "a recording of readings over a black and a white sheet, for the naive model of the paper",
         )
-    return posing.levels_in(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)
+    return posing.naive_levels_from_world(posing.world_like(sensor), posing.scale_of(sensor.instrumentation), rng=rng)

@@ -15,7 +15,7 @@ from probewise.cli._output import Stage
 from probewise.cli._stopping import raise_if_stopped
 from probewise.recordings import write_bytes_atomically, write_text_atomically
 from probewise.report import exploration as report
-from probewise.report.animation import gif
+from probewise.report.animation import animated_gif
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -64,7 +64,7 @@ class Pictures:
             return report.frame(step, inputs.experiment, readings, levels=inputs.levels, truth_mm=self.truth_mm)
         views = {inputs.model: (step, inputs.experiment), inputs.other_model: (shadow, inputs.other)}
         titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
-        return report.frame_of_both(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
+        return report.frame_of_several_models(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
 
     def write_results(self, stage: Stage, result: Exploration, *, seed: int, known: Mapping[str, float] | None) -> None:
         """Write the report, the animation, the result, its samples and the sensor as the run leaves it."""
@@ -79,10 +79,10 @@ class Pictures:
             unit=self.inputs.sensor.instrumentation.unit,
         )
         stage.write("report.html", page)
-        stage.write("run.gif", gif(self.frames))
+        stage.write("run.gif", animated_gif(self.frames))
         stage.write("result.json", posing.result_json(result))
         stage.write("samples.csv", posing.samples_csv(result))
-        learnt = posing.repaired(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
+        learnt = posing.repaired_sensor(self.inputs.sensor, result.last, rng=np.random.default_rng(seed))
         stage.write("sensor.json", learnt.to_json())
 
 

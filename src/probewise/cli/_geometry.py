@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._kinds import did_you_mean
 from probewise.errors import ParameterError
-from probewise.experiment import Hidden
+from probewise.experiment import HiddenShape
 from probewise.scene import SHAPES, Card, Field
 
 
@@ -40,13 +40,13 @@ def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
     return tuple(cards)
 
 
-def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> Hidden:
+def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np.random.Generator) -> HiddenShape:
     """Parse "[SHAPE:]V,V,...", the parameters of the true shape; if `text` is None, draw them from the prior.
 
     Raises ParameterError for an unknown shape, a wrong number of values, or values that the shape's prior excludes.
     """
     if text is None:
-        return Hidden.drawn({name: SHAPES[name](field) for name in names}, rng=rng)
+        return HiddenShape.drawn_from_prior({name: SHAPES[name](field) for name in names}, rng=rng)
     name, _, listed = text.rpartition(":")
     name = name or names[0]
     if name not in SHAPES:
@@ -61,4 +61,4 @@ def parse_truth(text: str | None, names: Sequence[str], field: Field, *, rng: np
         raise ParameterError("--truth", text, allowed) from error
     if len(theta) != len(shape.prior.names):
         raise ParameterError("--truth", text, allowed)
-    return Hidden.given(name, shape, theta, called=f"--truth {text}")
+    return HiddenShape.from_parameters(name, shape, theta, called=f"--truth {text}")

@@ -55,7 +55,7 @@ def journal_sensor(path: Path) -> Path:
     Raises FileError if the journal names none, or the file found is a different one.
     """
     from probewise.calibration import read_sensor
-    from probewise.experiment import read_journal, sensor_named
+    from probewise.experiment import read_journal, sensor_entry
 
     settings = read_journal(path).settings
     named, wanted = settings.get("sensor_file"), settings.get("sensor_sha256")
@@ -64,7 +64,7 @@ def journal_sensor(path: Path) -> Path:
         raise FileError(path, "it does not name its sensor's file", give)
     standing = [place for place in (path.parent / named, path.parent / Path(named).name) if place.exists()]
     for place in standing:
-        if sensor_named(read_sensor(place))["sensor_sha256"] == wanted:
+        if sensor_entry(read_sensor(place))["sensor_sha256"] == wanted:
             return place
     found = "is another by now" if standing else "is not there any more"
     raise FileError(path, f"its sensor {named} (as seen from {path.parent}) {found}", give)
@@ -87,7 +87,7 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
 
 
 def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
-    """Build the shape named in the first line, from those of the command line."""
+    """Build the shape that the journal's first line names; it must be one that `explore` offers, or a set of these."""
     from probewise.experiment import shape_named
     from probewise.scene import SHAPES, Field
 

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from probewise._signals import deferred
+from probewise._signals import defer_signals
 from probewise.cli._stopping import raise_if_stopped
 from probewise.errors import FileError, ParameterError
 
@@ -97,7 +97,7 @@ def check_out_file(path: Path, *inputs: Path) -> Path:
 
 
 @contextlib.contextmanager
-def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[Stage]:
+def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[Stage]:
     """Yield an empty directory; move its files into `out` only if the block succeeds.
 
     An error or a signal before that leaves `out` as it was.
@@ -117,21 +117,21 @@ def staged(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = 
         If `out` cannot be made or written to, another process writes there for too long, or a directory has the name of
         a result.
     """
-    from probewise.recordings import locked, write_text_atomically  # imported here, since the help does not need it
+    from probewise.recordings import hold_lock, write_text_atomically  # imported here, since the help does not need it
 
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise FileError(out, f"cannot be made ({error.strerror})", "a directory you may write to") from error
     folder = out / _FOLDER
-    with locked(out / "results", patience_s=_PATIENCE_S):
+    with hold_lock(out / "results", patience_s=_PATIENCE_S):
         try:
             _finish_interrupted_commit(out)
             folder.mkdir()
             stage = Stage(folder)
             yield stage
             raise_if_stopped()
-            with deferred():
+            with defer_signals():
                 commit = _prepare_commit(out, folder, inputs, outdated)
                 stage.kept = {out / name: out / kept for name, kept in commit.aside.items()}
                 write_text_atomically(folder / _COMMIT, json.dumps(asdict(commit)))

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probewise.arm import Pose
-from probewise.arm.carry_out import Request, bounds_of
-from probewise.cli._arm import questioner
+from probewise.arm.carry_out import Request, reach_of
+from probewise.cli._arm import prompter_for_answer
 from probewise.cli._bench import moved_pattern
-from probewise.cli._common import caution
+from probewise.cli._common import print_warning
 from probewise.emulator.scenes import scene_text
 from probewise.errors import ParameterError
 
@@ -57,7 +57,7 @@ class PersonAtBench:
             emulated,
         )
         self._check_sheets = check_sheets
-        self._answer = questioner(arm)
+        self._answer = prompter_for_answer(arm)
 
     def __call__(self, request: Request) -> None:
         """Prompt, and check the sheet until it is right or the person overrides the check."""
@@ -67,7 +67,7 @@ class PersonAtBench:
             return
         while (wrong := self._contradiction_of_sheet(request.pattern)) is not None:
             if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
-                caution(f"{wrong}; is the right sheet there, the right way round?")
+                print_warning(f"{wrong}; is the right sheet there, the right way round?")
                 break
             said = self._answer(f"{wrong}. Correct it and press Enter, or type go to continue anyway:  ")
             if said.lower() == "go":
@@ -89,10 +89,10 @@ class PersonAtBench:
 
     def _contradiction_of_sheet(self, name: str) -> str | None:
         """Read the sheet's white and black; return a complaint if they contradict its pattern, else None."""
-        bounds, origin = bounds_of(self._arm), np.array(self._origin)
+        bounds, origin = reach_of(self._arm), np.array(self._origin)
         values = {}
         for is_white, place in self._sheet_check.places_to_check(
-            name, lambda places: bounds.holds(places + origin)
+            name, lambda places: bounds.contains(places + origin)
         ).items():
             x_mm, y_mm = (np.array(place) + origin).tolist()
             standing = float(self._arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])

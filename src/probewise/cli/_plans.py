@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from probewise.recordings import Plan
 
 
-def plan_of(text: str) -> Plan:
+def read_or_shipped_plan(text: str) -> Plan:
     """Read a plan from its file, or return a shipped one: paper, two_way."""
     from probewise.recordings import paper_plan, read_plan, two_way_plan
 
@@ -32,7 +32,8 @@ def for_own_instrument(
         said |= dict(zip(("min", "max"), _parse_numbers("--range", range_, 2), strict=True))
     if step is not None:
         (said["step"],) = _parse_numbers("--step", step, 1)
-    return keep_commanded(dataclasses.replace(plan, instrumentation=dataclasses.replace(plan.instrumentation, **said)))  # type: ignore[arg-type]
+    instrumentation = dataclasses.replace(plan.instrumentation, **said)  # type: ignore[arg-type]
+    return without_measured_covariates(dataclasses.replace(plan, instrumentation=instrumentation))
 
 
 def for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
@@ -46,10 +47,10 @@ def for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
         sensor=plan.instrumentation.sensor or "LEGO 9844 light sensor",
         height_mm=geometry.read_height_mm,
     )
-    return keep_commanded(dataclasses.replace(plan, instrumentation=instrumentation))
+    return without_measured_covariates(dataclasses.replace(plan, instrumentation=instrumentation))
 
 
-def keep_commanded(plan: Plan) -> Plan:
+def without_measured_covariates(plan: Plan) -> Plan:
     """Return the plan with the covariates that can be commanded; others were measured in an earlier recording."""
     can = {*plan.instrumentation.controls, "led", "height_mm"}
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})

@@ -43,14 +43,14 @@ class SheetCheck:
 
     def __init__(self, plan: Plan, *, white_is_bright: bool) -> None:
         self._plan, self._bright = plan, white_is_bright
-        ends = plan.instrumentation.ends
+        ends = plan.instrumentation.declared_ends
         self._range = ends[1] - ends[0] if len(ends) == 2 else math.nan
         self._read: dict[bool, list[float]] = {True: [], False: []}
         self._reported: set[tuple[str, bool]] = set()
         places = np.stack([plan.x_mm, plan.y_mm], axis=-1)
         self._shades = np.full(len(plan), math.nan)
         for name, rows in plan.rows_by_pattern():
-            self._shades[rows] = shades(plan.patterns[name], places[rows])
+            self._shades[rows] = shades_at_places(plan.patterns[name], places[rows])
 
     def check_reading(self, row: int, value: float) -> str | None:
         """Return a complaint if the reading of a plan's row contradicts its sheet's pattern, else None.
@@ -107,7 +107,7 @@ class SheetCheck:
         candidates = candidates[allowed(candidates)]
         if not len(candidates):
             return {}
-        found = shades(self._plan.patterns[name], candidates)
+        found = shades_at_places(self._plan.patterns[name], candidates)
         middle = there.mean(axis=0)
         out = {}
         for is_white in (True, False):
@@ -140,7 +140,7 @@ class SheetCheck:
         return _SHARE * (self._range if math.isfinite(self._range) else max(abs(level) for level in levels))
 
 
-def shades(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
+def shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
     """Return the uniform shade below the sensor at each place, (n, 2): 1 white, 0 black, NaN mixed or grey; (n,)."""
     seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
     albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)

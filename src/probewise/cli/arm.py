@@ -20,7 +20,7 @@ from probewise.cli._arm import (
     parse_arm,
     parse_place,
     prompter,
-    questioner,
+    prompter_for_answer,
     warn_of_clearance,
 )
 from probewise.cli._common import (
@@ -31,16 +31,16 @@ from probewise.cli._common import (
     add_count,
     add_path,
     add_quiet,
-    caution,
-    kept_message,
+    message_of_kept_results,
     parse_path,
     positive_int,
     positive_number,
-    say,
+    print_result,
+    print_warning,
     seed_number,
 )
 from probewise.cli._output import check_out_file
-from probewise.cli._plans import for_lego_arm, for_own_instrument, keep_commanded
+from probewise.cli._plans import for_lego_arm, for_own_instrument, without_measured_covariates
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
@@ -71,12 +71,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Define the verb's options."""
     tasks = parser.add_subparsers(dest="task", metavar="TASK", required=True, parser_class=OneLineParser)
 
-    check = _task(tasks, "check", "Check a geometry file, and a brick; report and draw the arm's reach.")
+    check = _add_task(tasks, "check", "Check a geometry file, and a brick; report and draw the arm's reach.")
     _add_arm(check)
     check.add_argument("--out", type=parse_path, metavar="REACH.png", help="file of the drawing (default: none)")
     check.add_argument("--drawing", type=parse_path, metavar="ARM.png", help="file of a drawing with the arm's lengths")
 
-    jog = _task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
+    jog = _add_task(tasks, "jog", "Turn a joint by some degrees, or bring the sensor over a place.", moves=True)
     jog.add_argument(
         "where", nargs="+", metavar="WHERE", help="base, shoulder or elbow and degrees; or a place X,Y in mm"
     )
@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     jog.add_argument("--steps", action="store_true", help="with --down: in steps, each confirmed with Enter")
 
-    fit = _task(
+    fit = _add_task(
         tasks,
         "fit-geometry",
         "Fit home angles, links and base to marks that the sensor is brought to; writes the geometry.",
@@ -114,7 +114,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fit.add_argument("--resume", action="store_true", help="continue after the marks in MARKS.csv")
 
-    home = _task(
+    home = _add_task(
         tasks,
         "home",
         "Bring all joints home, where their counters are 0; joints with a stop find it first.",
@@ -124,7 +124,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--here", action="store_true", help="let a person bring the arm home by hand, and set the counters to 0 there"
     )
 
-    heights = _task(
+    heights = _add_task(
         tasks,
         "heights",
         "Check from the light over white whether the sensor hangs as high as its counters say.",
@@ -136,14 +136,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_count(heights, "--readings", "number of readings at each height (default 16)", default=16)
 
-    _task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
+    _add_task(tasks, "read", "Read the sensor where it stands, in LEGO units, and the battery.", moves=True)
 
-    scan = _task(tasks, "scan", "Read along a line; readings go to standard output as CSV.", moves=True, arms=_ALL_ARMS)
+    scan = _add_task(
+        tasks, "scan", "Read along a line; readings go to standard output as CSV.", moves=True, arms=_ALL_ARMS
+    )
     scan.add_argument("start", metavar="X,Y", help="first place of the line, mm")
     scan.add_argument("end", metavar="X,Y", help="last place of the line, mm")
     scan.add_argument("--readings", type=positive_int, default=21, metavar="N", help="number of readings (default 21)")
 
-    record = _task(
+    record = _add_task(
         tasks,
         "record",
         "Carry out a plan and write the recording; asks a person to lay sheets and turn the sensor.",
@@ -173,7 +175,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     record.add_argument("--resume", action="store_true", help="continue after the readings in REC.csv")
 
 
-def _task(
+def _add_task(
     tasks: argparse._SubParsersAction[OneLineParser],
     name: str,
     summary: str,
@@ -218,13 +220,13 @@ def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
     port = None if arguments.arm is None else _nxt_port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
-    held = geometry.holds(places)
-    say(f"reach        {geometry.sentence()}", quiet=arguments.quiet)
-    say(f"field        {held.mean():.1%} of it within reach", quiet=arguments.quiet)
+    held = geometry.contains(places)
+    print_result(f"reach        {geometry.sentence()}", quiet=arguments.quiet)
+    print_result(f"field        {held.mean():.1%} of it within reach", quiet=arguments.quiet)
     for name, joint in zip(JOINTS, geometry.joints, strict=True):
         count_mm = geometry.farthest_mm / abs(joint.counts_per_rad)
         low, high = math.degrees(joint.low_rad), math.degrees(joint.high_rad)
-        say(
+        print_result(
             f"{name:<12} motor {'ABC'[joint.port]}, {low:g} to {high:g} degrees; "
             f"at {geometry.farthest_mm:.0f} mm one count is {count_mm:.2f} mm, "
             f"its play {joint.play_rad * geometry.farthest_mm:.1f} mm",
@@ -234,7 +236,7 @@ def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
         known = "not fitted to marks: with home 2 degrees off on both links the sensor hangs up to"
     else:
         known = f"fitted to {geometry.accuracy.marks} marks; by 2 sds the sensor may hang"
-    say(
+    print_result(
         f"height       reads {geometry.read_height_mm:g} mm up; {known} {geometry.height_doubt_mm:.1f} mm lower",
         quiet=arguments.quiet,
     )
@@ -243,10 +245,10 @@ def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
     if out is not None:
         standing = np.where(held, geometry.orientation_rad(places), np.nan).reshape(y_mm.size, x_mm.size)
         write_bytes_atomically(out, png(reach_map(standing, x_mm, y_mm, axis_mm=geometry.axis_mm)))
-        say(f"drawn        {out}", quiet=arguments.quiet)
+        print_result(f"drawn        {out}", quiet=arguments.quiet)
     if drawing is not None:
         write_bytes_atomically(drawing, png(arm_lengths(geometry)))
-        say(f"drawn        {drawing}", quiet=arguments.quiet)
+        print_result(f"drawn        {drawing}", quiet=arguments.quiet)
     if port is not None:
         _check_brick(port, geometry)
 
@@ -258,10 +260,12 @@ def _check_brick(port: str, geometry: Geometry) -> None:
     with open_brick(port) as brick:
         version = brick.version()
         firmware = f"{version.firmware_major}.{version.firmware_minor:02d}"
-        say(f"brick        {brick.name()}, firmware {firmware}, battery {brick.battery_mv() / 1000:.2f} V")
+        print_result(f"brick        {brick.name()}, firmware {firmware}, battery {brick.battery_mv() / 1000:.2f} V")
         light = brick.light(geometry.sensor_port).read()
         value = in_lego_units(light.fine_percent, geometry)
-        say(f"light        {value:g} {UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts")
+        print_result(
+            f"light        {value:g} {UNITS} at port {geometry.sensor_port + 1}, {light.raw_counts} raw counts"
+        )
         program = brick.program()
         if program is not None:
             raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
@@ -281,7 +285,7 @@ def _jog_joints(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 if arguments.steps and not arguments.dry_run:
                     confirm_lowering(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
-                _say_position(arm, quiet=arguments.quiet)
+                _print_position(arm, quiet=arguments.quiet)
                 if arguments.down:
                     _prompter(arguments, arm)("check the sensor's position; it will be raised again")
         case [joint, text] if joint in JOINTS:
@@ -291,7 +295,7 @@ def _jog_joints(arguments: argparse.Namespace, geometry: Geometry) -> None:
                 raise ParameterError("WHERE", text, "a number of degrees") from error
             with _open_lego_arm(arguments, geometry) as arm:
                 arm.turn(JOINTS.index(joint), by_rad)
-                _say_position(arm, quiet=arguments.quiet)
+                _print_position(arm, quiet=arguments.quiet)
         case _:
             raise ParameterError("WHERE", " ".join(arguments.where), f"X,Y in mm; or {', '.join(JOINTS)}, and degrees")
 
@@ -307,7 +311,7 @@ def _bring_home(arguments: argparse.Namespace, geometry: Geometry) -> None:
             arm.set_home()
         else:
             arm.home()
-        _say_position(arm, quiet=arguments.quiet)
+        _print_position(arm, quiet=arguments.quiet)
 
 
 def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
@@ -330,18 +334,18 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
         _touch_marks(arguments, geometry, check_out_file(kept))
     turned, marks = read_marks(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
-    say(fitted.summary(), quiet=arguments.quiet)
+    print_result(fitted.summary(), quiet=arguments.quiet)
     text = with_fitted(source.read_text(encoding="utf-8-sig"), fitted.geometry)
     write_text_atomically(out, text)
     read_geometry(out)  # check that edits by hand have not hidden a number
-    say(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
+    print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
 
 
 def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
     """Bring the sensor to one mark after another, and save each at once."""
     from probewise.arm import LegoArm
     from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
-    from probewise.arm.marks import marks_of
+    from probewise.arm.marks import places_of_marks
     from probewise.cli._marks import bring_to_mark
 
     chosen = parse_arm(arguments.arm)
@@ -354,18 +358,22 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
         rows = zip(*(array.tolist() for array in read_marks(kept)), strict=True)
         taken = [TouchedMark(tuple(turned), tuple(place)) for turned, place in rows]
     done = {mark.place_mm[:2] for mark in taken}
-    marks = [(x, y) for x, y in marks_of(geometry).tolist()]
+    marks = [(x, y) for x, y in places_of_marks(geometry).tolist()]
     arguments.scene = arguments.sensor = arguments.seed = None
     instrument, bench = _open_instrument(arguments, geometry)
     assert isinstance(instrument, LegoArm)
 
     def kept_so_far() -> str:
-        return kept_message(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
+        return (
+            message_of_kept_results(kept, len(taken), "mark", arguments, "--resume")
+            if kept.exists()
+            else "no mark was kept"
+        )
 
     with reporting_what_is_kept(kept_so_far), instrument as arm:
-        answer = questioner(arm)
+        answer = prompter_for_answer(arm)
         ask = answer if bench is None else bench.answer_at_mark
-        tell = partial(say, quiet=bench is not None)
+        tell = partial(print_result, quiet=bench is not None)
         if bench is None:
             prompter(arm)(
                 f"lay the sheet of marks (probewise sheets {MARKS}) on the field, and on each cross in its turn a "
@@ -378,7 +386,7 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
             if met is not None:
                 taken.append(met)
                 write_marks(taken, kept)
-                say(f"mark {number} kept: {kept}", quiet=arguments.quiet)
+                print_result(f"mark {number} kept: {kept}", quiet=arguments.quiet)
 
 
 def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
@@ -387,7 +395,7 @@ def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
     from probewise.arm import LegoArm, require_reach
     from probewise.arm.height_check import HeightReading, check_heights
-    from probewise.arm.marks import marks_of
+    from probewise.arm.marks import places_of_marks
 
     if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
         raise ParameterError("--arm", arguments.arm, "nxt:PORT, or emulator:TRUE.toml")
@@ -395,7 +403,7 @@ def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
         raise ParameterError("--readings", arguments.readings, f"up to {_MOST_READINGS}")
     width, height = geometry.field_mm
     places = [parse_place("X,Y", text) for text in arguments.places]
-    places = places or [(width / 2, height / 2), *((x, y) for x, y in marks_of(geometry).tolist())]
+    places = places or [(width / 2, height / 2), *((x, y) for x, y in places_of_marks(geometry).tolist())]
     if len(places) < 2:
         raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
     require_reach(geometry, np.array(places), "place")
@@ -421,20 +429,20 @@ def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
             lights.append(light_at(place, lowest_mm))
             if not arguments.dry_run:
                 found = check_heights(curve, lights)
-                say(_height_in_words(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
+                print_result(_height_in_words(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
     if arguments.dry_run:
         return
-    say(
+    print_result(
         f"light        falls by {found.per_mm:.1%} with each mm at {lowest_mm:g} mm (in [sensor] of the geometry: "
         f"light_per_mm = {found.per_mm:.3f}); heights are relative to the first place, "
         f"({places[0][0]:g}, {places[0][1]:g}) mm",
         quiet=arguments.quiet,
     )
     if found.agrees:
-        say(f"heights      agree with the counters (p = {found.p_value:.2g})", quiet=arguments.quiet)
+        print_result(f"heights      agree with the counters (p = {found.p_value:.2g})", quiet=arguments.quiet)
     else:
         worst = int(np.argmax(np.abs(found.off_mm / found.sd_mm)))
-        caution(
+        print_warning(
             f"the light contradicts the heights (p = {found.p_value:.1g}), most at "
             f"{_height_in_words(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the same "
             "everywhere? Then bring the sensor to marks there and fit the geometry again (probewise arm fit-geometry)"
@@ -451,14 +459,14 @@ def _read_sensor(arguments: argparse.Namespace, geometry: Geometry) -> None:
     with _open_lego_arm(arguments, geometry) as arm:
         value, battery_mv = arm.read_here(), arm.battery_mv()
         if not arguments.dry_run:
-            say(f"{value:g} {UNITS}, battery {battery_mv:.0f} mV")
+            print_result(f"{value:g} {UNITS}, battery {battery_mv:.0f} mV")
 
 
 def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
     from probewise.arm import LegoArm, Pose, require_reach
-    from probewise.arm.carry_out import bounds_of
+    from probewise.arm.carry_out import reach_of
 
     start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
     if arguments.readings > _MOST_READINGS:
@@ -470,17 +478,17 @@ def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     instrument, _ = _open_instrument(arguments, geometry)
     _warn_and_confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
-        require_reach(bounds_of(arm), places, "reading of the scan")
+        require_reach(reach_of(arm), places, "reading of the scan")
         if isinstance(arm, LegoArm):
-            say(",".join((_COLUMNS, *names)))
+            print_result(",".join((_COLUMNS, *names)))
         for k, ((x_mm, y_mm), standing) in enumerate(zip(places, arm.orientation_rad(places), strict=True)):
             reading = arm.measure(Pose(float(x_mm), float(y_mm), float(standing)))
             if k == 0 and not isinstance(arm, LegoArm):
                 names = list(reading.covariates)
-                say(",".join((_COLUMNS, *names)))
+                print_result(",".join((_COLUMNS, *names)))
             turned = np.degrees(reading.pose.orientation_rad)
             more = (f",{reading.covariates.get(name, math.nan):.9g}" for name in names)
-            say(f"{x_mm:.3f},{y_mm:.3f},{turned:.3f},{reading.time_s:.3f},{reading.value:.9g}{''.join(more)}")
+            print_result(f"{x_mm:.3f},{y_mm:.3f},{turned:.3f},{reading.time_s:.3f},{reading.value:.9g}{''.join(more)}")
 
 
 def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
@@ -510,7 +518,7 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     def kept() -> str:
         if not out.exists():
             return "nothing was read"
-        return kept_message(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
+        return message_of_kept_results(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
 
     instrument, bench = _open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
     _warn_and_confirm_lowering(arguments, instrument, geometry)
@@ -518,14 +526,14 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         check = SheetCheck(plan, white_is_bright=not own)
         by_person = bench is None and not arguments.dry_run
         ask: Callable[[Request], None] = (
-            _prompter(arguments, arm) if bench is None else partial(bench.lay, plan.patterns, origin)
+            _prompter(arguments, arm) if bench is None else partial(bench.carry_out_request, plan.patterns, origin)
         )
         if by_person:
             ask = PersonAtBench(
                 arm, plan, origin, check, check_sheets=not own, emulated=not own and is_pty(_nxt_port(arguments.arm))
             )
             seconds = duration_s(arm, plan, origin_mm=origin, first=len(taken))
-            say(
+            print_result(
                 f"{len(plan) - len(taken)} readings, about {seconds / 60:.0f} minutes; including {BY_HAND_S:g} s for "
                 f"each step by hand",
                 quiet=arguments.quiet,
@@ -536,13 +544,13 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
             for reading in readings:
                 wrong = check.check_reading(len(taken), reading.value)
                 if wrong is not None and not arguments.dry_run:
-                    caution(f"{wrong}; is the right sheet there, the right way round?")
+                    print_warning(f"{wrong}; is the right sheet there, the right way round?")
                 taken.append(reading)
                 progress("readings", len(taken), len(plan))
                 if not arguments.dry_run:
                     write_recording(recording_of(plan, taken), out)
     if not arguments.dry_run:
-        say(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
+        print_result(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 
 
 def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
@@ -551,7 +559,7 @@ def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
 
     from probewise.calibration import read_sensor
 
-    return keep_commanded(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
+    return without_measured_covariates(dataclasses.replace(plan, instrumentation=read_sensor(sensor).instrumentation))
 
 
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
@@ -579,10 +587,10 @@ def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list
 
 def _open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
     """Open the arm of --arm, or for --dry-run one that only prints its moves."""
-    from probewise.arm import LegoArm, Rehearsal
+    from probewise.arm import DryRun, LegoArm
 
     if arguments.dry_run:
-        return LegoArm(Rehearsal(geometry, say), geometry, start_s=start_s)
+        return LegoArm(DryRun(geometry, print_result), geometry, start_s=start_s)
     if arguments.arm is None:
         raise CommandError(
             "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
@@ -620,7 +628,7 @@ def _open_instrument(
         start_s=start_s,
         n_taken=n_taken,
     )
-    say(f"seed {seed}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
+    print_result(f"seed {seed}", quiet=arguments.quiet or arguments.task == "scan" or opened[1] is None)
     return opened
 
 
@@ -669,12 +677,12 @@ def _nxt_port(name: str) -> str:
 
 def _prompter(arguments: argparse.Namespace, arm: Instrument) -> Callable[[str], None]:
     """Return a function that prompts the person; in a dry run, it only prints the request."""
-    return (lambda text: say(f"ask: {text}")) if arguments.dry_run else prompter(arm)
+    return (lambda text: print_result(f"ask: {text}")) if arguments.dry_run else prompter(arm)
 
 
-def _say_position(arm: LegoArm, *, quiet: bool) -> None:
+def _print_position(arm: LegoArm, *, quiet: bool) -> None:
     (x_mm, y_mm, height_mm), angles = arm.position_mm, [math.degrees(angle) for angle in arm.angles_rad]
-    say(
+    print_result(
         f"sensor at ({x_mm:.1f}, {y_mm:.1f}) mm, {height_mm:.1f} mm above the surface; base {angles[0]:.1f}, "
         f"shoulder {angles[1]:.1f}, elbow {angles[2]:.1f} degrees",
         quiet=quiet,

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_path, add_quiet, say
+from probewise.cli._common import Verb, add_path, add_quiet, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.cli._simulator import add_simulator, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -48,11 +48,11 @@ def run(arguments: argparse.Namespace) -> int:
             audit = audit_plan(plan, sensor=sensor, progress=progress)
         progress("drawing the figures")
         notes = [] if out is None else _write_results(audit, out, arguments.plan)
-    say(audit.summary(), quiet=arguments.quiet)
+    print_result(audit.summary(), quiet=arguments.quiet)
     for note in notes:
-        say(f"note: {note}", quiet=arguments.quiet)
+        print_result(f"note: {note}", quiet=arguments.quiet)
     if out is not None:
-        say(f"written to {out}", quiet=arguments.quiet)
+        print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 
@@ -74,7 +74,7 @@ def _write_results(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
 
     drawn = report.figures(audit)
     cures = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
-    with staged(out, inputs=(plan, plan.with_suffix(".json")), outdated=cures) as stage:
+    with staged_output(out, inputs=(plan, plan.with_suffix(".json")), outdated=cures) as stage:
         stage.write_json("audit.json", audit_json(audit))
         stage.write_figures(drawn)
         stage.write("report.html", report.write_page(audit, drawn, source=plan.name))

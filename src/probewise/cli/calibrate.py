@@ -5,9 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from probewise.cli._common import Verb, add_common, add_count, add_out_directory, parse_path, positive_int, say
+from probewise.cli._common import Verb, add_common, add_count, add_out_directory, parse_path, positive_int, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
@@ -91,13 +91,13 @@ def run(arguments: argparse.Namespace) -> int:
         prediction = predict(result.sensor, recording, progress=progress)
         progress("drawing the figures")
         drawn = report.figures(result, recording, prediction)
-        with staged(out) as stage:
+        with staged_output(out) as stage:
             write_sensor(result.sensor, stage / "sensor.json")
             stage.write_figures(drawn)
             stage.write("report.html", report.write_page(result, recording, prediction, drawn, seed=arguments.seed))
     for note in recording.notes:
-        say(f"note: {note}", quiet=arguments.quiet)
-    say(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+        print_result(f"note: {note}", quiet=arguments.quiet)
+    print_result(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 

@@ -6,9 +6,9 @@ import argparse
 import shlex
 from functools import partial
 
-from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, say
-from probewise.cli._executor import add_executor, campaign_kept_message, campaign_running
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, print_result
+from probewise.cli._executor import add_executor, campaign_running, message_of_kept_campaign
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 
 
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Run the remaining cases of the challenge and write its table."""
     from probewise._progress import progress_shown
-    from probewise.challenge import Investigated, run_case, run_challenge, score, score_rounds
+    from probewise.challenge import RunCaseInRounds, run_case, run_challenge, score, score_rounds
     from probewise.challenge.systems import run_system_case, score_systems
     from probewise.report import challenge as report
 
@@ -52,9 +52,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.systems:
         work, scored, of = run_system_case, score_systems, "systems"
     elif arguments.rounds > 1:
-        work, scored, of = Investigated(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
+        work, scored, of = RunCaseInRounds(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
     cases = out / "cases.jsonl"
-    kept = partial(campaign_kept_message, cases, "case", arguments)
+    kept = partial(message_of_kept_campaign, cases, "case", arguments)
     with campaign_running(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
             arguments.cases,
@@ -72,12 +72,12 @@ def run(arguments: argparse.Namespace) -> int:
         ["probewise", "challenge", *options, "--cases", str(arguments.cases), "--seed", str(arguments.seed)]
     )
     drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
         stage.write("table.csv", report.table_csv(rows))
         stage.write("report.html", report.write_page(results, rows, command=command, systems=arguments.systems))
-    say(report.answer(rows, len(results)), quiet=arguments.quiet)
-    say(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+    print_result(report.summary_sentence(rows, len(results)), quiet=arguments.quiet)
+    print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 

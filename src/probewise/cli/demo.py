@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from probewise.cli._common import Verb, add_common, add_out_directory, say
-from probewise.cli._output import Stage, check_out_directory, staged
+from probewise.cli._common import Verb, add_common, add_out_directory, print_result
+from probewise.cli._output import Stage, check_out_directory, staged_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     with progress_shown(quiet=arguments.quiet) as progress:
         lines = _run_demo(arguments, progress)
     for line in lines:
-        say(line, quiet=arguments.quiet)
+        print_result(line, quiet=arguments.quiet)
     return 0
 
 
@@ -57,7 +57,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     from probewise.arm import read_geometry, shipped_geometry
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
-    from probewise.cli._workers import workers
+    from probewise.cli._workers import worker_pool
     from probewise.recordings import read_recording, shipped
     from probewise.report import demo as report
     from probewise.report import diagnosis as diagnosis_report
@@ -68,7 +68,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     seed = arguments.seed
     out = check_out_directory(arguments.out)
     truth = hidden_circle(seed)
-    with workers(2) as pool:
+    with worker_pool(2) as pool:
         progress("calibrating and diagnosing", 0, 8)
         diagnosing = pool.submit(_diagnose_concealed, seed)
         calibration = _calibrate_shipped(seed, arguments.full, pool)
@@ -86,9 +86,9 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     recording = read_recording(shipped("paper"))
     prediction = predict(sensor, recording.plan, recording.readings)
     names = MODEL_NAMES.values()
-    searches = as_searches(sensor, zip(names, runs, strict=True), truth)
-    started_alike = as_searches(sensor, zip(names, alike, strict=True), truth)
-    doubted = as_searches(sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth)
+    searches = with_true_circle(sensor, zip(names, runs, strict=True), truth)
+    started_alike = with_true_circle(sensor, zip(names, alike, strict=True), truth)
+    doubted = with_true_circle(sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth)
     drawn = report.figures(
         calibration,
         recording,
@@ -102,11 +102,11 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     witnesses = diagnosis_report.figures(diagnosis)
     diagnosis_page = diagnosis_report.write_page(diagnosis, witnesses, source="concealed.csv", seed=seed)
     seconds = time.monotonic() - started
-    with staged(out) as stage:
+    with staged_output(out) as stage:
         write_sensor(sensor, stage / "sensor.json")
         stage.write_figures(drawn)
         (stage / "diagnosis").mkdir()
-        *_, rng = diagnose_verb.generators(seed)
+        *_, rng = diagnose_verb.generators_of_diagnosis(seed)
         diagnose_verb.write_results(diagnosis, witnesses, Stage(stage / "diagnosis"), rng=rng)
         stage.write("diagnosis/report.html", diagnosis_page)
         page = report.write_page(
@@ -128,15 +128,15 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
     return (
         *report.comparison_lines(searches),
-        report.answer(started_alike),
+        report.summary_sentence(started_alike),
         f"diagnosis of the second recording: {diagnosis.verdict}, "
         f"{' + '.join(diagnosis.combination) or 'nothing'}; concealed was: {concealed}",
-        f"a concealed saturation: {doubt_report.answer(doubted)}",
+        f"a concealed saturation: {doubt_report.summary_sentence(doubted)}",
         f"seed {seed}; {seconds:.0f} s; written to {out / 'report.html'}",
     )
 
 
-def as_searches(
+def with_true_circle(
     sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
 ) -> list[RobotSearch]:
     """Combine each run, with its robot's name, with the true circle."""
@@ -224,7 +224,7 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
     """Search for the circle by the paper's rule; the first reading, on the circle, is the same for all models."""
     import numpy as np
 
-    from probewise.experiment import arm_over, experiment_for, run_from, surface_of
+    from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
     from probewise.inquiry import ReadingEntropy
     from probewise.scene import Field
     from probewise.world.shipped import truth as world_behind
@@ -235,7 +235,7 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
     )
     first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
-        return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
+        return run_from_place(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
 
 
 def place_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
@@ -256,7 +256,7 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
 
     import numpy as np
 
-    from probewise.experiment import arm_over, experiment_for, run_from, surface_of
+    from probewise.experiment import arm_over, experiment_for, run_from_place, surface_of
     from probewise.report.doubt import SATURATION
     from probewise.scene import Field
     from probewise.world import Saturation
@@ -267,16 +267,18 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
     world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
     first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world, surface, field, seed=seed) as arm:
-        return run_from(first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT)
+        return run_from_place(
+            first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT
+        )
 
 
 def _diagnose_concealed(seed: int) -> Diagnosis:
     """Diagnose the second recording, with the same result as `probewise diagnose`."""
-    from probewise.cli.diagnose import generators
+    from probewise.cli.diagnose import generators_of_diagnosis
     from probewise.diagnosis import diagnose
     from probewise.recordings import read_recording, shipped
 
-    rng, *_ = generators(seed)
+    rng, *_ = generators_of_diagnosis(seed)
     return diagnose(read_recording(shipped("concealed")), rng=rng)
 
 

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_common, add_out_directory, add_path, parse_path, say
+from probewise.cli._common import Verb, add_common, add_out_directory, add_path, parse_path, print_result
 from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import is_journal, journal_recording, journal_sensor
-from probewise.cli._output import Stage, check_out_directory, staged
+from probewise.cli._output import Stage, check_out_directory, staged_output
 from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
 
@@ -66,7 +66,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = check_out_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
         recordings, sensor, shape = _read_inputs(arguments, progress=progress)
-        diagnosis_rng, nested_rng, files_rng = generators(arguments.seed)
+        diagnosis_rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
         joined = join(recordings)
         null = None
         if sensor is not None and shape is not None:
@@ -88,13 +88,13 @@ def run(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         drawn = report.figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
-        with staged(out, inputs=_files_to_keep(arguments, out), outdated=OF_ONE_RUN) as stage:
+        with staged_output(out, inputs=_files_to_keep(arguments, out), outdated=OF_ONE_RUN) as stage:
             write_results(diagnosis, drawn, stage, rng=files_rng)
             page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
             stage.write("report.html", page)
     for note in (*joined.notes, *stage.notes):
-        say(f"note: {note}", quiet=arguments.quiet)
-    say(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+        print_result(f"note: {note}", quiet=arguments.quiet)
+    print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 
@@ -122,7 +122,7 @@ def _read_inputs(
     return recordings, sensor, shape
 
 
-def generators(seed: int) -> Sequence[np.random.Generator]:
+def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
     """Return the generators of a diagnosis, of its nested sampling, and of the samples in its files."""
     import numpy as np
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import SCENE
-from probewise.cli._common import Verb, add_common, add_path, parse_path, say
+from probewise.cli._common import Verb, add_common, add_path, parse_path, print_result
 from probewise.cli._output import check_out_file
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError, ParameterError
@@ -71,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
 
     from probewise.cli._bench import world_of
-    from probewise.emulator import Faults, parse_scene, read_geometry, set_up, shipped_geometry
+    from probewise.emulator import Faults, parse_scene, read_geometry, set_up_bench, shipped_geometry
     from probewise.emulator.pty import Terminal, serve
 
     geometry = read_geometry(shipped_geometry() if arguments.geometry is None else arguments.geometry)
@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     faults = Faults.parse(arguments.fault)
     world, _ = world_of(arguments.sensor)
     with _telegram_log(arguments.log) as trace, Terminal(arguments.link) as terminal:
-        bench = set_up(
+        bench = set_up_bench(
             geometry,
             world,
             surface,
@@ -90,19 +90,19 @@ def run(arguments: argparse.Namespace) -> int:
             sleep_min=arguments.sleep,
             trace=trace,
         )
-        say(terminal.path)
-        say(
+        print_result(terminal.path)
+        print_result(
             f"seed {arguments.seed}, scene {arguments.scene}; type another, `turn DEGREES` or `where`; end with Ctrl-C",
             quiet=arguments.quiet,
         )
         with reporting_what_is_kept(lambda: "the device is gone"):
-            serve(terminal, bench.radio, time.monotonic, on_move=say, meanwhile=_Listener(bench).listen)
-    say(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
+            serve(terminal, bench.radio, time.monotonic, on_move=print_result, meanwhile=_Listener(bench).listen)
+    print_result(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
     return 0
 
 
 class _Listener:
-    """Executes commands typed at the emulator: a scene, `turn DEGREES`, `where`; reports a sensor in the table."""
+    """Executes typed commands (a scene, `turn DEGREES`, `where`); warns if the sensor is below the table top."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
@@ -113,7 +113,8 @@ class _Listener:
         stand = self._bench.arm.sensor_pose()
         if (stand.height_mm < 0) is not self._is_in_table:
             self._is_in_table = stand.height_mm < 0
-            say(f"{'the sensor went through' if self._is_in_table else 'it came out of'} the table: {_place(stand)}")
+            event = "the sensor went through" if self._is_in_table else "it came out of"
+            print_result(f"{event} the table: {_position_in_words(stand)}")
         while self._is_heard and select.select([0], [], [], 0)[0] and _is_foreground():
             typed = os.read(0, 4096)
             self._is_heard = bool(typed)
@@ -123,16 +124,16 @@ class _Listener:
 
     def _execute_line(self, line: str) -> None:
         if line.strip() == "where":
-            say(_place(self._bench.arm.sensor_pose()))
+            print_result(_position_in_words(self._bench.arm.sensor_pose()))
             return
         try:
             self._bench.table.carry_out(line)
-            say(f"done: {line}")
+            print_result(f"done: {line}")
         except ParameterError as error:
-            say(str(error))
+            print_result(str(error))
 
 
-def _place(stand: SensorPose) -> str:
+def _position_in_words(stand: SensorPose) -> str:
     """Describe the sensor's position."""
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 
@@ -147,10 +148,10 @@ def _is_foreground() -> bool:
 @contextlib.contextmanager
 def _telegram_log(path: Path | None) -> Iterator[Trace]:
     """Yield a function that writes a line per telegram or fault to the file; without a file it writes nothing."""
-    from probewise.emulator.radio import no_trace
+    from probewise.emulator.radio import ignore_trace
 
     if path is None:
-        yield no_trace
+        yield ignore_trace
         return
     began_s = time.monotonic()
     with check_out_file(path).open("w", encoding="utf-8", buffering=1) as file:

@@ -23,18 +23,18 @@ from probewise.cli._common import (
     add_count,
     add_out_directory,
     add_path,
-    kept_message,
+    message_of_kept_results,
     parse_path,
     positive_int,
-    say,
+    print_result,
 )
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError
 from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
 
 if TYPE_CHECKING:
-    from probewise.cli._explore_arm import Site
+    from probewise.cli._explore_arm import ArmAndTruth
     from probewise.cli._explore_inputs import Inputs
     from probewise.experiment import Exploration, Journal, Step
 
@@ -160,17 +160,17 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise import experiment as posing
     from probewise._progress import progress_shown
-    from probewise.cli._explore_arm import open_site
-    from probewise.cli._explore_inputs import inputs_of
+    from probewise.cli._explore_arm import open_arm_and_truth
+    from probewise.cli._explore_inputs import checked_inputs
     from probewise.cli._explore_pictures import Pictures
     from probewise.experiment import Exploration, explore, read_journal, shadow_run
 
     out = check_out_directory(arguments.out)
-    inputs = inputs_of(arguments)
+    inputs = checked_inputs(arguments)
     journal = out / "journal.jsonl"
     before = _journal_so_far(journal, resume=arguments.resume)
-    site = open_site(arguments, inputs, () if before is None else before.readings)
-    say(f"seed {arguments.seed}", quiet=arguments.quiet)
+    site = open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
+    print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
         warn_of_clearance(inputs.geometry)
         warn_of_place_sd(inputs.geometry, inputs.experiment.stop_sd_mm)
@@ -180,7 +180,7 @@ def run(arguments: argparse.Namespace) -> int:
     def kept() -> str:
         if not journal.exists():
             return "nothing was read"
-        return kept_message(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
+        return message_of_kept_results(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
 
     def tell(doing: str) -> None:
         believed = f"; widest sd {steps[-1].widest_mm:.1f} mm" if steps else ""
@@ -202,7 +202,7 @@ def run(arguments: argparse.Namespace) -> int:
                 max_readings=arguments.max_readings,
                 journal=before or journal,
                 about={
-                    **posing.sensor_named(inputs.sensor, _relative_path(out, arguments.sensor)),
+                    **posing.sensor_entry(inputs.sensor, _relative_path(out, arguments.sensor)),
                     **site.about,
                     "arm": arguments.arm.partition(":")[0],
                 },
@@ -213,22 +213,22 @@ def run(arguments: argparse.Namespace) -> int:
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
-            under = posing.ArmOverGrid.under(site.arm, inputs.other.grid)
+            under = posing.ArmOverGrid.of(site.arm, inputs.other.grid)
             pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.add(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
     drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
         pictures.write_results(stage, result, seed=arguments.seed, known=site.known)
     for line in _closing_lines(result, inputs, site, journal):
-        say(line, quiet=arguments.quiet)
-    say(f"written to {out}", quiet=arguments.quiet)
+        print_result(line, quiet=arguments.quiet)
+    print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 
-def _closing_lines(result: Exploration, inputs: Inputs, site: Site, journal: Path) -> Iterator[str]:
+def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journal: Path) -> Iterator[str]:
     """Yield the closing lines: the shape found, errors that its sds leave out, and probable faults of the sensor."""
     from probewise import experiment as posing
     from probewise.report import exploration as report

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, parse_path, say
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, parse_path, print_result
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.cli._simulator import add_simulator, read_tables
 
 
@@ -39,15 +39,15 @@ def run(arguments: argparse.Namespace) -> int:
         fitted = fit_simulator(simulator, table, source=source, notes=notes, rng=rng, progress=progress)
         progress("drawing the figures")
         drawn = report.figures(fitted)
-    with staged(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
+    with staged_output(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
         stage.write_json("fit.json", fit_json(fitted))
         write_fitted_system(fitted.fitted, stage / "fitted.json")
         stage.write("samples.csv", samples_csv(fitted.fitted))
         stage.write_figures(drawn)
         stage.write("report.html", report.write_page(fitted, drawn, seed=arguments.seed))
     for note in (*notes, *stage.notes):
-        say(f"note: {note}", quiet=arguments.quiet)
-    say(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
+        print_result(f"note: {note}", quiet=arguments.quiet)
+    print_result(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 

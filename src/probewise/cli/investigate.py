@@ -17,12 +17,12 @@ from probewise.cli._common import (
     add_count,
     add_out_directory,
     add_path,
-    kept_message,
+    message_of_kept_results,
     positive_number,
-    say,
+    print_result,
 )
-from probewise.cli._output import check_out_directory, staged
-from probewise.cli._plans import for_lego_arm, for_own_instrument, plan_of
+from probewise.cli._output import check_out_directory, staged_output
+from probewise.cli._plans import for_lego_arm, for_own_instrument, read_or_shipped_plan
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
@@ -112,7 +112,11 @@ def run(arguments: argparse.Namespace) -> int:
     sensor = None if arguments.sensor is None else read_sensor(arguments.sensor)
     truth_seed, noise_seed, rounds_seed, files_seed = np.random.SeedSequence(arguments.seed).spawn(4)
     noise = int(noise_seed.generate_state(1)[0])
-    world = _world(arguments.truth, np.random.default_rng(truth_seed)) if chosen.kind == "simulated" else None
+    world = (
+        _shipped_world_with_effects(arguments.truth, np.random.default_rng(truth_seed))
+        if chosen.kind == "simulated"
+        else None
+    )
     settings = {
         "arm": arguments.arm,
         "plan": fingerprint(Recording(plan, np.zeros(len(plan)))),
@@ -124,9 +128,9 @@ def run(arguments: argparse.Namespace) -> int:
     folder = RoundsFolder(out / "rounds", settings, resume=arguments.resume)
 
     def kept() -> str:
-        return kept_message(folder.path, folder.n_readings, "reading", arguments, "--resume")
+        return message_of_kept_results(folder.path, folder.n_readings, "reading", arguments, "--resume")
 
-    say(f"seed {arguments.seed}", quiet=arguments.quiet)
+    print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     rounds = []
     with contextlib.ExitStack() as stack:
         stack.enter_context(reporting_what_is_kept(kept))
@@ -149,7 +153,11 @@ def run(arguments: argparse.Namespace) -> int:
     found = Investigation(tuple(rounds))
     diagnosis = found.last.diagnosis
     drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out, outdated=OF_ONE_RUN) as stage:
+    with (
+        reporting_what_is_kept(kept, results=True),
+        drawing as progress,
+        staged_output(out, outdated=OF_ONE_RUN) as stage,
+    ):
         progress("drawing the report")
         drawn = of_a_diagnosis.figures(diagnosis)
         write_results(diagnosis, drawn, stage, rng=np.random.default_rng(files_seed))
@@ -158,16 +166,16 @@ def run(arguments: argparse.Namespace) -> int:
         concealed = None if world is None else tuple(effect.name for effect in world.concealed)
         page = report.write_page(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
         stage.write("report.html", page)
-    say(found.summary(), quiet=arguments.quiet)
+    print_result(found.summary(), quiet=arguments.quiet)
     if concealed is not None:
-        say(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
-    say(f"written to {out}", quiet=arguments.quiet)
+        print_result(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
+    print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 
 def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
     """Read the first plan, adapted to the chosen arm."""
-    plan = plan_of(arguments.plan)
+    plan = read_or_shipped_plan(arguments.plan)
     if chosen.kind == "simulated":
         return plan
     if arguments.no_hands and len(set(plan.pattern.tolist())) > 1:
@@ -189,7 +197,7 @@ def _opened_take(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsF
     if arguments.origin_mm is not None:
         origin = parse_place("--origin-mm", arguments.origin_mm)
     opened, bench = open_arm(
-        chosen, geometry, arguments.geometry, seed=seed, start_s=folder.ended_s, n_taken=folder.n_readings
+        chosen, geometry, arguments.geometry, seed=seed, start_s=folder.last_time_s, n_taken=folder.n_readings
     )
     with opened as arm:
         by_hand, laid = prompter(arm), list[str]()
@@ -197,7 +205,7 @@ def _opened_take(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsF
         def take(number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
             def ask(request: Request) -> None:
                 if bench is not None:
-                    bench.lay(plan.patterns, origin, request)
+                    bench.carry_out_request(plan.patterns, origin, request)
                 elif not arguments.no_hands:
                     by_hand(request)
                 elif request.pattern is None or laid:
@@ -209,7 +217,7 @@ def _opened_take(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsF
         yield take
 
 
-def _world(truth: str | None, rng: np.random.Generator) -> World:
+def _shipped_world_with_effects(truth: str | None, rng: np.random.Generator) -> World:
     """Build the world of the shipped recordings, with the effects to conceal."""
     from dataclasses import replace
 

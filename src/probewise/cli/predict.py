@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import Verb, add_common, add_path, parse_path, say
+from probewise.cli._common import Verb, add_common, add_path, parse_path, print_result
 from probewise.cli._journal import refuse_journal
 from probewise.cli._output import check_out_file
 from probewise.cli._simulator import add_simulator
@@ -42,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress(f"writing {out.name}")
         out.parent.mkdir(parents=True, exist_ok=True)
         write_prediction(prediction, out)
-    say(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
+    print_result(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
     return 0
 
 
@@ -67,7 +67,7 @@ def _predict_by_simulator(arguments: argparse.Namespace) -> int:
         prediction = predict_system(fitted, table, rng=np.random.default_rng(arguments.seed), progress=progress)
     out.parent.mkdir(parents=True, exist_ok=True)
     write_system_prediction(prediction, out)
-    say(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
+    print_result(f"{prediction.summary()}\nwritten to {out}", quiet=arguments.quiet)
     return 0
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, geometry_of
-from probewise.cli._common import CommandError, Verb, add_quiet, parse_path, say
+from probewise.cli._common import CommandError, Verb, add_quiet, parse_path, print_result
 from probewise.cli._output import check_out_file
 from probewise.errors import ParameterError
 
@@ -54,13 +54,13 @@ def run(arguments: argparse.Namespace) -> int:
         n = len(tiles_of(sheet, arguments.paper))
         width, height = sheet.size_mm
         pages = f"{n} page{'s' if n > 1 else ''}"
-        say(f"{sheet.name:<12} {width:g} x {height:g} mm, {pages}: {sheet.lines[0]}", quiet=arguments.quiet)
-    say(f"print at 100 % on {arguments.paper}, and measure the ruler: {out}", quiet=arguments.quiet)
+        print_result(f"{sheet.name:<12} {width:g} x {height:g} mm, {pages}: {sheet.lines[0]}", quiet=arguments.quiet)
+    print_result(f"print at 100 % on {arguments.paper}, and measure the ruler: {out}", quiet=arguments.quiet)
     return 0
 
 
 def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
-    from probewise.cli._plans import plan_of
+    from probewise.cli._plans import read_or_shipped_plan
     from probewise.recordings.description import read_description
     from probewise.report.sheets import field_sheet, jig_sheets, marks_sheet, plan_sheets, target_sheet
 
@@ -90,7 +90,7 @@ def _sheets_to_draw(arguments: argparse.Namespace) -> tuple[Sheet, ...]:
         if not beside.exists():
             return plan_sheets(read_description(path).patterns)
         what = str(beside)
-    plan = plan_of(what)
+    plan = read_or_shipped_plan(what)
     return plan_sheets(plan.patterns, plan)
 
 

@@ -7,9 +7,9 @@ import shlex
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, say
-from probewise.cli._executor import add_executor, campaign_kept_message, campaign_running
-from probewise.cli._output import check_out_directory, staged
+from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, print_result
+from probewise.cli._executor import add_executor, campaign_running, message_of_kept_campaign
+from probewise.cli._output import check_out_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
@@ -82,18 +82,18 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--circles", arguments.circles, "2 or more: one circle gives no standard error")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "trials.jsonl"
-    kept = partial(campaign_kept_message, trials, "run", arguments)
+    kept = partial(message_of_kept_campaign, trials, "run", arguments)
     with campaign_running(trials, "run", arguments) as (executor, progress):
         study = run_study(
             numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=progress
         )
     drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged(out) as stage:
+    with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
         stage.write("table.csv", report.table_csv(study))
         stage.write("report.html", report.write_page(study, command=_command_line(arguments)))
-    say(report.answer(study), quiet=arguments.quiet)
-    say(f"written to {out}", quiet=arguments.quiet)
+    print_result(report.summary_sentence(study), quiet=arguments.quiet)
+    print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 
@@ -121,11 +121,11 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
         )
     table = concealed_table(found)
     rows = concealed_rows(found)
-    with staged(out) as stage:
+    with staged_output(out) as stage:
         stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
         stage.write("report.html", report.write_page(rows, command=_concealed_command(arguments)))
-    say(report.answer(rows), quiet=arguments.quiet)
-    say(f"written to {out}", quiet=arguments.quiet)
+    print_result(report.summary_sentence(rows), quiet=arguments.quiet)
+    print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
 
 

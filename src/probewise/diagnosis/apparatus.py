@@ -67,6 +67,10 @@ class Apparatus(Protocol):
         """Return the names of the user's own effects, which are always tried."""
         ...
 
+    def spent_refit_budget(self) -> float:
+        """Return the share of the budget of costly predictions that is spent: 1 or more if it is used up."""
+        ...
+
     def refit_budget_is_spent(self, share: float = 1.0) -> bool:
         """Return whether this share of the budget of costly predictions is spent.
 

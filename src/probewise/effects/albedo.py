@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.patches import PatchEffect, bell, scanned_lines
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
 from probewise.scene.regions import edge_distance
@@ -47,13 +47,14 @@ class AlbedoGradient(LinearEffect[SceneView]):
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return replace(
-            value, regions={name: GradedRegion(r, theta) for name, r in _regions_under_readings(value, plan).items()}
+            value,
+            regions={name: RegionWithGradient(r, theta) for name, r in _regions_under_readings(value, plan).items()},
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the signal over white changes by {give_or_take(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
-            f"{give_or_take(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
+            f"the signal over white changes by {value_with_sd(mean[0], sd[0], factor=1e4)} % per 100 mm along X and by "
+            f"{value_with_sd(mean[1], sd[1], factor=1e4)} % per 100 mm along Y, that over black does not: the paper or "
             "its illumination is uneven"
         )
 
@@ -79,20 +80,20 @@ class AlbedoPatch(PatchEffect[SceneView]):
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return replace(
-            value, regions={name: PatchedRegion(r, theta) for name, r in _regions_under_readings(value, plan).items()}
+            value, regions={name: RegionWithPatch(r, theta) for name, r in _regions_under_readings(value, plan).items()}
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         kind = "whiter" if mean[0] > 0 else "darker"
         return (
-            f"within {give_or_take(mean[3], sd[3])} mm of the place ({give_or_take(mean[1], sd[1])}, "
-            f"{give_or_take(mean[2], sd[2])}) mm every pattern is "
-            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than it should be: a stain or a worn area"
+            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
+            f"{value_with_sd(mean[2], sd[2])}) mm every pattern is "
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {kind} than it should be: a stain or a worn area"
         )
 
 
 @dataclass(frozen=True, eq=False)
-class GradedRegion:
+class RegionWithGradient:
     """A region whose albedo is multiplied by 1 + per_mm . (X, Y); `per_mm` has shape (n_samples, 2)."""
 
     region: Region
@@ -116,7 +117,7 @@ class GradedRegion:
 
 
 @seen_by_one.register
-def _(region: GradedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate by Stein's lemma: response times field at the centre, plus a central difference of the response."""
     a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
     x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
@@ -133,7 +134,7 @@ def _(region: GradedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class PatchedRegion:
+class RegionWithPatch:
     """A region and a bell-shaped patch on it; `patch` holds albedo, x, y, r, (n_samples, 4)."""
 
     region: Region
@@ -158,7 +159,7 @@ class PatchedRegion:
 
 
 @seen_by_one.register
-def _(region: PatchedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate the region, then add the patch: under N(m, C) it is a bell of covariance C + r^2 about its centre."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
     from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
@@ -174,7 +175,7 @@ def _regions_under_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]
     return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
 
 
-@edge_distance.register(GradedRegion)
-@edge_distance.register(PatchedRegion)
-def _(region: GradedRegion | PatchedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+@edge_distance.register(RegionWithGradient)
+@edge_distance.register(RegionWithPatch)
+def _(region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return edge_distance(region.region, x_mm, y_mm)

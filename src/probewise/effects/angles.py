@@ -10,8 +10,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
-from probewise.effects.motion import in_scans, mountings
-from probewise.effects.vocabulary import entries, give_or_take
+from probewise.effects.motion import candidate_scan_groups, in_scans
+from probewise.effects.vocabulary import single_column_entries, value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -61,14 +61,14 @@ class ScanAngleError(OneScanEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Take each mounting and each scan as a candidate; None where there is only one."""
-        choices = mountings(extent.plan)
+        choices = candidate_scan_groups(extent.plan)
         return cls(choices=choices) if choices else None
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta) * in_scans(plan, self.scans))
 
     def bank(self) -> FloatArray:
-        return entries(self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0]))
+        return single_column_entries(self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0]))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return f"in {scans_in_words(self.scans)} the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}"
@@ -76,4 +76,4 @@ class ScanAngleError(OneScanEffect[Poses]):
 
 def _extra_turn_in_words(deg: float, sd: float) -> str:
     way = "anticlockwise" if deg > 0 else "clockwise"
-    return f"{give_or_take(abs(deg), sd)} degrees further {way} than commanded"
+    return f"{value_with_sd(abs(deg), sd)} degrees further {way} than commanded"

@@ -46,15 +46,15 @@ class ChangePointEffect(NamedEffect[V]):
     def prior(self) -> Product:
         """Sizes of either sign, and the time: uniform over the recording, or between two chosen readings."""
         sizes = {name: HeavyTailedPrior(size) for name, size in self.sizes.items()}
-        return Product({**sizes, "at_s": Uniform(*self.open_s)})
+        return Product({**sizes, "at_s": Uniform(*self.change_interval_s)})
 
     def bank(self) -> FloatArray:
         """Return one entry with a column for each amplitude, its time in the middle of the open interval."""
         sizes = np.diag(list(self.sizes.values()))
-        return np.column_stack([sizes, np.full(len(sizes), sum(self.open_s) / 2)])[None, :, :]
+        return np.column_stack([sizes, np.full(len(sizes), sum(self.change_interval_s) / 2)])[None, :, :]
 
     @property
-    def open_s(self) -> tuple[float, float]:
+    def change_interval_s(self) -> tuple[float, float]:
         """Bounds of the interval in which the change point may lie, s."""
         return self.between_s or (self.times_s[0], self.times_s[-1])
 

@@ -31,6 +31,6 @@ def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, ste
 
 
 def log_mass_between(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the log of a standard normal's mass between bounds of which the greater is not far in the upper tail."""
+    """Return the log of a standard normal's mass between two bounds; the greater must not lie far in the upper tail."""
     log_low, log_high = log_ndtr(low), log_ndtr(high)
     return np.asarray(log_high + np.log(-np.expm1(np.minimum(log_low - log_high, -1e-15))))

@@ -14,7 +14,7 @@ from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.patches import bell
-from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
+from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.recordings.plan import Plan
@@ -42,7 +42,7 @@ class EdgeBlur(LinearEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical width to 2 % of the longest scan."""
+        """Set the typical width to 2 % of the length of the longest scan."""
         return cls(typical_mm=0.02 * extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
@@ -59,7 +59,7 @@ class EdgeBlur(LinearEffect[Footprint]):
         return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the printed edges are soft: blurred by {give_or_take(mean[0], sd[0])} mm (sd)"
+        return f"the printed edges are soft: blurred by {value_with_sd(mean[0], sd[0])} mm (sd)"
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Halo(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search radii from a tenth of the longest scan to its whole length."""
+        """Search radii from a tenth of the length of the longest scan to all of it."""
         return cls(narrowest_mm=0.1 * extent.length_mm, widest_mm=extent.length_mm)
 
     @cached_property
@@ -112,12 +112,12 @@ class Halo(NamedEffect[Footprint]):
         )
 
     def bank(self) -> FloatArray:
-        return entries(0.02, np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5))
+        return single_column_entries(0.02, np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"a wide halo around the sensor's spot, of sd {give_or_take(mean[1], sd[1])} mm, contributes "
-            f"{give_or_take(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
+            f"a wide halo around the sensor's spot, of sd {value_with_sd(mean[1], sd[1])} mm, contributes "
+            f"{value_with_sd(mean[0], sd[0], factor=100)} % of the light: the lens scatters it"
         )
 
 
@@ -143,7 +143,7 @@ class EdgeShadow(NamedEffect[View]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search widths from a hundredth to a third of the longest scan.
+        """Search widths from a hundredth to a third of the length of the longest scan.
 
         Raised edges may belong to all kinds of pattern, to one kind, or to all kinds but one.
         """
@@ -176,15 +176,15 @@ class EdgeShadow(NamedEffect[View]):
         return tuple(replace(self, patterns=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        return entries(self.typical, np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6))
+        return single_column_entries(self.typical, np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         kind = "darker" if mean[0] > 0 else "brighter"
         where = f" of pattern {', '.join(self.patterns)}" if self.patterns else ""
         why = "the edge casts a shadow" if mean[0] > 0 else "the edge reflects light"
         return (
-            f"within {give_or_take(mean[1], sd[1])} mm of an edge{where} the surface looks "
-            f"{give_or_take(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: {why}"
+            f"within {value_with_sd(mean[1], sd[1])} mm of an edge{where} the surface looks "
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {kind} than the pattern explains: {why}"
         )
 
 

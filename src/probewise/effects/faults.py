@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import NoiseRows
-from probewise.effects.vocabulary import NoiseEffect, give_or_take
+from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
@@ -42,8 +42,8 @@ class Outliers(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"outliers: {give_or_take(mean[0], sd[0], factor=100)} % of the readings scatter "
-            f"{give_or_take(mean[1], sd[1])} times as widely as the others"
+            f"outliers: {value_with_sd(mean[0], sd[0], factor=100)} % of the readings scatter "
+            f"{value_with_sd(mean[1], sd[1])} times as widely as the others"
         )
 
 
@@ -69,7 +69,7 @@ class Dropouts(NoiseEffect):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Allow any value from 1 % below the range of the readings to 1 % above; note the declared range's ends."""
         low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
-        return cls(low, high, extent.plan.instrumentation.ends, unit=extent.unit)
+        return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -96,6 +96,6 @@ class Dropouts(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"readings are lost: {give_or_take(mean[0], sd[0], factor=100)} % of them read "
-            f"{give_or_take(mean[1], sd[1], self.unit)}, whatever the true value"
+            f"readings are lost: {value_with_sd(mean[0], sd[0], factor=100)} % of them read "
+            f"{value_with_sd(mean[1], sd[1], self.unit)}, whatever the true value"
         )

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
+from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -50,13 +50,13 @@ class GainDrift(NamedEffect[FloatArray]):
         return np.asarray(value * (1 + theta[:, :1] * fade))
 
     def bank(self) -> FloatArray:
-        return entries(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7))
+        return single_column_entries(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         side = "too strong" if mean[0] > 0 else "too weak"
         return (
-            f"the signal starts {give_or_take(abs(mean[0]), sd[0], factor=100)} % {side} at time 0 and settles "
-            f"with a time constant of {give_or_take(mean[1], sd[1])} s: the lamp warms up"
+            f"the signal starts {value_with_sd(abs(mean[0]), sd[0], factor=100)} % {side} at time 0 and settles "
+            f"with a time constant of {value_with_sd(mean[1], sd[1])} s: the lamp warms up"
         )
 
 
@@ -90,7 +90,7 @@ class BatterySag(LinearEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "loses" if mean[0] > 0 else "gains"
         return (
-            f"the signal {way} {give_or_take(abs(mean[0]), sd[0], factor=100)} % for each volt that the battery "
+            f"the signal {way} {value_with_sd(abs(mean[0]), sd[0], factor=100)} % for each volt that the battery "
             "falls: the lamp follows the battery"
         )
 

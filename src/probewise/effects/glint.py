@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.patches import PatchEffect, bell, scanned_lines
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
@@ -41,7 +41,7 @@ class Glint(PatchEffect[FloatArray]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"within {give_or_take(mean[3], sd[3])} mm of the place ({give_or_take(mean[1], sd[1])}, "
-            f"{give_or_take(mean[2], sd[2])}) mm the readings are {give_or_take(abs(mean[0]), sd[0], self.unit)} too "
+            f"within {value_with_sd(mean[3], sd[3])} mm of the place ({value_with_sd(mean[1], sd[1])}, "
+            f"{value_with_sd(mean[2], sd[2])}) mm the readings are {value_with_sd(abs(mean[0]), sd[0], self.unit)} too "
             f"{'high' if mean[0] > 0 else 'low'}, over black and white alike: a reflection"
         )

@@ -64,7 +64,7 @@ class HeavyTailedPrior:
         else:
             tail, sign = np.minimum(u, 1.0 - u), np.where(u < 0.5, -1.0, 1.0)
         goal = -np.log(2 * np.clip(tail, 1e-15, 0.5))
-        return np.asarray(sign * self.typical * _tabulate_quantiles(self.smallest, self.largest).at(goal))
+        return np.asarray(sign * self.typical * _tabulate_quantiles(self.smallest, self.largest).sizes_at(goal))
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, any shape."""
@@ -87,7 +87,7 @@ class _QuantileTable:
     depth: FloatArray
     size: FloatArray
 
-    def at(self, goal: FloatArray) -> FloatArray:
+    def sizes_at(self, goal: FloatArray) -> FloatArray:
         """Return the sizes at which -log(2 x upper tail) equals `goal`, any shape."""
         x = np.interp(goal, self.depth, self.size)
         for _ in range(3):

@@ -8,10 +8,10 @@ from typing import Self
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
-from probewise.effects.motion import in_scans, mountings
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.motion import candidate_scan_groups, in_scans
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
-from probewise.sensor.commanded import raised
+from probewise.sensor.commanded import footprint_at_height
 from probewise.sensor.stages import Footprint, Stage
 
 _USUAL_MM = 14.0  # the height assumed where a recording gives none
@@ -39,12 +39,12 @@ class HeightGradient(LinearEffect[Footprint]):
         return cls(typical=0.01 * _nominal_height_mm(extent.plan) / extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return raised(value, 1 + theta[:, :1] * plan.x_mm / _nominal_height_mm(plan))
+        return footprint_at_height(value, 1 + theta[:, :1] * plan.x_mm / _nominal_height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "grows" if mean[0] > 0 else "shrinks"
         return (
-            f"the sensor's height above the surface {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} mm per "
+            f"the sensor's height above the surface {way} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} mm per "
             "100 mm along X: the table slopes"
         )
 
@@ -65,15 +65,15 @@ class HeightOffset(OneScanEffect[Footprint]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical offset to 1 % of the height; None for a single scan."""
-        choices = mountings(extent.plan)
+        choices = candidate_scan_groups(extent.plan)
         return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return raised(value, 1 + theta * in_scans(plan, self.scans) / _nominal_height_mm(plan))
+        return footprint_at_height(value, 1 + theta * in_scans(plan, self.scans) / _nominal_height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "higher" if mean[0] > 0 else "lower"
-        much = give_or_take(abs(mean[0]), sd[0])
+        much = value_with_sd(abs(mean[0]), sd[0])
         return f"in {scans_in_words(self.scans)} the sensor hangs {much} mm {way} than in the others"
 
 

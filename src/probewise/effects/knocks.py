@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -50,9 +50,9 @@ class ArmKnock(ChangePointEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"from {give_or_take(mean[3], sd[3])} s on, all positions are off by {give_or_take(mean[0], sd[0])} mm "
-            f"along X and {give_or_take(mean[1], sd[1])} mm along Y, and the sensor is turned by "
-            f"{give_or_take(mean[2], sd[2])} degrees: the arm or the paper was pushed"
+            f"from {value_with_sd(mean[3], sd[3])} s on, all positions are off by {value_with_sd(mean[0], sd[0])} mm "
+            f"along X and {value_with_sd(mean[1], sd[1])} mm along Y, and the sensor is turned by "
+            f"{value_with_sd(mean[2], sd[2])} degrees: the arm or the paper was pushed"
         )
 
 
@@ -84,6 +84,6 @@ class GainStep(ChangePointEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "stronger" if mean[0] > 0 else "weaker"
         return (
-            f"from {give_or_take(mean[1], sd[1])} s on, the signal is {give_or_take(abs(mean[0]), sd[0], factor=100)} "
-            f"% {way}: the lamp or the lens changed suddenly"
+            f"from {value_with_sd(mean[1], sd[1])} s on, the signal is "
+            f"{value_with_sd(abs(mean[0]), sd[0], factor=100)} % {way}: the lamp or the lens changed suddenly"
         )

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import NoiseRows
-from probewise.effects.vocabulary import NoiseEffect, give_or_take
+from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
@@ -59,7 +59,7 @@ class Quantisation(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the readings are rounded to steps of {give_or_take(mean[0], sd[0], self.unit)}, which were not declared"
+            f"the readings are rounded to steps of {value_with_sd(mean[0], sd[0], self.unit)}, which were not declared"
         )
 
 

@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
 from probewise.effects.motion import in_scans
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.patterns import HalfPlane, Ramp, Stripes
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SceneView, Stage
@@ -32,14 +32,14 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical offset to 0.3 % of the longest scan."""
+        """Set the typical offset to 0.3 % of the length of the longest scan."""
         return cls(typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return _shifted_patterns(value, theta * np.ones(len(plan)), plan)
+        return _with_shifted_patterns(value, theta * np.ones(len(plan)), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the printed edges lie {give_or_take(mean[0], sd[0])} mm from their described place, in all scans"
+        return f"the printed edges lie {value_with_sd(mean[0], sd[0])} mm from their described place, in all scans"
 
 
 @dataclass(frozen=True)
@@ -57,23 +57,23 @@ class ScanMisplacement(OneScanEffect[SceneView]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical offset to 0.3 % of the longest scan; None for a single scan."""
+        """Set the typical offset to 0.3 % of the length of the longest scan; None for a single scan."""
         names = tuple(dict.fromkeys(extent.plan.scan_names))
         if len(names) < 2:
             return None
         return cls(choices=tuple((name,) for name in names), typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return _shifted_patterns(value, theta * in_scans(plan, self.scans), plan)
+        return _with_shifted_patterns(value, theta * in_scans(plan, self.scans), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"in {scans_in_words(self.scans)} the pattern lies {give_or_take(mean[0], sd[0])} mm from where it lies "
+            f"in {scans_in_words(self.scans)} the pattern lies {value_with_sd(mean[0], sd[0])} mm from where it lies "
             "in the others"
         )
 
 
-def _shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
+def _with_shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
     """Shift each reading's pattern by `by_mm`, (n_samples, n_points)."""
     angle = np.zeros(len(plan))
     for name, rows in plan.rows_by_pattern():

@@ -25,7 +25,7 @@ def in_scans(plan: Plan, names: tuple[str, ...]) -> FloatArray:
     return np.asarray(member[plan.scan])
 
 
-def mountings(plan: Plan) -> tuple[tuple[str, ...], ...]:
+def candidate_scan_groups(plan: Plan) -> tuple[tuple[str, ...], ...]:
     """List candidate groups of scans: each mounting (the scans that share an orientation) and each single scan.
 
     A group of all scans is left out, since nothing remains to compare it with. A scan in which the

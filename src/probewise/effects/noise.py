@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
 from probewise.effects.noise_distribution import NoiseRows
-from probewise.effects.vocabulary import NoiseEffect, give_or_take
+from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import NoiseLevel, Stage
@@ -42,7 +42,7 @@ class CorrelatedNoise(NoiseEffect):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the noise of successive readings has correlation {give_or_take(mean[0], sd[0])}: "
+            f"the noise of successive readings has correlation {value_with_sd(mean[0], sd[0])}: "
             "part of each error returns in the next reading"
         )
 
@@ -70,7 +70,7 @@ class SignalDependentNoise(NoiseEffect):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
             f"the noise grows with the reading: its variance at the highest level is "
-            f"{give_or_take(1 + mean[0], sd[0])} times that at the lowest"
+            f"{value_with_sd(1 + mean[0], sd[0])} times that at the lowest"
         )
 
 
@@ -99,7 +99,7 @@ class DriftingNoise(NoiseEffect):
         return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the sd of the noise at the end is {give_or_take(mean[0], sd[0])} times that at the start"
+        return f"the sd of the noise at the end is {value_with_sd(mean[0], sd[0])} times that at the start"
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class RandomWalk(NoiseEffect):
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the offset is a random walk with steps of sd {give_or_take(mean[0], sd[0])} noise sds from row to row"
+        return f"the offset is a random walk with steps of sd {value_with_sd(mean[0], sd[0])} noise sds from row to row"
 
 
 _SPREADS = (0.1, 0.2, 0.4, 0.8, 1.6)  # hyperprior, equal weights: sds between runs of the logarithm of a run's sd
@@ -227,8 +227,8 @@ class NoisePerRun(NoiseEffect):
         """Say which runs have the least and the most noise."""
         low, high = int(np.argmin(mean)), int(np.argmax(mean))
         return (
-            f"the noise differs from run to run: its sd is {give_or_take(mean[high], sd[high])} times the typical one "
-            f"in run {self.runs[high]} and {give_or_take(mean[low], sd[low])} times in run {self.runs[low]}"
+            f"the noise differs from run to run: its sd is {value_with_sd(mean[high], sd[high])} times the typical one "
+            f"in run {self.runs[high]} and {value_with_sd(mean[low], sd[low])} times in run {self.runs[low]}"
         )
 
 

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.change_points import ChangePointEffect, change_point_times
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
 
@@ -43,8 +43,8 @@ class AmbientGradient(LinearEffect[FloatArray]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the reading changes by {give_or_take(mean[0], sd[0], self.unit, factor=100)} per 100 mm along X and by "
-            f"{give_or_take(mean[1], sd[1], self.unit, factor=100)} per 100 mm along Y, over black and white alike: "
+            f"the reading changes by {value_with_sd(mean[0], sd[0], self.unit, factor=100)} per 100 mm along X and by "
+            f"{value_with_sd(mean[1], sd[1], self.unit, factor=100)} per 100 mm along Y, over black and white alike: "
             "stray light from one side"
         )
 
@@ -74,7 +74,7 @@ class OffsetDrift(LinearEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > 0 else "falls"
         return (
-            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0], self.unit)} per hour, over black and white "
+            f"the reading {way} by {value_with_sd(abs(mean[0]), sd[0], self.unit)} per hour, over black and white "
             "alike: the electronics or the room light drift"
         )
 
@@ -112,6 +112,6 @@ class AmbientStep(ChangePointEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "jumps up" if mean[0] > 0 else "drops"
         return (
-            f"the reading {way} by {give_or_take(abs(mean[0]), sd[0], self.unit)} at {give_or_take(mean[1], sd[1])} s "
-            "and stays there, over black and white alike: the room light changed"
+            f"the reading {way} by {value_with_sd(abs(mean[0]), sd[0], self.unit)} at "
+            f"{value_with_sd(mean[1], sd[1])} s and stays there, over black and white alike: the room light changed"
         )

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -34,7 +34,7 @@ class Backlash(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical width to 0.5 % of the longest scan."""
+        """Set the typical width to 0.5 % of the length of the longest scan."""
         return cls(typical_mm=0.005 * extent.length_mm)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -48,8 +48,8 @@ class Backlash(LinearEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the arm comes to rest {give_or_take(mean[0], sd[0], factor=0.5)} mm short of where it was sent, "
-            f"on the side it came from: gear play of {give_or_take(mean[0], sd[0])} mm"
+            f"the arm comes to rest {value_with_sd(mean[0], sd[0], factor=0.5)} mm short of where it was sent, "
+            f"on the side it came from: gear play of {value_with_sd(mean[0], sd[0])} mm"
         )
 
 
@@ -83,6 +83,6 @@ class PositionScale(LinearEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the arm moves {give_or_take(mean[0], sd[0], factor=100)} % too far along X and "
-            f"{give_or_take(mean[1], sd[1], factor=100)} % along Y: the scale of its positions is wrong"
+            f"the arm moves {value_with_sd(mean[0], sd[0], factor=100)} % too far along X and "
+            f"{value_with_sd(mean[1], sd[1], factor=100)} % along Y: the scale of its positions is wrong"
         )

@@ -57,7 +57,7 @@ class PredictiveMixture:
             log_p = log_density(_noise_of_rows(level, self.scored), self.readings[self.scored], mean[:, self.scored])
             self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
 
-    def finished(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def mean_sd_and_log_density(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return mean and sd of a new reading at each row, and log density of the measured one: (n_points,) each.
 
         The density is NaN where a reading is not scored.

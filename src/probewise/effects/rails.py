@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NamedEffect, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
@@ -37,7 +37,7 @@ class BentRails(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical quadratic error to 0.5 % of the longest scan at half its length."""
+        """Set the typical quadratic error to 0.5 % of the longest scan's length, at half of it or 10 mm if more."""
         return cls(typical_mm=0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -49,7 +49,7 @@ class BentRails(LinearEffect[Poses]):
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        of_x, of_y = (give_or_take(mean[k] + mean[k + 1], float(np.hypot(sd[k], sd[k + 1]))) for k in (0, 2))
+        of_x, of_y = (value_with_sd(mean[k] + mean[k + 1], float(np.hypot(sd[k], sd[k + 1]))) for k in (0, 2))
         return f"the rails are bent: 10 mm from the origin the arm is off by {of_x} mm along X and {of_y} mm along Y"
 
 
@@ -74,7 +74,7 @@ class MissingTooth(NamedEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical jump to 0.5 % of the longest scan; None where no axis takes more than two positions."""
+        """Set the typical jump to 0.5 % of the longest scan's length; None where no axis has over two positions."""
         places = tuple(_thinned_positions(axis) for axis in (extent.plan.x_mm, extent.plan.y_mm))
         return cls(0.005 * extent.length_mm, (places[0], places[1])) if any(len(own) > 2 for own in places) else None
 
@@ -101,7 +101,7 @@ class MissingTooth(NamedEffect[Poses]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         axis = "Y" if mean[2] > 0.5 else "X"
         return (
-            f"beyond {axis} = {give_or_take(mean[1], sd[1])} mm the arm is {give_or_take(mean[0], sd[0])} mm off "
+            f"beyond {axis} = {value_with_sd(mean[1], sd[1])} mm the arm is {value_with_sd(mean[0], sd[0])} mm off "
             f"along {axis}: a tooth is missing"
         )
 

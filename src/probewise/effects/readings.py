@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.motion import direction_varies, sign_of_motion
-from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
+from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -44,8 +44,8 @@ class Hysteresis(LinearEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "higher" if mean[0] > 0 else "lower"
         return (
-            f"readings of forward motion are {give_or_take(abs(mean[0]), sd[0], self.unit, factor=2)} {way} than those "
-            "of backward motion, over black and white alike: hysteresis"
+            f"readings of forward motion are {value_with_sd(abs(mean[0]), sd[0], self.unit, factor=2)} {way} than "
+            "those of backward motion, over black and white alike: hysteresis"
         )
 
 
@@ -98,10 +98,10 @@ class Lag(NamedEffect[FloatArray]):
         return held
 
     def bank(self) -> FloatArray:
-        return entries(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
+        return single_column_entries(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"each reading keeps part of the previous one, with a time constant of {give_or_take(mean[0], sd[0])} s: "
+            f"each reading keeps part of the previous one, with a time constant of {value_with_sd(mean[0], sd[0])} s: "
             "the electronics lag"
         )

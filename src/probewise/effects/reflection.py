@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
+from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint, Stage
@@ -63,12 +63,12 @@ class Reflection(NamedEffect[Footprint]):
         angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES
         far = self.farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
         dx, dy = (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()
-        return entries(self.typical, dx, dy)
+        return single_column_entries(self.typical, dx, dy)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"a second spot, {give_or_take(mean[1], sd[1])} mm along X and {give_or_take(mean[2], sd[2])} mm along Y "
-            f"from the first, contributes {give_or_take(mean[0], sd[0], factor=100)} % of the light: a reflection"
+            f"a second spot, {value_with_sd(mean[1], sd[1])} mm along X and {value_with_sd(mean[2], sd[2])} mm along Y "
+            f"from the first, contributes {value_with_sd(mean[0], sd[0], factor=100)} % of the light: a reflection"
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, entries, give_or_take
+from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -41,11 +41,11 @@ class Nonlinearity(NamedEffect[FloatArray]):
         return np.asarray(np.clip(value, 0.0, 1.0) ** theta[:, :1])
 
     def bank(self) -> FloatArray:
-        return entries(np.exp(self.typical_log * np.array([-1.0, 1.0])))
+        return single_column_entries(np.exp(self.typical_log * np.array([-1.0, 1.0])))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         seen = 100 * 0.5 ** mean[0]
         return (
-            f"the response is bent with exponent {give_or_take(mean[0], sd[0])}: "
+            f"the response is bent with exponent {value_with_sd(mean[0], sd[0])}: "
             f"a half-white view reads as {seen:.1f} % white"
         )

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.vocabulary import NamedEffect, give_or_take
+from probewise.effects.vocabulary import NamedEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -75,6 +75,6 @@ class Saturation(NamedEffect[FloatArray]):
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         softness = f"{mean[1]:.2g} {self.unit}".rstrip()
         return (
-            f"no reading rises above {give_or_take(mean[0], sd[0], self.unit)}: the electronics saturate, "
+            f"no reading rises above {value_with_sd(mean[0], sd[0], self.unit)}: the electronics saturate, "
             f"from about {softness} below that limit"
         )

@@ -8,7 +8,7 @@ from typing import Self
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -36,6 +36,6 @@ class SensorTilt(LinearEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the sensor's spot is off by {give_or_take(mean[0], sd[0])} mm along X and "
-            f"{give_or_take(mean[1], sd[1])} mm along Y, whatever the orientation: the sensor is tilted"
+            f"the sensor's spot is off by {value_with_sd(mean[0], sd[0])} mm along X and "
+            f"{value_with_sd(mean[1], sd[1])} mm along Y, whatever the orientation: the sensor is tilted"
         )

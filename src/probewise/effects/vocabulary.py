@@ -180,12 +180,12 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
     """Whether it is physics of the mean, seen in the readings alone."""
 
     @property
-    def seen(self) -> FloatArray | None:
+    def certain_parameters(self) -> FloatArray | None:
         """Parameters (n_params,) that are certain from the readings alone; by default None: they take a fit."""
         return None
 
     def change(self, predicted: FloatArray) -> FloatArray:
-        """Return its change of readings predicted without it, same shape; zeros unless it `changes_the_mean`."""
+        """Return by how much it changes readings predicted without it, same shape; 0 unless it `changes_the_mean`."""
         return np.zeros_like(predicted)
 
     def bank(self) -> FloatArray:
@@ -209,12 +209,12 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
         return None
 
 
-def entries(*parameters: ArrayLike) -> FloatArray:
+def single_column_entries(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of one column from the parameters' values, numbers or (n_bank,): (n_bank, 1, n_params)."""
     return np.stack(np.broadcast_arrays(*parameters), axis=-1)[:, None, :].astype(np.float64)
 
 
-def give_or_take(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:
+def value_with_sd(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:
     """Write mean ± sd and the unit, rounded to two significant digits of the sd."""
     mean, sd = factor * mean, factor * sd
     if np.isfinite(sd) and sd > 0:
@@ -223,3 +223,7 @@ def give_or_take(mean: float, sd: float, unit: str = "", *, factor: float = 1.0)
     else:
         written = f"{mean:.4g}"
     return f"{written} {unit}".rstrip()
+
+
+give_or_take = value_with_sd
+"""The old name of `value_with_sd`."""

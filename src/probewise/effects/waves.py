@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, V, entries, give_or_take
+from probewise.effects.vocabulary import NamedEffect, V, single_column_entries, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
@@ -28,9 +28,9 @@ _SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, dampe
 def sine_and_cosine(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of waves, a sine and a cosine each, (n_bank, 2, n_params).
 
-    `parameters` are those before the phase, which is the last, as in `entries`; the first is the amplitude.
+    `parameters` are those before the phase, which is the last: numbers or (n_bank,); the first is the amplitude.
     """
-    return np.concatenate([entries(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
+    return np.concatenate([single_column_entries(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
 
 
 def amplitude_and_phase(entry: FloatArray, amounts: FloatArray) -> FloatArray:
@@ -92,8 +92,8 @@ class Flicker(_WaveEffect[FloatArray]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the reading oscillates with an amplitude of {give_or_take(mean[0], sd[0], self.unit)} at "
-            f"{give_or_take(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), over black and white alike: "
+            f"the reading oscillates with an amplitude of {value_with_sd(mean[0], sd[0], self.unit)} at "
+            f"{value_with_sd(mean[1], sd[1])} Hz (a period of {1 / mean[1]:.4g} s), over black and white alike: "
             "a lamp flickers"
         )
 
@@ -116,7 +116,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search periods from three steps of X to twice its range; None where X takes fewer than eight positions."""
-        shortest, reach = _steps_and_range(extent.plan)
+        shortest, reach = _three_steps_and_range(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 2 * reach) if reach > 0 else None
 
     @cached_property
@@ -137,8 +137,8 @@ class PeriodicPositionError(_WaveEffect[Poses]):
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the arm's position along X is off by up to {give_or_take(mean[0], sd[0])} mm, with a period of "
-            f"{give_or_take(mean[1], sd[1])} mm: a gear or lead screw is not round"
+            f"the arm's position along X is off by up to {value_with_sd(mean[0], sd[0])} mm, with a period of "
+            f"{value_with_sd(mean[1], sd[1])} mm: a gear or lead screw is not round"
         )
 
 
@@ -161,7 +161,7 @@ class StickSlip(NamedEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search periods from three steps of X to a quarter of its range; None where that is empty."""
-        shortest, reach = _steps_and_range(extent.plan)
+        shortest, reach = _three_steps_and_range(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 0.25 * reach) if 0.25 * reach > shortest else None
 
     @cached_property
@@ -178,16 +178,16 @@ class StickSlip(NamedEffect[Poses]):
     def bank(self) -> FloatArray:
         waves = np.linspace(1.0 / self.longest_mm, 1.0 / self.shortest_mm, self.n_periods + 2)[1:-1]
         periods, phases = np.meshgrid(1 / waves, np.arange(self.n_phases) / self.n_phases - 0.5, indexing="ij")
-        return entries(self.typical_mm, periods.ravel(), phases.ravel())
+        return single_column_entries(self.typical_mm, periods.ravel(), phases.ravel())
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
-            f"the slide sticks and then jumps by {give_or_take(abs(mean[0]), sd[0], factor=2)} mm, once every "
-            f"{give_or_take(mean[1], sd[1])} mm along X: it lacks lubrication"
+            f"the slide sticks and then jumps by {value_with_sd(abs(mean[0]), sd[0], factor=2)} mm, once every "
+            f"{value_with_sd(mean[1], sd[1])} mm along X: it lacks lubrication"
         )
 
 
-def _steps_and_range(plan: Plan) -> tuple[float, float]:
+def _three_steps_and_range(plan: Plan) -> tuple[float, float]:
     """Return three times the median step of X and the range of X, mm; 0 and 0 for fewer than eight positions."""
     x_mm = np.unique(plan.x_mm)
     return (3 * float(np.median(np.diff(x_mm))), float(np.ptp(x_mm))) if len(x_mm) >= 8 else (0.0, 0.0)

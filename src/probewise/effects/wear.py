@@ -10,9 +10,9 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
-from probewise.sensor.commanded import raised
+from probewise.sensor.commanded import footprint_at_height
 from probewise.sensor.stages import Footprint, Poses, Stage
 
 
@@ -39,7 +39,7 @@ class SlowTurn(LinearEffect[Poses]):
         return replace(value, orientation_rad=value.orientation_rad + turn)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        return f"the sensor turns by {give_or_take(mean[0], sd[0])} degrees per hour: it is loose in its holder"
+        return f"the sensor turns by {value_with_sd(mean[0], sd[0])} degrees per hour: it is loose in its holder"
 
 
 @dataclass(frozen=True)
@@ -61,11 +61,11 @@ class SlowSinking(LinearEffect[Footprint]):
         return cls(typical_per_hour=0.01 / (extent.duration_s / 3600))
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return raised(value, 1 + theta[:, :1] * (plan.time_s / 3600))
+        return footprint_at_height(value, 1 + theta[:, :1] * (plan.time_s / 3600))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > 0 else "sinks"
         return (
-            f"the sensor {way} by {give_or_take(abs(mean[0]), sd[0], factor=100)} % of its height per hour: "
+            f"the sensor {way} by {value_with_sd(abs(mean[0]), sd[0], factor=100)} % of its height per hour: "
             "it is loose in its holder"
         )

@@ -5,7 +5,7 @@ sensor over a `world`. It shares no code with the driver in `arm`, so each tests
 """
 
 from probewise.emulator.arm import EmulatedArm, Joint, SensorPose
-from probewise.emulator.bench import Bench, set_up
+from probewise.emulator.bench import Bench, set_up_bench
 from probewise.emulator.brick import Battery, Brick
 from probewise.emulator.clock import Clock, VirtualClock
 from probewise.emulator.faults import Faults
@@ -15,8 +15,8 @@ from probewise.emulator.line import VirtualLine
 from probewise.emulator.motor import Motor, MotorParameters
 from probewise.emulator.radio import Radio, Trace
 from probewise.emulator.scenes import parse_scene
-from probewise.emulator.sensors import Analog, Digital, EmptyPort, LightSensor, sonar
-from probewise.emulator.table import Table
+from probewise.emulator.sensors import AnalogSensor, DigitalSensor, EmptyPort, LightSensor, ultrasonic_sensor
+from probewise.emulator.table import Tabletop
 
 Sight = LightModel
 """The old name of `LightModel`."""
@@ -34,12 +34,12 @@ Light = LightSensor
 """The old name of `LightSensor`."""
 
 __all__ = [
-    "Analog",
+    "AnalogSensor",
     "Battery",
     "Bench",
     "Brick",
     "Clock",
-    "Digital",
+    "DigitalSensor",
     "EmptyPort",
     "EmulatedArm",
     "Faults",
@@ -52,13 +52,22 @@ __all__ = [
     "MotorParameters",
     "Radio",
     "SensorPose",
-    "Table",
+    "Tabletop",
     "Trace",
     "VirtualClock",
     "VirtualLine",
     "parse_scene",
     "read_geometry",
-    "set_up",
+    "set_up_bench",
     "shipped_geometry",
-    "sonar",
+    "ultrasonic_sensor",
 ]
+
+set_up = set_up_bench
+"""The old name of `set_up_bench`."""
+
+sonar = ultrasonic_sensor
+"""The old name of `ultrasonic_sensor`."""
+
+Table = Tabletop
+"""The old name of `Tabletop`."""

@@ -13,9 +13,9 @@ from probewise.emulator.faults import Faults
 from probewise.emulator.geometry import Geometry
 from probewise.emulator.inputs import Sensor
 from probewise.emulator.light_model import LightModel
-from probewise.emulator.radio import Radio, Trace, no_trace
-from probewise.emulator.sensors import EmptyPort, LightSensor, sonar
-from probewise.emulator.table import Table
+from probewise.emulator.radio import Radio, Trace, ignore_trace
+from probewise.emulator.sensors import EmptyPort, LightSensor, ultrasonic_sensor
+from probewise.emulator.table import Tabletop
 from probewise.world import Surface, World
 
 _WALL_CM = 42
@@ -25,12 +25,12 @@ _WALL_CM = 42
 class Bench:
     """The emulated bench; `arm` and `radio.brick` give access to its state."""
 
-    table: Table
+    table: Tabletop
     arm: EmulatedArm
     radio: Radio
 
 
-def set_up(
+def set_up_bench(
     geometry: Geometry,
     world: World,
     surface: Surface,
@@ -40,7 +40,7 @@ def set_up(
     name: str = "NXT",
     faults: Faults | None = None,
     sleep_min: int = 10,
-    trace: Trace = no_trace,
+    trace: Trace = ignore_trace,
 ) -> Bench:
     """Build a bench, the arm at home.
 
@@ -70,12 +70,12 @@ def set_up(
     """
     faults = Faults() if faults is None else faults
     arm = EmulatedArm(geometry)
-    table = Table(surface)
+    table = Tabletop(surface)
     light = LightModel(world, table, arm.sensor_pose, read_height_mm=geometry.read_height_mm, seed=seed, clock=clock)
     sensors: list[Sensor] = [EmptyPort() for _ in range(4)]
     at = geometry.sensor_port - 1
     sensors[at] = LightSensor(light, clock)
-    sensors[0 if at == 3 else 3] = sonar(_WALL_CM)
+    sensors[0 if at == 3 else 3] = ultrasonic_sensor(_WALL_CM)
     brick = Brick(
         clock,
         motors=arm.motors(),

@@ -12,7 +12,7 @@ from probewise.emulator.inputs import Inputs, Sensor
 from probewise.emulator.motor import Motor
 from probewise.emulator.outputs import Outputs
 from probewise.emulator.programs import Programs
-from probewise.emulator.protocol import Refused, Request, Status, parse, reply
+from probewise.emulator.protocol import RefusedError, Request, Status, parse, reply
 from probewise.emulator.sensors import EmptyPort
 from probewise.errors import ParameterError
 
@@ -33,7 +33,7 @@ class Battery:
     full_mv: float = 7412.0
     sag_mv_min: float = 0.0
 
-    def at(self, seconds: float) -> float:
+    def millivolts_after(self, seconds: float) -> float:
         """Return the voltage in mV after some time, at least 5.5 V."""
         return max(self.full_mv - self.sag_mv_min * seconds / 60, 5500.0)
 
@@ -118,7 +118,7 @@ class Brick:
     @property
     def battery_mv(self) -> float:
         """The battery's voltage now."""
-        return self._battery.at(self._clock() - self._began_s)
+        return self._battery.millivolts_after(self._clock() - self._began_s)
 
     @property
     def is_off(self) -> bool:
@@ -149,7 +149,7 @@ class Brick:
             return Status.UNKNOWN_COMMAND, b""
         try:
             return Status.OK, self._commands[request.opcode](*request.command.fields(request.body))
-        except Refused as refused:
+        except RefusedError as refused:
             zeros = bytes(request.command.error_bytes)
             return refused.status, zeros if refused.payload is None else refused.payload
 
@@ -159,7 +159,7 @@ class Brick:
 
     def _play_file(self, loop: int, name: bytes) -> bytes:
         if not self._files.exists(name.split(b"\0")[0].decode("latin-1")):
-            raise Refused(Status.OUT_OF_RANGE)
+            raise RefusedError(Status.OUT_OF_RANGE)
         return b""
 
     def _keep_alive(self) -> bytes:
@@ -174,18 +174,18 @@ class Brick:
         return struct.pack("<15s7s4xI", self._name, ADDRESS, self._files.free)
 
     def _refuse_module(self, wanted: bytes | int) -> bytes:
-        raise Refused(Status.MODULE_NOT_FOUND)
+        raise RefusedError(Status.MODULE_NOT_FOUND)
 
     def _refuse_reading_map(self, module: int, offset: int, wanted: int) -> bytes:
-        raise Refused(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0) + bytes(min(wanted, 119)))
+        raise RefusedError(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0) + bytes(min(wanted, 119)))
 
     def _refuse_writing_map(self, module: int, offset: int, wanted: int, data: bytes) -> bytes:
-        raise Refused(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0))
+        raise RefusedError(Status.MODULE_NOT_FOUND, struct.pack("<IH", module, 0))
 
     def _poll_buffer(self, buffer: int, wanted: int) -> bytes:
         if wanted > _LONGEST_POLL:
-            raise Refused(Status.UNDEFINED_ERROR, bytes((buffer, 0)))
+            raise RefusedError(Status.UNDEFINED_ERROR, bytes((buffer, 0)))
         return bytes((buffer, 0)) + bytes(wanted)
 
     def _refuse_usb_only(self, *fields: bytes) -> bytes:
-        raise Refused(Status.UNDEFINED_ERROR)
+        raise RefusedError(Status.UNDEFINED_ERROR)

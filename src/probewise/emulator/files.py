@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
-from probewise.emulator.protocol import Refused, Status
+from probewise.emulator.protocol import RefusedError, Status
 
 _N_HANDLES = 16
 _NAME = 20
@@ -71,9 +71,9 @@ class Files:
     def _open_to_write(self, name: bytes, size: int) -> bytes:
         text = _checked_name(name)
         if self.exists(text):
-            raise Refused(Status.FILE_EXISTS)
+            raise RefusedError(Status.FILE_EXISTS)
         if size > self.free:
-            raise Refused(Status.NO_SPACE)
+            raise RefusedError(Status.NO_SPACE)
         handle = self._new_handle(_OpenFile(text, size=size))
         self._files[text] = bytearray()
         return bytes((handle,))
@@ -92,19 +92,19 @@ class Files:
         reader.at += len(part)
         payload = struct.pack("<BH", handle, n_read) + part.ljust(n_read, b"\0")
         if len(part) < n_read:
-            raise Refused(Status.END_OF_FILE, payload)
+            raise RefusedError(Status.END_OF_FILE, payload)
         return payload
 
     def _write_file(self, handle: int, data: bytes) -> bytes:
         writer = self._file_of_handle(handle)
         if writer.size is None:
-            raise Refused(Status.ILLEGAL_HANDLE, struct.pack("<BH", handle, 0))
+            raise RefusedError(Status.ILLEGAL_HANDLE, struct.pack("<BH", handle, 0))
         part = data[: writer.size - writer.at]
         self._files[writer.name] += part
         writer.at += len(part)
         payload = struct.pack("<BH", handle, len(part))
         if len(part) < len(data):
-            raise Refused(Status.FILE_FULL, payload)
+            raise RefusedError(Status.FILE_FULL, payload)
         return payload
 
     def _close_file(self, handle: int) -> bytes:
@@ -115,9 +115,9 @@ class Files:
     def _delete_file(self, name: bytes) -> bytes:
         found = self._matching_name(_checked_name(name))
         if found is None:
-            raise Refused(Status.FILE_NOT_FOUND, name)
+            raise RefusedError(Status.FILE_NOT_FOUND, name)
         if any(opened.name == found for opened in self._open_files.values()):
-            raise Refused(Status.FILE_BUSY, name)
+            raise RefusedError(Status.FILE_BUSY, name)
         del self._files[found]
         return name
 
@@ -130,7 +130,7 @@ class Files:
         wanted = _checked_name(pattern).lower()
         matches = tuple(name for name in sorted(self._files) if fnmatchcase(name.lower(), wanted))
         if not matches:
-            raise Refused(Status.FILE_NOT_FOUND)
+            raise RefusedError(Status.FILE_NOT_FOUND)
         return self._next_match(self._new_handle(_OpenFile("", matches=matches)))
 
     def _find_next_file(self, handle: int) -> bytes:
@@ -140,7 +140,7 @@ class Files:
         search = self._file_of_handle(handle)
         matches = tuple(name for name in search.matches if name in self._files)
         if not matches:
-            raise Refused(Status.FILE_NOT_FOUND, bytes((handle,)) + bytes(24))
+            raise RefusedError(Status.FILE_NOT_FOUND, bytes((handle,)) + bytes(24))
         name, search.matches = matches[0], matches[1:]
         return bytes((handle,)) + struct.pack("<20sI", name.encode("latin-1"), len(self._files[name]))
 
@@ -149,19 +149,19 @@ class Files:
             if handle not in self._open_files:
                 self._open_files[handle] = opened
                 return handle
-        raise Refused(Status.NO_MORE_HANDLES)
+        raise RefusedError(Status.NO_MORE_HANDLES)
 
     def _file_of_handle(self, handle: int) -> _OpenFile:
         if handle >= _N_HANDLES:
-            raise Refused(Status.ILLEGAL_HANDLE)
+            raise RefusedError(Status.ILLEGAL_HANDLE)
         if handle not in self._open_files:
-            raise Refused(Status.HANDLE_CLOSED)
+            raise RefusedError(Status.HANDLE_CLOSED)
         return self._open_files[handle]
 
     def _stored_name(self, name: bytes) -> str:
         found = self._matching_name(_checked_name(name))
         if found is None:
-            raise Refused(Status.FILE_NOT_FOUND)
+            raise RefusedError(Status.FILE_NOT_FOUND)
         return found
 
     def _matching_name(self, name: str) -> str | None:
@@ -171,5 +171,5 @@ class Files:
 def _checked_name(name: bytes) -> str:
     text = name.split(b"\0")[0].decode("latin-1")
     if not 1 <= len(text) < _NAME or "." not in text:
-        raise Refused(Status.ILLEGAL_FILE_NAME)
+        raise RefusedError(Status.ILLEGAL_FILE_NAME)
     return text

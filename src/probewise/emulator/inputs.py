@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from probewise.emulator.clock import Clock
-from probewise.emulator.protocol import Refused, Status
-from probewise.emulator.sensors import AD_MAX, Analog, Digital, EmptyPort
+from probewise.emulator.protocol import RefusedError, Status
+from probewise.emulator.sensors import AD_MAX, AnalogSensor, DigitalSensor, EmptyPort
 
-Sensor: TypeAlias = Analog | Digital
+Sensor: TypeAlias = AnalogSensor | DigitalSensor
 
 _NONE, _LIGHT_ON, _LIGHT_OFF, _SOUND, _DIGITAL = 0x00, 0x05, 0x06, (0x07, 0x08), (0x0A, 0x0B)
 _COLOUR = range(0x0D, 0x12)
@@ -100,7 +100,7 @@ class Inputs:
         if self.clock() < port.valid_s:
             return False
         if port.kind not in (_NONE, *_DIGITAL):
-            sensor = EmptyPort() if isinstance(port.sensor, Digital) else port.sensor
+            sensor = EmptyPort() if isinstance(port.sensor, DigitalSensor) else port.sensor
             raw = sensor.counts(lit=port.kind == _LIGHT_ON)
             normalized = _normalized_value(raw, port.kind)
             port.boolean = _boolean_value(normalized, port.boolean)
@@ -116,11 +116,11 @@ class Inputs:
         port = self._port_numbered(number)
         status, _ = self._bus_state(port)
         if status in (Status.CHANNEL_NOT_READY, Status.BUS_PENDING):
-            raise Refused(Status.CHANNEL_NOT_READY)
+            raise RefusedError(Status.CHANNEL_NOT_READY)
         if n_written > 16 or n_wanted > 16 or len(written) < n_written:
-            raise Refused(Status.ILLEGAL_SIZE)
+            raise RefusedError(Status.ILLEGAL_SIZE)
         device = port.sensor
-        answer = device.transfer(written[:n_written], n_wanted) if isinstance(device, Digital) else None
+        answer = device.transfer(written[:n_written], n_wanted) if isinstance(device, DigitalSensor) else None
         port.failed, port.answer = answer is None, answer or b""
         port.answered_s = self.clock() + 10 * (n_written + n_wanted) * _I2C_BIT_S
         return b""
@@ -142,13 +142,13 @@ class Inputs:
 
     def _port_numbered(self, number: int) -> _InputPort:
         if number >= len(self._ports):
-            raise Refused(Status.OUT_OF_RANGE)
+            raise RefusedError(Status.OUT_OF_RANGE)
         return self._ports[number]
 
 
 def _payload_if_ok(status: Status, payload: bytes) -> bytes:
     if status != Status.OK:
-        raise Refused(status, payload)
+        raise RefusedError(status, payload)
     return payload
 
 

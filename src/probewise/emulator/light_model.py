@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.emulator.arm import SensorPose
 from probewise.emulator.clock import Clock
-from probewise.emulator.table import Table
+from probewise.emulator.table import Tabletop
 from probewise.world import World
 
 _BRIGHTEST_MM = 8.0  # closer than this the divider between LED and photodiode shades the surface
@@ -47,7 +47,7 @@ class LightModel:
     def __init__(
         self,
         world: World,
-        table: Table,
+        table: Tabletop,
         sensor_pose: Callable[[], SensorPose],
         *,
         read_height_mm: float,
@@ -74,10 +74,14 @@ class LightModel:
             time_s=self._clock(),
             rng=self._rng,
         )
-        return (bright + _CUT_OFF) * (1 + lit * _led(sensor_pose.height_mm) / _led(self._read_height_mm)) / 2
+        return (
+            (bright + _CUT_OFF)
+            * (1 + lit * _led_brightness(sensor_pose.height_mm) / _led_brightness(self._read_height_mm))
+            / 2
+        )
 
 
-def _led(height_mm: float) -> float:
+def _led_brightness(height_mm: float) -> float:
     """Return the relative brightness of the LED at a height, 1 at the brightest."""
     steps = max(height_mm, 0.0) / _BRIGHTEST_MM
     return steps * math.exp(1 - steps)

@@ -40,8 +40,8 @@ class VirtualLine:
             if len(self._received) >= size or self._clock() >= deadline_s:
                 break
             self._require_open()
-            next_s = self._radio.next_s
-            until_s = deadline_s if next_s is None else min(next_s, deadline_s)
+            next_arrival_s = self._radio.next_arrival_s
+            until_s = deadline_s if next_arrival_s is None else min(next_arrival_s, deadline_s)
             self._clock.sleep(max(until_s - self._clock(), 0.0))
         data = bytes(self._received[:size])
         del self._received[:size]

@@ -105,7 +105,7 @@ class Output:
         asked = (s.power, s.mode, s.regulation, s.turn_ratio, self.run_state, s.tacho_limit)
         return (*asked, self.tacho_count, self.block_count, self.rotation_count)
 
-    def tick(self, battery_mv: float) -> None:
+    def simulate_millisecond(self, battery_mv: float) -> None:
         """Simulate a millisecond of motor and firmware."""
         self.motor.step(1e-3, self.power, brake=self._brake, battery_mv=battery_mv)
         seen = self._shown_deg
@@ -231,7 +231,7 @@ class Output:
 
     def _drive_unregulated(self) -> None:
         if not self._regulation:
-            self.power = bounded(self.target_power, 100)
+            self.power = clipped(self.target_power, 100)
 
     def _fade_power(self) -> None:
         """Reduce the power by 1 per millisecond after a limit: a host sees IDLE well before the motor rests."""
@@ -243,17 +243,17 @@ class Output:
     def _regulated_power(self, error: int) -> int:
         """Return the power of the firmware's PID regulator for a position error in counts."""
         steepness, self._error = error - self._error, error
-        self._error_sum = bounded(quotient(3 * self._error_sum + error, 4), 800)
-        wanted = bounded(_GAIN_P * error, 100) + bounded(_GAIN_I * self._error_sum, 100) + _GAIN_D * steepness
-        return bounded(quotient(wanted, 2), 100)
+        self._error_sum = clipped(quotient_towards_zero(3 * self._error_sum + error, 4), 800)
+        wanted = clipped(_GAIN_P * error, 100) + clipped(_GAIN_I * self._error_sum, 100) + _GAIN_D * steepness
+        return clipped(quotient_towards_zero(wanted, 2), 100)
 
 
-def bounded(value: int, limit: int) -> int:
+def clipped(value: int, limit: int) -> int:
     """Clip a value to +-limit."""
     return min(max(value, -limit), limit)
 
 
-def quotient(value: int, by: int) -> int:
+def quotient_towards_zero(value: int, by: int) -> int:
     """Divide integers and round towards 0, as C does."""
     return value // by if value >= 0 else -(-value // by)
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from probewise.emulator.motor import Motor
-from probewise.emulator.output import Output, OutputSetting, RunState, bounded, quotient
-from probewise.emulator.protocol import Refused, Status
+from probewise.emulator.output import Output, OutputSetting, RunState, clipped, quotient_towards_zero
+from probewise.emulator.protocol import RefusedError, Status
 
 _ALL = 0xFF
 _TICK_S = 1e-3
@@ -26,13 +26,13 @@ class _Synchronisation:
     def correct(self, one: Output, two: Output) -> None:
         """Slow the motor that leads and speed up the one that lags (PID gains 3, 1, 1, over 4)."""
         inner = two if (one.setting.turn_ratio > 0) == (one.target_power >= 0) else one
-        self.turn += 2 * quotient(inner.setting.turn_ratio * abs(inner.target_power), 100)
-        lead = bounded(one.block_count - two.block_count + self.turn, 500)
-        self.lead_sum = bounded(self.lead_sum + lead, 900)
-        wanted = quotient(3 * lead + self.lead_sum + (lead - self.lead), 4)
+        self.turn += 2 * quotient_towards_zero(inner.setting.turn_ratio * abs(inner.target_power), 100)
+        lead = clipped(one.block_count - two.block_count + self.turn, 500)
+        self.lead_sum = clipped(self.lead_sum + lead, 900)
+        wanted = quotient_towards_zero(3 * lead + self.lead_sum + (lead - self.lead), 4)
         self.lead = lead
         for port, target in ((one, one.target_power - wanted), (two, two.target_power + wanted)):
-            port.power = bounded(target, abs(port.target_power) if one.setting.turn_ratio else 100)
+            port.power = clipped(target, abs(port.target_power) if one.setting.turn_ratio else 100)
 
 
 class Outputs:
@@ -80,7 +80,7 @@ class Outputs:
     def _simulate_millisecond(self, moving: Sequence[Output], battery_mv: float) -> None:
         """Simulate a millisecond of the moving ports; a synchronised pair stops when one of them reaches its limit."""
         for port in moving:
-            port.tick(battery_mv)
+            port.simulate_millisecond(battery_mv)
         pair = [port for port in moving if port.is_synchronised][:2]
         if len(pair) == 2 and any(port.is_at_limit for port in pair):
             for port in pair:
@@ -108,5 +108,5 @@ class Outputs:
 
     def _port_numbered(self, port: int) -> Output:
         if port >= len(self.ports):
-            raise Refused(Status.OUT_OF_RANGE)
+            raise RefusedError(Status.OUT_OF_RANGE)
         return self.ports[port]

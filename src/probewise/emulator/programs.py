@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping
 
-from probewise.emulator.protocol import Refused, Status
+from probewise.emulator.protocol import RefusedError, Status
 
 _N_BOXES = 20
 _ANSWERS = 10  # a program's outbox n is the host's box n + 10
@@ -38,7 +38,7 @@ class Programs:
 
     def _start_program(self, name: bytes) -> bytes:
         if not self._exists(name.split(b"\0")[0].decode("latin-1")):
-            raise Refused(Status.OUT_OF_RANGE)
+            raise RefusedError(Status.OUT_OF_RANGE)
         self._switch_program(name)
         return b""
 
@@ -55,9 +55,9 @@ class Programs:
     def _write_message(self, box: int, size: int, rest: bytes) -> bytes:
         message = rest[:size]
         if not 1 <= size <= _SIZE or len(message) < size or message[-1]:
-            raise Refused(Status.OUT_OF_RANGE)
+            raise RefusedError(Status.OUT_OF_RANGE)
         if box >= _N_BOXES:
-            raise Refused(Status.ILLEGAL_MAILBOX)
+            raise RefusedError(Status.ILLEGAL_MAILBOX)
         self._running_name()
         self._boxes[box + _ANSWERS if box < _ANSWERS else box].append(message)
         return b""
@@ -67,15 +67,15 @@ class Programs:
             return bytes((local_box, len(message))) + message.ljust(_SIZE, b"\0")
 
         if self.running is None:
-            raise Refused(Status.NO_PROGRAM, padded(b""))
+            raise RefusedError(Status.NO_PROGRAM, padded(b""))
         if box >= _N_BOXES:
-            raise Refused(Status.ILLEGAL_MAILBOX, padded(b""))
+            raise RefusedError(Status.ILLEGAL_MAILBOX, padded(b""))
         if not self._boxes[box]:
-            raise Refused(Status.MAILBOX_EMPTY, padded(b""))
+            raise RefusedError(Status.MAILBOX_EMPTY, padded(b""))
         return padded(self._boxes[box].popleft() if remove else self._boxes[box][0])
 
     def _running_name(self) -> bytes:
         """Return the running program's name; refuse if none runs."""
         if self.running is None:
-            raise Refused(Status.NO_PROGRAM)
+            raise RefusedError(Status.NO_PROGRAM)
         return self.running

@@ -47,7 +47,7 @@ class Status(IntEnum):
     ILLEGAL_MAILBOX = 0xEE
 
 
-class Refused(Exception):
+class RefusedError(Exception):
     """A status other than OK; `payload` None means zeros at the command's full length."""
 
     def __init__(self, status: Status, payload: bytes | None = None) -> None:
@@ -78,7 +78,7 @@ class Command:
         """
         size = struct.calcsize("<" + self.layout)
         if len(body) < size:
-            raise Refused(Status.MALFORMED)
+            raise RefusedError(Status.MALFORMED)
         found: tuple[FieldValue, ...] = struct.unpack("<" + self.layout, body[:size])
         return (*found, body[size:]) if self.more else found
 

@@ -103,7 +103,7 @@ def serve(
         Called repeatedly, at least every 50 ms.
     """
     while not radio.brick.is_off:
-        due_s = radio.next_s
+        due_s = radio.next_arrival_s
         wait_s = _LONGEST_WAIT_S if due_s is None else min(max(due_s - clock(), 0.0), _LONGEST_WAIT_S)
         radio.send(terminal.read(wait_s))
         radio.brick.advance()

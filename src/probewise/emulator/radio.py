@@ -29,7 +29,7 @@ _STATUSES = (Status.UNDEFINED_ERROR, Status.MALFORMED, Status.OUT_OF_RANGE, Stat
 _UNASKED = bytes.fromhex("800900 03 686900")  # a running program writes "hi" to mailbox 0
 
 
-def no_trace(now_s: float, event: Event, text: str) -> None:
+def ignore_trace(now_s: float, event: Event, text: str) -> None:
     """Keep no record."""
 
 
@@ -67,7 +67,7 @@ class Radio:
         rng: np.random.Generator,
         faults: Faults | None = None,
         turnaround_s: float = _TURNAROUND_S,
-        trace: Trace = no_trace,
+        trace: Trace = ignore_trace,
     ) -> None:
         self.brick, self._clock, self._rng, self._trace = brick, clock, rng, trace
         self.faults = Faults() if faults is None else faults
@@ -89,7 +89,7 @@ class Radio:
         return not self._ended and not self.brick.is_off
 
     @property
-    def next_s(self) -> float | None:
+    def next_arrival_s(self) -> float | None:
         """Time at which the next bytes reach the host, None if there are none."""
         return self._coming[0][0] if self._coming else None
 

@@ -11,7 +11,7 @@ from probewise.emulator.clock import Clock
 AD_MAX = 1023
 
 
-class Analog(Protocol):
+class AnalogSensor(Protocol):
     """A sensor with a voltage output."""
 
     def counts(self, *, lit: bool) -> int:
@@ -58,7 +58,7 @@ def _counts_of(percent: float) -> int:
 
 
 @dataclass
-class Digital:
+class DigitalSensor:
     """A sensor with registers at one I2C address."""
 
     address: int
@@ -77,8 +77,8 @@ class Digital:
         return self.registers.get(begin, b"")[:wanted].ljust(wanted, b"\0")
 
 
-def sonar(distance_cm: int) -> Digital:
+def ultrasonic_sensor(distance_cm: int) -> DigitalSensor:
     """Make an ultrasonic sensor at a distance from a wall."""
     version, maker, kind = b"V1.0".ljust(8, b"\0"), b"LEGO".ljust(8, b"\0"), b"Sonar".ljust(8, b"\0")
     heads = {0x00: version, 0x08: maker, 0x10: kind, 0x14: b"10E-2m\0", 0x41: b"\x02", 0x42: bytes((distance_cm,))}
-    return Digital(0x02, heads)
+    return DigitalSensor(0x02, heads)

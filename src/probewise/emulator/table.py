@@ -11,7 +11,7 @@ from probewise.world import Surface
 
 
 @dataclass
-class Table:
+class Tabletop:
     """The surface under the sensor, and the sensor's rotation from the geometry's mounting."""
 
     surface: Surface

@@ -6,7 +6,8 @@ from probewise.experiment.configuration import Experiment, OneScan
 from probewise.experiment.digest import value_digest
 from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.found import OFF_MM, FoundParameter, FoundShape, found_shape, result_json, samples_csv
-from probewise.experiment.hidden import Hidden, Truth, members_of
+from probewise.experiment.from_names import MethodName, experiment_from_names
+from probewise.experiment.hidden import HiddenShape, Truth, members_of
 from probewise.experiment.journal import (
     Entry,
     Journal,
@@ -16,38 +17,37 @@ from probewise.experiment.journal import (
     recording_of,
     require_same_settings,
 )
-from probewise.experiment.left_out import CLEAN, LeftOut, left_out_of, repaired
+from probewise.experiment.left_out import CLEAN, LeftOut, left_out_of, repaired_sensor
 from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
 from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.paper import (
     NestedSampling,
-    levels_from,
-    levels_in,
+    naive_levels_from_recording,
+    naive_levels_from_world,
     paper_experiment,
     student_t_bounds,
 )
-from probewise.experiment.posed import MethodName, pose_experiment
-from probewise.experiment.sensor_update import AdjustedMixture, Change, sensor_prior
+from probewise.experiment.sensor_update import AdjustedMixture, SensorChangeSds, sensor_prior
 from probewise.experiment.shadow import shadow_run
 from probewise.experiment.simulation import (
     TRUST,
     Model,
-    Streams,
+    RandomStreams,
     arm_over,
+    default_trust,
     experiment_for,
     scale_of,
-    sensor_named,
+    sensor_entry,
     shape_named,
     shape_of,
     surface_of,
-    usual_trust,
     with_cards,
     world_like,
 )
-from probewise.experiment.start import run_from
+from probewise.experiment.start import run_from_place
 from probewise.experiment.state import PAPER_BITS, ArmError, Exploration, ExplorationState, Step
-from probewise.experiment.stopping_rule import chance_off
+from probewise.experiment.stopping_rule import probability_of_length_off
 
 __all__ = [
     "CLEAN",
@@ -57,7 +57,6 @@ __all__ = [
     "AdjustedMixture",
     "ArmError",
     "ArmOverGrid",
-    "Change",
     "Entry",
     "Experiment",
     "Exploration",
@@ -65,7 +64,7 @@ __all__ = [
     "FittedArm",
     "FoundParameter",
     "FoundShape",
-    "Hidden",
+    "HiddenShape",
     "Journal",
     "JournalWriter",
     "LeftOut",
@@ -75,33 +74,35 @@ __all__ = [
     "NestedSampling",
     "OneScan",
     "PosteriorSummary",
+    "RandomStreams",
+    "SensorChangeSds",
     "SequentialMonteCarlo",
     "Step",
-    "Streams",
     "Truth",
     "arm_over",
     "begin",
-    "chance_off",
+    "default_trust",
     "experiment_for",
+    "experiment_from_names",
     "explore",
     "found_shape",
     "least_readings",
     "left_out_of",
-    "levels_from",
-    "levels_in",
     "members_of",
+    "naive_levels_from_recording",
+    "naive_levels_from_world",
     "paper_experiment",
-    "pose_experiment",
+    "probability_of_length_off",
     "read_journal",
     "recording_of",
-    "repaired",
+    "repaired_sensor",
     "require_same_settings",
     "result_json",
     "run",
-    "run_from",
+    "run_from_place",
     "samples_csv",
     "scale_of",
-    "sensor_named",
+    "sensor_entry",
     "sensor_prior",
     "shadow_run",
     "shape_named",
@@ -109,7 +110,6 @@ __all__ = [
     "step",
     "student_t_bounds",
     "surface_of",
-    "usual_trust",
     "value_digest",
     "with_arm_error",
     "with_cards",
@@ -127,3 +127,36 @@ beside = shadow_run
 
 Belief = PosteriorSummary
 """The old name of `PosteriorSummary`."""
+
+Hidden = HiddenShape
+"""The old name of `HiddenShape`."""
+
+levels_from = naive_levels_from_recording
+"""The old name of `naive_levels_from_recording`."""
+
+levels_in = naive_levels_from_world
+"""The old name of `naive_levels_from_world`."""
+
+pose_experiment = experiment_from_names
+"""The old name of `experiment_from_names`."""
+
+repaired = repaired_sensor
+"""The old name of `repaired_sensor`."""
+
+sensor_named = sensor_entry
+"""The old name of `sensor_entry`."""
+
+usual_trust = default_trust
+"""The old name of `default_trust`."""
+
+Streams = RandomStreams
+"""The old name of `RandomStreams`."""
+
+run_from = run_from_place
+"""The old name of `run_from_place`."""
+
+Change = SensorChangeSds
+"""The old name of `SensorChangeSds`."""
+
+chance_off = probability_of_length_off
+"""The old name of `probability_of_length_off`."""

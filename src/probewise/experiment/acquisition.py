@@ -1,4 +1,4 @@
-"""Inquire: the utility of every available reading, and the choice of the next."""
+"""The utility of every available reading, and the choice of the next (the paper's "inquire")."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probewise._arrays import BoolArray, FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
-from probewise.inquiry import Goal, Grid, Prospect, UtilityMap, choose, choose_several, reachable_rows, utility_map
+from probewise.inquiry import Goal, Grid, UtilityInput, UtilityMap, choose, choose_several, reachable_rows, utility_map
 from probewise.inquiry.forecast import resampled_hypotheses
 from probewise.nested.importance import Weighted
 
@@ -30,7 +30,7 @@ class ArmOverGrid:
     travel_s: Callable[[Pose, FloatArray], FloatArray]
 
     @classmethod
-    def under(cls, instrument: Instrument, grid: Grid) -> Self:
+    def of(cls, instrument: Instrument, grid: Grid) -> Self:
         """Build from an instrument."""
         return cls(
             np.asarray(instrument.reachable(grid.places_mm), dtype=np.bool_),
@@ -38,8 +38,11 @@ class ArmOverGrid:
             instrument.travel_s,
         )
 
+    under = of
+    """The old name of `of`."""
 
-def inquire(
+
+def predict_and_rate_readings(
     experiment: Experiment,
     posterior: Weighted,
     drawn: FloatArray,
@@ -47,8 +50,8 @@ def inquire(
     *,
     at: Reading | None,
     goal: Goal | None = None,
-) -> tuple[Prospect, UtilityMap]:
-    """Compute the utility of every available reading.
+) -> tuple[UtilityInput, UtilityMap]:
+    """Predict every available reading, and compute its utility.
 
     Parameters
     ----------
@@ -65,7 +68,7 @@ def inquire(
 
     Returns
     -------
-    What is expected of each available reading, and their utilities.
+    Posterior, designs and predictive distributions; and the utility of each design.
     """
     designs = experiment.designs
     rows = reachable_rows(field.reachable, experiment.grid.n_places, len(designs.combinations))
@@ -86,7 +89,7 @@ def inquire(
     if experiment.trust < 1:  # samples of several kinds: use no more than for one
         some, share = resampled_hypotheses(weight, experiment.n_particles)
         theta, weight = theta[some], share / share.sum()
-    prospect = Prospect(
+    utility_input = UtilityInput(
         experiment.forecast,
         experiment.readout,
         theta,
@@ -98,18 +101,18 @@ def inquire(
         cost_s[rows],
         experiment.goal if goal is None else goal,
     )
-    return prospect, utility_map(prospect, experiment.utility)
+    return utility_input, utility_map(utility_input, experiment.utility)
 
 
 def next_poses(
-    experiment: Experiment, prospect: Prospect, utilities: UtilityMap, *, rng: np.random.Generator
+    experiment: Experiment, utility_input: UtilityInput, utilities: UtilityMap, *, rng: np.random.Generator
 ) -> tuple[Pose, ...]:
     """Choose the next pose, or a batch of poses, each repeated as its design says."""
     if experiment.batch > 1:
-        rows = choose_several(prospect, experiment.batch, rng=rng)
+        rows = choose_several(utility_input, experiment.batch, rng=rng)
     else:
         rows = (choose(utilities.values, utilities.reachable, rng=rng),)
-    orientation_rad = prospect.plan.orientation_rad  # the orientation that the sensor will have there
+    orientation_rad = utility_input.plan.orientation_rad  # the orientation that the sensor will have there
     designs = [(experiment.designs[row], float(orientation_rad[row])) for row in rows]
     return tuple(
         Pose(design.x_mm, design.y_mm, standing, dict(design.settings).get("height_mm"))

@@ -27,7 +27,7 @@ from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.state import ArmError, Exploration
-from probewise.inference.problem import scores
+from probewise.inference.problem import checked_log_prob
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
 from probewise.scene.shapes import AnyOf
@@ -73,7 +73,7 @@ def with_arm_error(
         arm,
         run.readings,
         last.posterior,
-        last.kinds.wary,
+        last.kinds.with_warier_odds,
         mean=last.mean,
         sd=last.sd,
         likely_shape=last.likely_shape,
@@ -118,7 +118,7 @@ def arm_error(
     width_mm, height_mm = geometry.field_mm
     middle = (width_mm / 2, height_mm / 2) if arm.calibrated_mm is None else arm.calibrated_mm
     places = np.stack([recording.plan.x_mm, recording.plan.y_mm], axis=-1)
-    off = _effect_of_errors(geometry, np.concatenate([places, [middle]]), accuracy)
+    off = _pose_changes_by_errors(geometry, np.concatenate([places, [middle]]), accuracy)
     off[:, 2] -= off[-1, 2]
     off = off[:-1]
     dark, white = arm.levels
@@ -127,22 +127,24 @@ def arm_error(
         falls = geometry.light_per_mm * white / (white - dark)
     # From here on what the light does stands for the height: the share by which light above black rises.
     off[:, 2] *= -falls
-    slopes = _mean_shifts(experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape)
+    slopes = _posterior_mean_shifts(
+        experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape
+    )
     theta = posterior.theta[:, experiment.shape_columns]
-    return ArmError(slopes, moved_by_arm(experiment, slopes, theta, likely_shape, rng=rng))
+    return ArmError(slopes, shifts_by_arm_error(experiment, slopes, theta, likely_shape, rng=rng))
 
 
-def moved_by_arm(
+def shifts_by_arm_error(
     experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw an error of the arm for each sample, theta (n_samples, n_params), and return its shift, of the same form."""
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     if isinstance(experiment.shape, AnyOf):
-        moved[experiment.shape.which(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
+        moved[experiment.shape.shape_index(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
     return np.asarray(moved)
 
 
-def _effect_of_errors(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
+def _pose_changes_by_errors(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
     """Return the change of x, y, height and orientation at places by each error of one sd: (n_points, 4, n_errors)."""
     root = _matrix_root(np.array(accuracy.covariance))
     place = slopes_mm(geometry, places_mm) @ root
@@ -160,7 +162,7 @@ def _matrix_root(covariance: FloatArray) -> FloatArray:
     return np.asarray(scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-def _mean_shifts(
+def _posterior_mean_shifts(
     experiment: Experiment,
     posterior: Posterior,
     recording: Recording,
@@ -186,8 +188,8 @@ def _mean_shifts(
         theta = particles.weighted.theta[some]
         thetas.append(theta[:, own])
         weights.append(probability * particles.weighted.weight[some])
-        by_error.append(_slopes_by_error(kind, theta, recording, off, dark))
-        by_shape.append(_slopes_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
+        by_error.append(_log_likelihood_slopes_by_error(kind, theta, recording, off, dark))
+        by_shape.append(_log_likelihood_slopes_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
     theta, slope, known = (_centred_columns(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
@@ -203,7 +205,7 @@ def _centred_columns(columns: FloatArray, weight: FloatArray) -> FloatArray:
     return columns - weight @ columns
 
 
-def _slopes_by_shape(
+def _log_likelihood_slopes_by_shape(
     kind: HypothesisKind, theta: FloatArray, recording: Recording, columns: IntArray, steps: FloatArray
 ) -> FloatArray:
     """Differentiate each hypothesis's log likelihood by each parameter of the shape: (n_samples, n_columns)."""
@@ -216,7 +218,7 @@ def _slopes_by_shape(
     return np.stack(slopes, axis=-1)
 
 
-def _slopes_by_error(
+def _log_likelihood_slopes_by_error(
     kind: HypothesisKind, theta: FloatArray, recording: Recording, off: FloatArray, dark: float
 ) -> FloatArray:
     """Differentiate each hypothesis's log likelihood by each independent error: (n_samples, n_errors)."""
@@ -240,7 +242,9 @@ def _slopes_by_error(
     for error in range(off.shape[2]):
         change = _STEP_SD * np.einsum("skp,kp->sk", by_pose, off[:, :, error])
         up, down = (
-            scores(kind.likelihood, recording.readings[usable], predicted[:, usable] + way * change[:, usable])
+            checked_log_prob(
+                kind.likelihood, recording.readings[usable], predicted[:, usable] + way * change[:, usable]
+            )
             for way in (1, -1)
         )
         out[:, error] = (up - down) / (2 * _STEP_SD)

@@ -1,8 +1,8 @@
-"""Readings of a run that knows its shape: what the sensor leaves out, and the side of the shape that nobody has seen.
+"""Check readings before a run ends: for faults of the sensor, and on the side of the shape that has no reading yet.
 
-A dozen readings that fit the plain sensor leave most faults open, and a single further reading would show some of them.
-And the far side of a shape that was read from one side follows from the sensor model alone: a fault outside the
-vocabulary may have put it anywhere. A run that doubts its sensor checks both before it ends.
+A dozen readings that fit the plain sensor cannot exclude most faults, and a single further reading would show some of
+them. And if a shape was read from one side only, its far side is computed from the sensor model alone: with a fault
+outside the vocabulary, that result may be wrong by any amount. A run that doubts its sensor checks both.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.arm.instrument import Reading
-from probewise.inquiry import Prospect, Readout, entropy_bits
+from probewise.inquiry import Readout, UtilityInput, entropy_bits
 from probewise.inquiry.given_reading import GivenReading
 from probewise.scene import outlines
 from probewise.scene.albedo import Region
@@ -34,7 +34,7 @@ _FAR = 0.75  # of the shape's diameter: two opposite readings at the edge of a c
 _AT_EDGE = 1.0  # spacings of the grid within which a reading is at the edge
 
 
-def bits_of_names(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout) -> FloatArray:
+def bits_about_name(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout) -> FloatArray:
     """Return the expected information of a reading about the name alone: the smaller of two estimates.
 
     Both err upwards. The estimate by a Gaussian for each name does so where a few predictions lie far from the others.
@@ -116,14 +116,14 @@ class Outline:
     diameter_mm: float
 
     @classmethod
-    def of(cls, prospect: Prospect, region: Region, readings: Sequence[Reading]) -> Self | None:
+    def of(cls, utility_input: UtilityInput, region: Region, readings: Sequence[Reading]) -> Self | None:
         """Lay out the outline of one region; None if it is neither an ellipse nor a polygon, or out of reach."""
         if not isinstance(region, EllipseRegion | PolygonRegion):
             return None
         edge = outlines(region)[0]
-        grid = prospect.designs.grid
+        grid = utility_input.designs.grid
         spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
-        away = np.linalg.norm(edge[:, None] - places_of(prospect), axis=2)
+        away = np.linalg.norm(edge[:, None] - places_of_designs(utility_input), axis=2)
         within = away.min(axis=1) <= spacing
         if not within.any():
             return None
@@ -151,6 +151,6 @@ class Outline:
         return np.asarray(self.distances_with_reading(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
 
 
-def places_of(prospect: Prospect) -> FloatArray:
+def places_of_designs(utility_input: UtilityInput) -> FloatArray:
     """Return the places of the available designs, (n, 2)."""
-    return np.stack([prospect.plan.x_mm[prospect.rows], prospect.plan.y_mm[prospect.rows]], axis=1)
+    return np.stack([utility_input.plan.x_mm[utility_input.rows], utility_input.plan.y_mm[utility_input.rows]], axis=1)

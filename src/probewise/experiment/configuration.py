@@ -67,7 +67,7 @@ class OneScan:
             )
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Score every hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,); see `inference.StudentT`."""
+        """Return the log likelihood of each hypothesis, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         one = np.zeros(readings.size, dtype=np.int64)
         return StudentT(one, self.sd_floor, self.sd_ceiling).log_prob(readings, predicted)
 
@@ -174,7 +174,7 @@ class Experiment:
         _ = self.readout, self.designs  # their constructors check the values
 
     def _require_stopping_rule(self) -> None:
-        """Check when the run stops, and what it doubts."""
+        """Check target sd and probabilities of the stopping rule, trust, and the p-value of doubt."""
         if not 0 < self.stop_sd_mm < math.inf:
             raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
         if not 0 < self.stop_probability < 1:
@@ -208,7 +208,7 @@ class Experiment:
                 raise ParameterError("heights_mm", self.heights_mm, allowed)
 
     @cached_property
-    def learning(self) -> Method:
+    def inference_method(self) -> Method:
         """Method of inference."""
         return SequentialMonteCarlo(self.n_particles, self.n_live) if self.method is None else self.method
 
@@ -268,7 +268,7 @@ class Experiment:
         """Return the inference problem for these readings."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
         if self.trust < 1:
-            recording = Pace.of(readings).on_recording(recording)
+            recording = Pace.of(readings).recording_with_run_time(recording)
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
     @cached_property
@@ -282,20 +282,24 @@ class Experiment:
             self.shape, self.sensor_prior, self.prior, models, self.likelihood, trust=self.trust, rivals=rivals
         )
 
-    def is_known(self, sd: FloatArray, shapes: Mapping[str, float], chance_off: float = 0.0) -> bool:
-        """Return whether the stopping rule is met.
+    def may_stop(self, sd: FloatArray, shapes: Mapping[str, float], chance_off: float = 0.0) -> bool:
+        """Return whether the stopping rule is met: the shape is known to the target precision.
 
         Parameters
         ----------
         sd, shapes
             Posterior sds of the shape's parameters, and the shapes' probabilities.
         chance_off
-            Probability that a length is off by three times the target sd, see `stopping_rule.chance_off`; it counts if
-            the sensor is doubted, since the posterior then has tails that sds do not show.
+            Probability that a length is off by three times the target sd, see
+            `stopping_rule.probability_of_length_off`; it counts if the sensor is doubted, since the posterior then has
+            tails that sds do not show.
         """
         likely = max(shapes.values(), default=1.0)
         sure = self.trust == 1 or chance_off < MOST_OFF
         return widest_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability and sure
+
+    is_known = may_stop
+    """The old name of `may_stop`."""
 
     def settings(self, seed: np.random.SeedSequence) -> dict[str, Any]:
         """Return the settings for a journal's first line."""

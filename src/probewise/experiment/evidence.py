@@ -20,7 +20,7 @@ from probewise.errors import NotConvergedError
 from probewise.experiment.kernels import LocalKernels
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted, pareto_k
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 
 _WIDE = 3.0  # factor on the width of some kernels, so that draws extend beyond the samples
 _OF_WIDE = 0.15  # share of the draws from those
@@ -30,7 +30,7 @@ _UNKNOWN = 2.0  # nats: error of an evidence that cannot be estimated anew
 
 
 @dataclass(frozen=True)
-class Bridged:
+class BridgedEvidence:
     """Log evidence, its standard error, and the number of likelihood evaluations."""
 
     log_z: float
@@ -38,7 +38,9 @@ class Bridged:
     n_calls: int
 
 
-def bridged_evidence(posterior: Weighted, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int) -> Bridged:
+def bridged_evidence(
+    posterior: Weighted, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
+) -> BridgedEvidence:
     """Estimate the evidence of a problem.
 
     Parameters
@@ -58,14 +60,14 @@ def bridged_evidence(posterior: Weighted, problem: SensorProblem, *, rng: np.ran
         The mean of the two halves' estimates; the error is their standard error, or their difference if larger.
     """
     n = len(posterior.theta) // 2 * 2
-    rows = resampled(posterior.weight, n, rng)
+    rows = resampled_rows(posterior.weight, n, rng)
     # Copies of a sample are adjacent, and so are in the same half.
     halves = np.split(rows, 2)
     if min(len(np.unique(posterior.theta[half, 0])) for half in halves) <= 2 * posterior.theta.shape[1]:
-        return Bridged(posterior.log_z, max(posterior.log_z_error, _UNKNOWN), 0)  # too few to fit kernels
+        return BridgedEvidence(posterior.log_z, max(posterior.log_z_error, _UNKNOWN), 0)  # too few to fit kernels
     found = []
     for own, other in (halves, halves[::-1]):
-        density = _KernelDensity.about(posterior.theta[other], rng=rng)
+        density = _KernelDensity.fitted_to(posterior.theta[other], rng=rng)
         drawn = density.draw(n_draws // 2, rng=rng)
         log_prior = problem.prior.log_prob(drawn)
         possible = np.isfinite(log_prior)
@@ -80,7 +82,7 @@ def bridged_evidence(posterior: Weighted, problem: SensorProblem, *, rng: np.ran
     (one, e1), (other_z, e2) = found
     log_z = float(logsumexp([one, other_z])) - math.log(2.0)
     error = max(0.5 * math.hypot(e1, e2), 0.5 * abs(one - other_z))
-    return Bridged(log_z, error, n_draws)
+    return BridgedEvidence(log_z, error, n_draws)
 
 
 def importance_resampled(
@@ -100,7 +102,7 @@ def importance_resampled(
     NotConvergedError
         If no draw could have given the readings.
     """
-    density = _KernelDensity.about(points, rng=rng)
+    density = _KernelDensity.fitted_to(points, rng=rng)
     found = weighted_draws(density.draw(n_draws, rng=rng), density.log_density, problem)
     if found is None:
         raise NotConvergedError("no hypothesis near the samples could have given the readings")
@@ -134,8 +136,8 @@ class _KernelDensity:
     far: LocalKernels
 
     @classmethod
-    def about(cls, points: FloatArray, *, rng: np.random.Generator) -> _KernelDensity:
-        return cls(LocalKernels.about(points, rng=rng), LocalKernels.about(points, rng=rng, widened=_WIDE))
+    def fitted_to(cls, points: FloatArray, *, rng: np.random.Generator) -> _KernelDensity:
+        return cls(LocalKernels.fitted_to(points, rng=rng), LocalKernels.fitted_to(points, rng=rng, widened=_WIDE))
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         n_far = round(_OF_WIDE * n)

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.experiment.left_out import left_out_of
 from probewise.experiment.state import Exploration, require_exploration
-from probewise.experiment.stopping_rule import chance_off
+from probewise.experiment.stopping_rule import probability_of_length_off
 from probewise.nested.weights import weighted_quantiles
 from probewise.recordings.table import csv_text_of_rows
 from probewise.scene.albedo import Shape
@@ -52,7 +52,7 @@ def found_shape(run: Exploration) -> FoundShape:
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
     name = last.likely_shape or _shape_name(shape)
     if isinstance(shape, AnyOf):
-        own = shape.which(theta) == shape.labels.index(name)
+        own = shape.shape_index(theta) == shape.labels.index(name)
         theta, weight = theta[own], weight[own]
     low, high = weighted_quantiles(theta, weight, [0.025, 0.975])
     parameters = tuple(
@@ -78,7 +78,7 @@ def result_json(run: Exploration) -> str:
         "stop_reason": run.stop_reason,
         "known": run.reached,
         "shape": asdict(found_shape(run)),
-        "chance_off_12mm": chance_off(run.experiment, run.posterior, OFF_MM),
+        "chance_off_12mm": probability_of_length_off(run.experiment, run.posterior, OFF_MM),
         "left_out": left_out_of(run.last, run.experiment.trust).as_json(),
         "bits": run.last.bits,
         "seconds": run.seconds,
@@ -97,7 +97,7 @@ def samples_csv(run: Exploration) -> str:
     several = isinstance(shape, AnyOf)
     columns = [k for k, name in enumerate(names) if name != "shape"]
     rows = []
-    which = shape.which(theta) if isinstance(shape, AnyOf) else np.zeros(len(theta), dtype=np.int64)
+    which = shape.shape_index(theta) if isinstance(shape, AnyOf) else np.zeros(len(theta), dtype=np.int64)
     for row in np.flatnonzero(weight > 0).tolist():
         label, held = [], set(columns)
         if isinstance(shape, AnyOf):

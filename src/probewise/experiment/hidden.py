@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, floats, frozen
 from probewise._kinds import require_finite_number, require_rng
 from probewise.errors import ParameterError
-from probewise.experiment.simulation import surface_under
+from probewise.experiment.simulation import surface_of_region
 from probewise.priors import Prior
 from probewise.scene import SHAPES, AnyOf, Field, Shape, outlines
 from probewise.world import Surface
@@ -20,7 +20,7 @@ Truth = Sequence[float] | Mapping[str, float] | Mapping[str, Sequence[float]] | 
 
 
 @dataclass(frozen=True, eq=False)
-class Hidden:
+class HiddenShape:
     """A shape with its parameters, theta (n_params,), and its name among the possible shapes."""
 
     name: str
@@ -31,7 +31,7 @@ class Hidden:
         object.__setattr__(self, "theta", frozen(self.theta))
 
     @classmethod
-    def given(cls, name: str, shape: Shape, theta: FloatArray, *, called: str = "truth") -> Hidden:
+    def from_parameters(cls, name: str, shape: Shape, theta: FloatArray, *, called: str = "truth") -> HiddenShape:
         """Build from parameters that the shape's prior allows; `called` is their name in messages.
 
         Raises
@@ -56,7 +56,7 @@ class Hidden:
         return cls(name, shape, values)
 
     @classmethod
-    def drawn(cls, members: Mapping[str, Shape], *, rng: np.random.Generator) -> Hidden:
+    def drawn_from_prior(cls, members: Mapping[str, Shape], *, rng: np.random.Generator) -> HiddenShape:
         """Draw one of several shapes, and its parameters from its prior."""
         require_rng(rng)
         name = list(members)[int(rng.integers(len(members)))]
@@ -64,8 +64,10 @@ class Hidden:
         return cls(name, members[name], prior.from_unit_cube(rng.random((1, len(prior.names))))[0])
 
     @classmethod
-    def of(cls, truth: Truth | None, members: Mapping[str, Shape], field: Field, *, rng: np.random.Generator) -> Hidden:
-        """Build from a given truth, of the first member or of a named shape; if None, draw it.
+    def of(
+        cls, truth: Truth | None, members: Mapping[str, Shape], field: Field, *, rng: np.random.Generator
+    ) -> HiddenShape:
+        """Build from given parameters, of the first member or as {shape: parameters}; if `truth` is None, draw a shape.
 
         Raises
         ------
@@ -73,25 +75,25 @@ class Hidden:
             If the name is unknown, or the shape's prior excludes the numbers.
         """
         if truth is None:
-            return cls.drawn(members, rng=rng)
+            return cls.drawn_from_prior(members, rng=rng)
         first = next(iter(members))
         known = {**{name: make(field) for name, make in SHAPES.items()}, **members}
         if isinstance(truth, Mapping) and len(truth) == 1 and set(truth) <= set(known):
             ((name, values),) = truth.items()
-            return cls.given(name, known[name], _theta_by_name(known[name].prior.names, values))
+            return cls.from_parameters(name, known[name], _theta_by_name(known[name].prior.names, values))
         if isinstance(truth, Mapping) and not set(truth) & set(members[first].prior.names):
             raise ParameterError("truth", truth, f"one shape of {', '.join(known)} with its parameters")
-        return cls.given(first, members[first], _theta_by_name(members[first].prior.names, truth))
+        return cls.from_parameters(first, members[first], _theta_by_name(members[first].prior.names, truth))
 
     @property
-    def document(self) -> dict[str, str | float]:
+    def journal_entry(self) -> dict[str, str | float]:
         """Its entry in a journal, since a resumed run needs the same shape."""
         return {"shape": self.name, **self.parameters}
 
     @property
     def surface(self) -> Surface:
         """Its surface in the simulated world, which shares only geometry with the models."""
-        return surface_under(self.shape.region(self.theta[None, :]), self.name)
+        return surface_of_region(self.shape.region(self.theta[None, :]), self.name)
 
     @property
     def outline_mm(self) -> FloatArray:
@@ -103,7 +105,7 @@ class Hidden:
         """Its parameters by name."""
         return dict(zip(self.shape.prior.names, self.theta.tolist(), strict=True))
 
-    def named_as(self, names: Sequence[str]) -> dict[str, float]:
+    def parameters_by_names(self, names: Sequence[str]) -> dict[str, float]:
         """Return its parameters by the hypothesis' names: in a set, "rectangle.width_mm", with shared centre."""
         known, prefix = self.parameters, f"{self.name}."
         return {name: known[name.removeprefix(prefix)] for name in names if name.removeprefix(prefix) in known}

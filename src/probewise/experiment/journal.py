@@ -30,10 +30,10 @@ from probewise._kinds import require_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, shown
 from probewise.recordings.atomic import write_text_atomically, write_to_disk
-from probewise.recordings.locking import locked
+from probewise.recordings.locking import hold_lock
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
-from probewise.recordings.strict_json import json_of
+from probewise.recordings.strict_json import parse_json_file_text
 from probewise.recordings.text import read_bytes
 
 FORMAT = "journal/1"
@@ -177,7 +177,7 @@ def read_journal(path: str | Path) -> Journal:
 
 
 def _parse_line(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
-    value = json_of(path, line, "one JSON object a line", row=row)
+    value = parse_json_file_text(path, line, "one JSON object a line", row=row)
     if not isinstance(value, dict):
         raise FileError(path, f"a JSON {type(value).__name__}", "one JSON object a line", row=row)
     return value
@@ -211,9 +211,9 @@ def _parse_entry(path: str | Path, line: Mapping[str, Any], row: int) -> Entry:
         column = "time_s"
         time_s = _parse_number(line["time_s"])
         column = "reading"
-        value = _or_nan(line["reading"])
+        value = _nan_if_null(line["reading"])
         column = "covariates"
-        covariates = {str(name): _or_nan(number) for name, number in line["covariates"].items()}
+        covariates = {str(name): _nan_if_null(number) for name, number in line["covariates"].items()}
         column = "belief"
         summary = _parse_summary(line["belief"]) if "belief" in line else None
     except KeyError as error:
@@ -228,12 +228,12 @@ def _parse_summary(line: Mapping[str, Any]) -> PosteriorSummary:
     return PosteriorSummary(mean, sd, _parse_number(line["bits"]), _parse_pose(line["next"]))
 
 
-def _or_null(value: float) -> float | None:
+def _null_if_nan(value: float) -> float | None:
     """Convert NaN, a missing reading or covariate, to null, since JSON has no NaN."""
     return value if math.isfinite(value) else None
 
 
-def _or_nan(value: float | None) -> float:
+def _nan_if_null(value: float | None) -> float:
     return math.nan if value is None else _parse_number(value)
 
 
@@ -309,7 +309,7 @@ class JournalWriter:
         except OSError as error:
             raise FileError(path.parent, f"cannot be made ({error.strerror})", "a folder you may write to") from error
         with contextlib.ExitStack() as stack:
-            stack.enter_context(locked(path))
+            stack.enter_context(hold_lock(path))
             if path.exists():
                 raise _error_of_existing_file(path)
             write_text_atomically(path, json.dumps({"format": FORMAT, **settings}, allow_nan=False) + "\n")
@@ -328,7 +328,7 @@ class JournalWriter:
             If the file cannot be written, another process writes to it, or one has since it was read.
         """
         with contextlib.ExitStack() as stack:
-            stack.enter_context(locked(journal.path))
+            stack.enter_context(hold_lock(journal.path))
             try:
                 file = stack.enter_context(open(journal.path, "r+b", buffering=0))
             except OSError as error:
@@ -341,19 +341,19 @@ class JournalWriter:
             file.seek(0, os.SEEK_END)
             return cls(Path(journal.path), file, stack.pop_all())
 
-    def reading(self, index: int, reading: Reading) -> None:
+    def write_reading(self, index: int, reading: Reading) -> None:
         """Write a reading, the first part of its line."""
         line = {
             "index": index,
             "pose": _pose_as_json(reading.pose),
             "time_s": reading.time_s,
-            "reading": _or_null(reading.value),
-            "covariates": {name: _or_null(value) for name, value in reading.covariates.items()},
+            "reading": _null_if_nan(reading.value),
+            "covariates": {name: _null_if_nan(value) for name, value in reading.covariates.items()},
         }
         write_to_disk(self._file, self.path, json.dumps(line, allow_nan=False)[:-1].encode())
 
-    def summary(self, summary: PosteriorSummary) -> None:
-        """Write the summary after that reading, the rest of its line."""
+    def write_summary(self, summary: PosteriorSummary) -> None:
+        """Write the summary after the last reading written: the rest of its line."""
         line = {
             "mean": dict(summary.mean),
             "sd": dict(summary.sd),
@@ -361,6 +361,9 @@ class JournalWriter:
             "next": _pose_as_json(summary.next_pose),
         }
         write_to_disk(self._file, self.path, (_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n").encode())
+
+    # Old names.
+    reading, summary = write_reading, write_summary
 
     def close(self) -> None:
         """Close the file and let other processes write to it."""

@@ -37,7 +37,7 @@ class LocalKernels:
     form: FloatArray
 
     @classmethod
-    def about(
+    def fitted_to(
         cls, points: FloatArray, *, rng: np.random.Generator, widened: float = 1.0, most: int = MOST_KERNELS
     ) -> Self:
         """Fit at most `most` kernels to equally weighted samples, (n_samples, n_params), widened by a factor."""

@@ -38,7 +38,7 @@ class HypothesisKind:
         Natural log of its prior probability.
     prior, model, likelihood
         Prior, model and likelihood of its own parameters.
-    placed
+    to_whole_theta
         Converts its hypotheses, (n, n_own), to those of the whole experiment, (n, n_params): missing parameters are
         drawn from the prior, and those of the effect are dropped.
     whole_names
@@ -53,7 +53,7 @@ class HypothesisKind:
     prior: Prior
     model: SensorModel
     likelihood: Likelihood
-    placed: Callable[[FloatArray, np.random.Generator], FloatArray]
+    to_whole_theta: Callable[[FloatArray, np.random.Generator], FloatArray]
     whole_names: tuple[str, ...]
     effect: EffectWithSentence | None = None
 
@@ -97,13 +97,17 @@ def kinds_of(
         plain = log_prior + math.log(trust)
         whole, model = _with_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
         kinds.append(
-            HypothesisKind(part.label, "", plain, whole, part.model(model), likelihood, part.placed, prior.names)
+            HypothesisKind(
+                part.label, "", plain, whole, part.model(model), likelihood, part.to_whole_theta, prior.names
+            )
         )
         for rival in rivals:
             log_p = log_prior + math.log((1.0 - trust) / (len(ways) * ways[rival.name]))
             if rival.effect is None:
                 model, law = part.model(quick), rival.likelihood or likelihood
-                kinds.append(HypothesisKind(part.label, rival.name, log_p, own, model, law, part.placed, prior.names))
+                kinds.append(
+                    HypothesisKind(part.label, rival.name, log_p, own, model, law, part.to_whole_theta, prior.names)
+                )
                 continue
             if not isinstance(chain, Chain):
                 raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
@@ -112,7 +116,15 @@ def kinds_of(
             model = part.model(TabulatedChain.of(acting, quick) or acting)
             kinds.append(
                 HypothesisKind(
-                    part.label, rival.name, log_p, both, model, likelihood, part.placed, prior.names, rival.effect
+                    part.label,
+                    rival.name,
+                    log_p,
+                    both,
+                    model,
+                    likelihood,
+                    part.to_whole_theta,
+                    prior.names,
+                    rival.effect,
                 )
             )
     return tuple(kinds)
@@ -145,8 +157,8 @@ class _ShapePart:
     number: int | None
     n_sensor: int
 
-    def placed(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """See `HypothesisKind.placed`."""
+    def to_whole_theta(self, theta: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Convert own hypotheses, (n, n_own), to those of the experiment: draw what is missing, drop the effect's."""
         if self.number is None:
             return theta[:, : len(self.columns)]
         u = rng.random((len(theta), len(self.whole.names)))
@@ -190,7 +202,7 @@ class _RestrictedModel:
     others: FloatArray
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `SensorModel.predict`."""
+        """Return noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
         full = np.tile(self.others, (len(theta), 1))
         full[:, self.columns] = theta
         return self.whole.predict(full, plan)
@@ -209,13 +221,13 @@ class _PrefixedPrior:
         return tuple(f"{self.effect}.{name}" for name in self.own.names)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
-        """See `Prior.from_unit_cube`."""
+        """Map unit-cube coordinates to parameters, both (n_samples, n_params)."""
         return self.own.from_unit_cube(u)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """See `Prior.to_unit_cube`."""
+        """Map parameters to unit-cube coordinates, both (n_samples, n_params)."""
         return self.own.to_unit_cube(theta)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """See `Prior.log_prob`."""
+        """Return the natural log of the density, (n_samples, n_params) -> (n_samples,)."""
         return self.own.log_prob(theta)

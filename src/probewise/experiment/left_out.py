@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise.calibration import FittedSensor
 from probewise.effects import AmbientStep, GainDrift, OffsetDrift, spoken_name
-from probewise.experiment.pace import in_seconds
+from probewise.experiment.pace import parameters_in_seconds_of
 from probewise.experiment.rivals import WITH_CARDS
 from probewise.experiment.state import Step
 
@@ -27,9 +27,10 @@ _ALIASES = (
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Probability of each effect by name, most probable first, the same by the warier odds, and a sentence.
+    """Probability of each effect by name, most probable first, and a sentence.
 
-    `leading` is the most probable.
+    `wary` holds the same probabilities with the odds of every effect multiplied by `posterior.WARY`. `leading` is the
+    name of the most probable.
     """
 
     probability: Mapping[str, float]
@@ -38,12 +39,12 @@ class LeftOut:
 
     @property
     def leading(self) -> str:
-        """The most probable."""
+        """Name of the most probable effect, or "clean"."""
         return next(iter(self.probability))
 
     @property
     def credible_set(self) -> tuple[str, ...]:
-        """Names that hold 95 % of the probability, and every other that holds 5 % of it by the warier odds."""
+        """Names that hold 95 % of the probability, and every other with 5 % or more in `wary`."""
         held, names = 0.0, []
         for name, p in self.probability.items():
             if held < _CREDIBLE or self.wary[name] >= 1.0 - _CREDIBLE:
@@ -63,7 +64,7 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
     """Summarise the probabilities after a step, in a run with this prior trust in its sensor."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     probability = {name: p for p, name in shares}
-    wary = {name or CLEAN: p for name, p in last.kinds.wary.left_out.items()}
+    wary = {name or CLEAN: p for name, p in last.kinds.with_warier_odds.left_out.items()}
     if trust == 1:
         return LeftOut(probability, wary, "The sensor model was taken for complete, as it was told to be.")
     name, p = next(iter(probability.items()))
@@ -93,11 +94,13 @@ def _sentence_of(last: Step, name: str) -> str:
         return spoken_name(name)
     own = slice(-len(kind.effect.prior.names), None)
     posterior = last.kinds.particles[best].weighted
-    mean, sd = (in_seconds(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd()))
+    mean, sd = (
+        parameters_in_seconds_of(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd())
+    )
     return kind.effect.sentence(mean, sd)
 
 
-def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:
+def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:
     """Return the sensor with the effect that a run found, and with its remaining uncertainty.
 
     A noise effect, or one in the time of the run, is only mentioned in a note.
@@ -112,7 +115,9 @@ def repaired(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> F
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
     n_own, n = len(effect.prior.names), len(sensor.samples)
-    own = in_seconds(effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace)
+    own = parameters_in_seconds_of(
+        effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace
+    )
     return replace(
         sensor,
         names=(*sensor.names, *(f"{name}.{parameter}" for parameter in effect.prior.names)),

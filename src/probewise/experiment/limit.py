@@ -34,7 +34,7 @@ def least_readings(experiment: Experiment, *, rng: np.random.Generator, n_sample
     predictive = experiment.forecast.predictive(
         theta, weight, designs, designs.plan(PATTERN), np.arange(experiment.grid.n_places), experiment.noise_sd
     )
-    _, mass = next(predictive.maps(weight))
+    _, mass = next(predictive.level_weights(weight))
     levels = predictive.levels
     beside = levels[int(mass.sum(axis=0).argmax())]
     covered = float(mass[:, np.abs(levels - beside) > _MET * experiment.noise_sd].sum(axis=1).max())

@@ -20,10 +20,10 @@ from probewise._kinds import require_callable, require_kind, require_path, requi
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
-from probewise.experiment.acquisition import ArmOverGrid, inquire, next_poses
-from probewise.experiment.arm_error import arm_error, moved_by_arm
+from probewise.experiment.acquisition import ArmOverGrid, next_poses, predict_and_rate_readings
+from probewise.experiment.arm_error import arm_error, shifts_by_arm_error
 from probewise.experiment.configuration import Experiment, widest_mm
-from probewise.experiment.hidden import Hidden
+from probewise.experiment.hidden import HiddenShape
 from probewise.experiment.journal import (
     Journal,
     JournalWriter,
@@ -33,24 +33,24 @@ from probewise.experiment.journal import (
 )
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import prior_posterior
-from probewise.experiment.settling import utility_near_end
 from probewise.experiment.state import ArmError, Exploration, ExplorationState, Step
 from probewise.experiment.stopping_rule import (
     OFF_SDS,
-    chance_off,
     doubt_message,
     goodness_of_fit,
-    information,
-    moments,
+    information_nats,
+    probability_of_length_off,
     sensor_moments,
+    shape_moments,
     stop_reason,
 )
+from probewise.experiment.utility_near_end import utility_near_end
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
 
 def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generator) -> ExplorationState:
-    """Return the state before the first reading: draws from the prior, and the pose that promises most by them.
+    """Return the state before the first reading: draws from the prior, and the pose with the largest utility.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generato
     posterior = prior_posterior(experiment.kinds, experiment.n_particles, rng=rng)
     joined = posterior.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
-    prospect, utilities = inquire(experiment, joined, drawn, field, at=None)
+    utility_input, utilities = predict_and_rate_readings(experiment, joined, drawn, field, at=None)
     if utilities.flat:
         raise ParameterError(
             "utility",
@@ -79,7 +79,7 @@ def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generato
             "one that differs between places: as it is, no reading within reach is expected to tell anything; "
             "does the field hold the shape's prior, and can the sensor tell the shape from its surroundings?",
         )
-    pose, *planned = next_poses(experiment, prospect, utilities, rng=rng)
+    pose, *planned = next_poses(experiment, utility_input, utilities, rng=rng)
     return ExplorationState((), posterior, pose, tuple(planned))
 
 
@@ -123,14 +123,14 @@ def step(
     with warnings.catch_warnings():
         # Each step keeps its own notes; a warning per reading would hide them.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
-        carried = experiment.learning.updated(state.posterior, problem.recording, rng=rng)
-    wary = carried.wary
+        carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
+    wary = carried.with_warier_odds
     posterior = wary.joined(rng=rng)
     if experiment.trust < 1 and _stopping_rule_met(experiment, posterior, None, "", rng)[0]:
-        carried = experiment.learning.reconsidered(carried, problem.recording, rng=rng)
-        wary = carried.wary
+        carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
+        wary = carried.with_warier_odds
         posterior = wary.joined(rng=rng)
-    mean, sd, shapes = moments(experiment, posterior)
+    mean, sd, shapes = shape_moments(experiment, posterior)
     leader = carried.kinds[carried.leader]
     p_value, worst = goodness_of_fit(
         experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording)
@@ -140,7 +140,7 @@ def step(
     notes = () if posterior.run is None else posterior.run.warnings
     if p_value < experiment.doubt_p:
         notes = (*notes, doubt_message(p_value, worst, readings))
-    drawn = experiment.learning.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
+    drawn = experiment.inference_method.drawn(carried, posterior, problem.recording, experiment.n_samples, rng=rng)
     likely = max(shapes, key=shapes.__getitem__, default="")
 
     def error_of_arm() -> ArmError | None:
@@ -151,19 +151,19 @@ def step(
 
     arm = error_of_arm() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
     known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
-    prospect, utilities = inquire(
+    utility_input, utilities = predict_and_rate_readings(
         experiment, posterior, drawn, field, at=reading, goal=_remaining_goal(experiment, arm)
     )
     asks = False
     if experiment.trust < 1:
-        utilities, asks = utility_near_end(experiment, wary, prospect, utilities, readings, rng=rng, known=known)
+        utilities, asks = utility_near_end(experiment, wary, utility_input, utilities, readings, rng=rng, known=known)
         asks = asks and (max_readings is None or len(readings) < max_readings)
     if arm is None and (utilities.flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = error_of_arm()
         known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
     reason = stop_reason(experiment, sd, known and not asks, p_value, utilities, len(readings), max_readings, arm_sd)
-    pose, *planned = state.planned or next_poses(experiment, prospect, utilities, rng=rng)
+    pose, *planned = state.planned or next_poses(experiment, utility_input, utilities, rng=rng)
     info = Step(
         number=len(readings),
         reading=reading,
@@ -171,10 +171,12 @@ def step(
         mean=mean,
         sd=sd,
         shapes=shapes,
-        samples=prospect.drawn[:, experiment.shape_columns],
+        samples=utility_input.drawn[:, experiment.shape_columns],
         map=utilities,
         next_pose=None if reason else pose,
-        bits=bits_gained(information(posterior), problem.prior.log_prob(posterior.theta), posterior.weight, prior_bits),
+        bits=bits_gained(
+            information_nats(posterior), problem.prior.log_prob(posterior.theta), posterior.weight, prior_bits
+        ),
         p_value=p_value,
         posterior=posterior,
         sensor=sensor_moments(experiment, posterior),
@@ -203,15 +205,15 @@ def _stopping_rule_met(
     experiment: Experiment, posterior: Weighted, arm: ArmError | None, likely: str, rng: np.random.Generator
 ) -> tuple[bool, float]:
     """Return whether a posterior meets the stopping rule, arm included, and the chance that a length is off."""
-    _, sd, shapes = moments(experiment, posterior)
+    _, sd, shapes = shape_moments(experiment, posterior)
     if arm is not None:
         sd = np.hypot(sd, arm.sd)
         theta = posterior.theta.copy()
         own = theta[:, experiment.shape_columns]
-        theta[:, experiment.shape_columns] = own + moved_by_arm(experiment, arm.slopes, own, likely, rng=rng)
+        theta[:, experiment.shape_columns] = own + shifts_by_arm_error(experiment, arm.slopes, own, likely, rng=rng)
         posterior = dataclasses.replace(posterior, theta=theta)
-    off = chance_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
-    return experiment.is_known(sd, shapes, off), off
+    off = probability_of_length_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
+    return experiment.may_stop(sd, shapes, off), off
 
 
 def explore(
@@ -289,7 +291,7 @@ def run(
     max_readings: int = 100,
     journal: str | Path | Journal | None = None,
     progress: Callable[[Step], None] | None = None,
-    hidden: Hidden | None = None,
+    hidden: HiddenShape | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> Exploration:
     """Run `explore` to its end and collect the steps; `progress` is called with each step.
@@ -299,8 +301,8 @@ def run(
     if progress is not None:
         require_callable("progress", progress, "a function that is called with every Step, or None")
     if hidden is not None:
-        require_kind("hidden", hidden, Hidden, "a Hidden: what a simulated field holds; or None")
-        about = {**(about or {}), "hidden": hidden.document}
+        require_kind("hidden", hidden, HiddenShape, "a Hidden: what a simulated field holds; or None")
+        about = {**(about or {}), "hidden": hidden.journal_entry}
     steps = []
     for info in explore(instrument, experiment, rng=rng, max_readings=max_readings, journal=journal, about=about):
         if progress is not None:
@@ -320,7 +322,7 @@ def _steps(
 ) -> Generator[Step, None, None]:
     """Yield the steps: those of the journal `before`, then those of new readings, written to `path`."""
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
-    field = ArmOverGrid.under(instrument, experiment.grid)
+    field = ArmOverGrid.of(instrument, experiment.grid)
     first = _rng_of(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
     state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
@@ -330,9 +332,9 @@ def _steps(
             number = len(state.readings) + 1
             entry = replayed[number - 1] if number <= len(replayed) else None
             reading = instrument.measure(state.next_pose) if entry is None else entry.reading
-            _require_readable(experiment, reading)  # before it is written, or a resumed run fails again
+            _require_value_in_range(experiment, reading)  # before it is written, or a resumed run fails again
             if writer is not None and entry is None:
-                writer.reading(number, reading)
+                writer.write_reading(number, reading)
             state, info = step(
                 state,
                 reading,
@@ -343,7 +345,7 @@ def _steps(
                 max_readings=max_readings,
             )
             if writer is not None and (entry is None or entry.summary is None):
-                writer.summary(_journal_summary(info, state))
+                writer.write_summary(_journal_summary(info, state))
             if entry is not None:
                 info = dataclasses.replace(info, replayed=True)
                 # The journal's pose is used, even if another machine's arithmetic would choose another.
@@ -355,7 +357,7 @@ def _steps(
             yield info
 
 
-def _require_readable(experiment: Experiment, reading: Reading) -> None:
+def _require_value_in_range(experiment: Experiment, reading: Reading) -> None:
     """Raise LinkError for a reading out of range: the instrument is at fault, and the run can be resumed."""
     try:
         experiment.readout.require(reading.value)

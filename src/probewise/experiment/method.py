@@ -71,28 +71,28 @@ class SequentialMonteCarlo:
 
     @property
     def label(self) -> str:
-        """See `Method.label`."""
+        """Short name for reports."""
         return f"sequential Monte Carlo, {self.n_particles} samples carried from reading to reading"
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """See `Method.updated`."""
+        """Reweight, resample and move the samples of every kind by the last reading."""
         return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._nested_solver(rng))
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """See `Method.reconsidered`."""
+        """Sample rivals again whose samples may have lost the truth."""
         return reconsidered(posterior, recording, self.n_particles, rng=rng, from_scratch=self._nested_solver(rng))
 
     def _nested_solver(self, rng: np.random.Generator) -> Callable[[SensorProblem], NestedResult]:
-        return lambda problem: from_scratch(problem, self.n_live, rng)
+        return lambda problem: nested_sampling_from_scratch(problem, self.n_live, rng)
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
-        """See `Method.drawn`."""
+        """Resample `n` hypotheses from the joined posterior, (n, n_params)."""
         return joined.samples(n, rng=rng)
 
 
-def from_scratch(problem: SensorProblem, n_live: int, rng: np.random.Generator) -> NestedResult:
+def nested_sampling_from_scratch(problem: SensorProblem, n_live: int, rng: np.random.Generator) -> NestedResult:
     """Infer from all readings at once by nested sampling, when the samples cannot be updated."""
     return run(
         problem,

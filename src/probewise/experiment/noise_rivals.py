@@ -47,7 +47,7 @@ def _log_mean_over_nodes(nodes: list[FloatArray]) -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False)
-class OutlierLaw:
+class OutlierLikelihood:
     """Likelihood with outliers, marginalised over their share and width.
 
     `sd` and `step` are those of the declared noise (step 0: not rounded); `shares` and `sizes`, (n_nodes,), are equally
@@ -70,7 +70,7 @@ class OutlierLaw:
 
 
 @dataclass(frozen=True, eq=False)
-class LostReadingLaw:
+class LostReadingLikelihood:
     """Likelihood with lost readings, independent of the target.
 
     Lost readings are black, exactly or within the noise, or anything in the range.
@@ -97,7 +97,7 @@ class LostReadingLaw:
 
 
 @dataclass(frozen=True, eq=False)
-class CorrelatedLaw:
+class CorrelatedLikelihood:
     """Likelihood with AR(1) noise, marginalised over the correlation."""
 
     sd: float
@@ -117,7 +117,7 @@ class CorrelatedLaw:
 
 
 @dataclass(frozen=True, eq=False)
-class SignalDependentLaw:
+class SignalDependentLikelihood:
     """Likelihood with noise that grows with the signal, marginalised over the ratio."""
 
     sd: float
@@ -137,7 +137,7 @@ class SignalDependentLaw:
 
 
 @dataclass(frozen=True, eq=False)
-class FlickerLaw:
+class FlickerLikelihood:
     """Likelihood under a lamp that flickers faster than the readings: each reading has a random phase.
 
     `amplitudes` are equally weighted nodes. A sine of uniform phase is approximated by a mixture over a few phases.
@@ -161,7 +161,7 @@ class FlickerLaw:
 
 
 @dataclass(frozen=True, eq=False)
-class LatticeLaw:
+class LatticeLikelihood:
     """Likelihood with coarser rounding than declared; without a lattice, the same as the declared noise.
 
     A lattice is the set of multiples of the coarser step. Three different values or more determine it. If the declared
@@ -202,10 +202,17 @@ class LatticeLaw:
         return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(self.step) if self.step else 0.0))
 
 
-Law = OutlierLaw | LostReadingLaw | CorrelatedLaw | SignalDependentLaw | FlickerLaw | LatticeLaw
+NoiseLikelihood = (
+    OutlierLikelihood
+    | LostReadingLikelihood
+    | CorrelatedLikelihood
+    | SignalDependentLikelihood
+    | FlickerLikelihood
+    | LatticeLikelihood
+)
 
 
-def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, Law]:
+def noise_likelihoods(sd: float, step: float, ends: tuple[float, float]) -> dict[str, NoiseLikelihood]:
     """Return the noise models by their names in the vocabulary.
 
     Parameters
@@ -220,12 +227,12 @@ def noise_laws(sd: float, step: float, ends: tuple[float, float]) -> dict[str, L
     shares, sizes = Outliers().bank()[:, 0].T
     amplitudes = HeavyTailedPrior(0.01 * (high - low), positive=True).from_unit((np.arange(6) + 0.5) / 6)
     return {
-        "outliers": OutlierLaw(sd, step, shares, sizes),
-        "dropouts": LostReadingLaw(sd, step, dark, low, high),
-        "correlated_noise": CorrelatedLaw(sd, step),
-        "signal_dependent_noise": SignalDependentLaw(sd, step, dark, bright),
-        "flicker": FlickerLaw(sd, step, tuple(amplitudes.tolist())),
-        "quantisation": LatticeLaw(sd, step),
+        "outliers": OutlierLikelihood(sd, step, shares, sizes),
+        "dropouts": LostReadingLikelihood(sd, step, dark, low, high),
+        "correlated_noise": CorrelatedLikelihood(sd, step),
+        "signal_dependent_noise": SignalDependentLikelihood(sd, step, dark, bright),
+        "flicker": FlickerLikelihood(sd, step, tuple(amplitudes.tolist())),
+        "quantisation": LatticeLikelihood(sd, step),
     }
 
 

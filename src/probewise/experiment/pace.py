@@ -33,19 +33,19 @@ class Pace:
 
     @classmethod
     def of(cls, readings: Sequence[Reading]) -> Self:
-        """Estimate it from readings."""
+        """Estimate start and pace from readings."""
         if len(readings) < 2 or readings[-1].time_s <= readings[0].time_s:
             return cls(readings[0].time_s if readings else 0.0)
         return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
 
-    def on(self, plan: Plan) -> Plan:
+    def plan_with_run_time(self, plan: Plan) -> Plan:
         """Add a column with the run's own time to a plan."""
         own = (plan.time_s - self.start_s) * (EACH_S / self.each_s)
         return replace(plan, covariates={**plan.covariates, _COLUMN: own})
 
-    def on_recording(self, recording: Recording) -> Recording:
-        """Add the column to a recording's plan."""
-        return replace(recording, plan=self.on(recording.plan))
+    def recording_with_run_time(self, recording: Recording) -> Recording:
+        """Add a column with the run's own time to a recording's plan."""
+        return replace(recording, plan=self.plan_with_run_time(recording.plan))
 
 
 def run_time_s(plan: Plan) -> FloatArray | None:
@@ -62,25 +62,25 @@ class EffectWithSentence(Effect[Any], Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Paced(WrappedEffect[FloatArray]):
-    """An effect that uses the run's own time: for its prior and, if the plan has that time, for its formula."""
+class EffectInRunTime(WrappedEffect[FloatArray]):
+    """An effect whose times and rates are in the run's own time; without that column in the plan, in recorded time."""
 
     effect: EffectWithSentence
 
     powers: ClassVar[Mapping[str, int]] = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Apply the effect."""
+        """Apply the effect in the run's own time, if the plan has it."""
         own = run_time_s(plan)
         return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
 
-    def by_the_clock(self, theta: FloatArray, pace: Pace) -> FloatArray:
+    def parameters_in_seconds(self, theta: FloatArray, pace: Pace) -> FloatArray:
         """Convert parameters from the run's own time to seconds, any shape (..., n_params)."""
         powers = np.array([self.powers.get(name, 0) for name in self.prior.names])
         return np.asarray(theta * (pace.each_s / EACH_S) ** powers)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the effect."""
+        """Describe the effect, given posterior means and sds of its parameters."""
         return self.effect.sentence(mean, sd)
 
 
@@ -105,10 +105,10 @@ class FromRest(WrappedEffect[Any]):
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Describe the effect."""
+        """Describe the effect, given posterior means and sds of its parameters."""
         return self.effect.sentence(mean, sd)
 
 
-def in_seconds(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
-    """Return an effect's parameters in seconds, whether or not it is `Paced`."""
-    return effect.by_the_clock(theta, pace) if isinstance(effect, Paced) else theta
+def parameters_in_seconds_of(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
+    """Return an effect's parameters in seconds: converted if it is an `EffectInRunTime`, else as they are."""
+    return effect.parameters_in_seconds(theta, pace) if isinstance(effect, EffectInRunTime) else theta

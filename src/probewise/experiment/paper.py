@@ -15,7 +15,7 @@ from typing import get_args
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm import LegoScale
+from probewise.arm import ReadingScale
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
 from probewise.errors import NotConvergedError, ParameterError
@@ -23,7 +23,14 @@ from probewise.experiment.configuration import Experiment, OneScan
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import Particles
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.simulation import Model, bin_width_of, chain_of, levels_of, posing, scale_of
+from probewise.experiment.simulation import (
+    Model,
+    bin_width_of,
+    chain_of,
+    experiment_without_inference,
+    levels_of,
+    scale_of,
+)
 from probewise.inference import Naive
 from probewise.inquiry import ReadingEntropy
 from probewise.nested import (
@@ -38,7 +45,7 @@ from probewise.nested import (
     diversify,
 )
 from probewise.nested.run import run
-from probewise.nested.weights import resampled
+from probewise.nested.weights import resampled_rows
 from probewise.recordings import Recording
 from probewise.recordings import Uniform as UniformPattern
 from probewise.recordings.plan import require_described, require_recording
@@ -78,11 +85,11 @@ class NestedSampling:
 
     @property
     def label(self) -> str:
-        """See `Method.label`."""
+        """Short name for reports."""
         return f"the paper's: nested sampling anew after each reading, {self.n_live} live points"
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """See `Method.updated`: nested sampling anew, once for each kind of hypotheses."""
+        """Infer from all readings by a new nested sampling run for each kind of hypotheses."""
         found = tuple(
             self._sample_by_nested_sampling(had, kind, recording, rng)
             for kind, had in zip(previous.kinds, previous.particles, strict=True)
@@ -93,20 +100,20 @@ class NestedSampling:
         return now
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """See `Method.reconsidered`; return the posterior as it is, since every reading starts anew."""
+        """Return the posterior as it is: every reading starts nested sampling anew, so no samples lose the truth."""
         return posterior
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
-        """See `Method.drawn`; samples of a nested run may be copies, so each takes its own steps."""
-        which = resampled(posterior.probability, n, rng)
+        """Draw `n` hypotheses, (n, n_params); each takes steps of its own, since a run's samples may be copies."""
+        which = resampled_rows(posterior.probability, n, rng)
         drawn = []
         for k, (kind, particles) in enumerate(zip(posterior.kinds, posterior.particles, strict=True)):
             if n_own := int((which == k).sum()):
                 start = particles.weighted.samples(n_own, rng=rng)
                 moved, _ = diversify(start, kind.problem(recording), rng=rng, n_steps=self.n_steps)
-                drawn.append(kind.placed(moved, rng))
+                drawn.append(kind.to_whole_theta(moved, rng))
         return np.concatenate(drawn)
 
     def _sample_by_nested_sampling(
@@ -169,8 +176,8 @@ def paper_experiment(
         "change": nested sampling ends at a change of ln Z below 1e-8, as in the paper; "remaining": when ln Z can rise
         by at most 0.05.
     naive
-        Levels and sds of the naive model, from repeated readings over black and over white; see `levels_from` and
-        `levels_in`.
+        Levels and sds of the naive model, from repeated readings over black and over white; see
+        `naive_levels_from_recording` and `naive_levels_from_world`.
     orientations_rad, repeats, heights_mm
         As for `experiment_for`.
 
@@ -183,12 +190,14 @@ def paper_experiment(
     for name, value, allowed in (("model", model, get_args(Model)), ("nested_stop", nested_stop, tuple(NESTED_STOP))):
         if value not in allowed:
             raise ParameterError(name, value, " or ".join(map(repr, allowed)))
-    sensor = sensor.leading()
+    sensor = sensor.with_leading_effects()
     scale, scene = scale_of(sensor.instrumentation), HypothesisScene(shape)
     if naive is not None and model != "naive":
         raise ParameterError("naive", naive, 'None, but with the model "naive"')
     pose = partial(
-        posing(sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm),
+        experiment_without_inference(
+            sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm
+        ),
         utility=ReadingEntropy(bin_width_of(sensor)),
         n_samples=_N_SAMPLES,
         n_live=N_LIVE,
@@ -211,7 +220,7 @@ def student_t_bounds(levels: FixedLevels, step: float | None) -> OneScan:
     return OneScan(floor, max(span, 10.0 * floor))
 
 
-def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
+def naive_levels_from_recording(recording: Recording, sensor: FittedSensor) -> Naive:
     """Estimate the naive model's levels and sds from a recording's readings over black and over white.
 
     Readings count if at most a thousandth of the footprint is on the other colour: over uniform sheets, and at the far
@@ -225,7 +234,7 @@ def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
     require_recording(recording)
     require_sensor(sensor)
     require_described(recording.plan)
-    mixture, patterns = sensor.leading().mixture(), KnownScene(recording.plan.patterns)
+    mixture, patterns = sensor.with_leading_effects().mixture(), KnownScene(recording.plan.patterns)
     share = Chain(mixture, FixedLevels(0.0, 1.0), patterns, n_nodes=FAST_NODES)
     seen = share.predict(np.empty((1, 0)), recording.plan)[0]
     black, white = (
@@ -240,7 +249,9 @@ def levels_from(recording: Recording, sensor: FittedSensor) -> Naive:
     return _naive_from_readings(black, white, scale_of(sensor.instrumentation).step)
 
 
-def levels_in(world: World, scale: LegoScale, *, rng: np.random.Generator, n_each: int = _N_EACH) -> Naive:
+def naive_levels_from_world(
+    world: World, scale: ReadingScale, *, rng: np.random.Generator, n_each: int = _N_EACH
+) -> Naive:
     """Simulate `n_each` readings over a black and a white sheet, for the naive model's levels and sds."""
     black, white = (
         np.array(

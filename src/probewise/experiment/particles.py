@@ -19,10 +19,10 @@ from scipy.special import logsumexp
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError
 from probewise.experiment.kernels import MOST_KERNELS, LocalKernels
-from probewise.inference.problem import SensorProblem, scores
+from probewise.inference.problem import SensorProblem, checked_log_prob
 from probewise.nested.importance import Weighted, pareto_k
 from probewise.nested.result import NestedResult
-from probewise.nested.weights import n_effective, power_bracket, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Prior
 
 _KEEP = 0.5  # least effective share of the samples without resampling
@@ -187,14 +187,14 @@ def update(
         given_up = n_resampled - previous.n_resampled >= effort.most_temperatures
         strained |= given_up and all_at_once < least
         share = 1.0 if all_at_once >= least or given_up else _next_power(log_weight, base, now, share, least)
-        weighed = _updated_log_weights(log_weight, now.at(share), base)
+        weighed = _updated_log_weights(log_weight, now.log_likelihood_at_power(share), base)
         gained = float(logsumexp(weighed))
-        log_z, log_weight, base = log_z + gained, weighed - gained, now.at(share)
+        log_z, log_weight, base = log_z + gained, weighed - gained, now.log_likelihood_at_power(share)
         n_eff = n_effective(log_weight)
         variance += max(1.0 / n_eff - 1.0 / n, 0.0)
         if share == 1.0 and n_eff >= least:
             break
-        rows = resampled(np.exp(log_weight - log_weight.max()), n, rng)
+        rows = resampled_rows(np.exp(log_weight - log_weight.max()), n, rng)
         now, moves = _move_by_metropolis(
             now.take(rows), share, last, rng, _partition_rows(rows) if fall_back is None else None, effort
         )
@@ -203,7 +203,7 @@ def update(
             if fall_back is not None:
                 return _particles_from_run(fall_back(), n, last, n_calls, rng)
             strained = True
-        base, log_weight = now.at(share), np.full(n, -math.log(n))
+        base, log_weight = now.log_likelihood_at_power(share), np.full(n, -math.log(n))
         if share == 1.0:
             break
     tail = pareto_k(log_weight) if n_eff < n else -math.inf
@@ -242,7 +242,7 @@ def resample_and_move(
     had = particles.weighted
     if n == len(had.theta) or had.log_z == -math.inf:
         return particles
-    rows = resampled(had.weight, n, rng)
+    rows = resampled_rows(had.weight, n, rng)
     start = _EvaluatedSamples(
         had.theta[rows], problem.prior.log_prob(had.theta[rows]), *np.tile(had.log_likelihood[rows], (2, 1))
     )
@@ -260,7 +260,7 @@ def particles_from_posterior(
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     last = _LastReading(problem)
-    cloud = last.evaluate_samples(found.theta[resampled(found.weight, n, rng)])
+    cloud = last.evaluate_samples(found.theta[resampled_rows(found.weight, n, rng)])
     moved, moves = _move_by_metropolis(cloud, 1.0, last, rng, effort=effort)
     drawn = replace(_equally_weighted(moved, found), n_calls=found.n_calls + n + moves.n_calls)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
@@ -283,14 +283,14 @@ class _EvaluatedSamples:
     before: FloatArray
     after: FloatArray
 
-    def at(self, share: float) -> FloatArray:
+    def log_likelihood_at_power(self, share: float) -> FloatArray:
         """Return the log likelihood with the last reading's raised to a power `share`."""
         return self.after if share == 1.0 else (1.0 - share) * self.before + share * self.after
 
     def take(self, rows: IntArray) -> _EvaluatedSamples:
         return _EvaluatedSamples(self.theta[rows], self.log_prior[rows], self.before[rows], self.after[rows])
 
-    def put(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
+    def overwritten(self, rows: BoolArray, other: _EvaluatedSamples) -> _EvaluatedSamples:
         """Overwrite rows with the samples of `other`, in the same order."""
         return _EvaluatedSamples(
             np.where(rows[:, None], other.theta, self.theta),
@@ -314,7 +314,7 @@ class _LastReading:
         recording = self.problem.recording
         if not recording.usable[-1]:
             return 0.0
-        best = scores(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
+        best = checked_log_prob(self.problem.likelihood, recording.readings[-1:], predicted[:, -1:]).max()
         return float(self.perfect_log_likelihood - best)
 
     @property
@@ -322,7 +322,9 @@ class _LastReading:
         """Log likelihood of the last reading under a perfect prediction; zero if it is missing."""
         recording = self.problem.recording
         reading = recording.readings[-1:]
-        return float(scores(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
+        return (
+            float(checked_log_prob(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
+        )
 
     def log_likelihoods(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
@@ -335,7 +337,7 @@ class _LastReading:
         """Return the log likelihood of these readings; zero for none."""
         if not rows.any():
             return np.zeros(len(predicted))
-        return scores(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
+        return checked_log_prob(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
 
     def evaluate_samples(self, theta: FloatArray) -> _EvaluatedSamples:
         """Evaluate samples; the model is not evaluated outside the prior."""
@@ -376,7 +378,7 @@ def _move_by_metropolis(
         return start, _MoveCounts(0.0, 0)
     parts = [np.arange(n)] if parts is None else parts
     effort = THOROUGH if effort is None else effort
-    kernels = [LocalKernels.about(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
+    kernels = [LocalKernels.fitted_to(start.theta[rows], rng=rng, most=effort.n_kernels) for rows in parts]
     now, accepted, n_calls = start, 0.0, 0
     for _ in range(_MOST_ROUNDS):
         for propose in (_propose_from_kernels, _propose_along_differences):
@@ -384,9 +386,15 @@ def _move_by_metropolis(
             for k, rows in enumerate(parts):
                 theta[rows], log_ratio[rows] = propose(now.theta[rows], kernels[k - 1], rng)
             proposed = last.evaluate_samples(theta)
-            odds = proposed.log_prior + proposed.at(share) - now.log_prior - now.at(share) + log_ratio
+            odds = (
+                proposed.log_prior
+                + proposed.log_likelihood_at_power(share)
+                - now.log_prior
+                - now.log_likelihood_at_power(share)
+                + log_ratio
+            )
             taken = np.log(rng.random(n)) < odds
-            now = now.put(taken, proposed)
+            now = now.overwritten(taken, proposed)
             n_calls += n
             accepted += float(taken.mean())
         if accepted >= effort.steps_per_sample:
@@ -421,7 +429,11 @@ def _partition_rows(rows: IntArray) -> list[IntArray]:
 def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples, share: float, enough: float) -> float:
     """Return the largest power of the last reading's likelihood with enough effective samples, by bisection."""
     low, _ = power_bracket(
-        lambda power: _updated_log_weights(log_weight, now.at(power), base), share, 1.0, wanted=enough, n_steps=30
+        lambda power: _updated_log_weights(log_weight, now.log_likelihood_at_power(power), base),
+        share,
+        1.0,
+        wanted=enough,
+        n_steps=30,
     )
     return max(low, share + 1e-6)
 

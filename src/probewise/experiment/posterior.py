@@ -17,7 +17,7 @@ from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.experiment.evidence import Bridged, bridged_evidence, importance_resampled
+from probewise.experiment.evidence import BridgedEvidence, bridged_evidence, importance_resampled
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import (
     BRIEF,
@@ -101,7 +101,7 @@ class Posterior:
         """Index of the most probable kind."""
         return int(self.log_odds.argmax())
 
-    def doubting(self, times: float) -> Posterior:
+    def with_fault_odds_times(self, times: float) -> Posterior:
         """Return the posterior with the odds of an incomplete sensor model multiplied by `times`."""
         log_prior = np.array([k.log_prior + (math.log(times) if k.left_out else 0.0) for k in self.kinds])
         log_prior -= logsumexp(log_prior)
@@ -109,9 +109,9 @@ class Posterior:
         return replace(self, kinds=kinds)
 
     @property
-    def wary(self) -> Posterior:
-        """The posterior by the warier odds; itself in a run that trusts its sensor."""
-        return self.doubting(WARY) if any(kind.left_out for kind in self.kinds) else self
+    def with_warier_odds(self) -> Posterior:
+        """The posterior with the odds of an incomplete model multiplied by `WARY`; itself if no kind has an effect."""
+        return self.with_fault_odds_times(WARY) if any(kind.left_out for kind in self.kinds) else self
 
     def joined(self, *, rng: np.random.Generator) -> Weighted:
         """Combine the samples of all kinds to one weighted posterior."""
@@ -121,7 +121,7 @@ class Posterior:
         some = [k for k, p in enumerate(probability) if p > 0]
         own = [self.particles[k].weighted for k in some]
         leader = self.particles[self.leader].weighted
-        theta = np.concatenate([self.kinds[k].placed(w.theta, rng) for k, w in zip(some, own, strict=True)])
+        theta = np.concatenate([self.kinds[k].to_whole_theta(w.theta, rng) for k, w in zip(some, own, strict=True)])
         log_weight = np.concatenate([w.log_weight + math.log(probability[k]) for k, w in zip(some, own, strict=True)])
         weight = np.exp(log_weight)
         errors = np.array([self.particles[k].log_z_error for k in some])
@@ -267,10 +267,10 @@ def _with_rivals_sampled_again(
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
         donors += [own.weighted] if own.log_z > hopeless else []
         n = max(len(own.ancestor), _n_samples_of_kind(kind, 0.0, n_particles))
-        anew = _sample_from_others(kind, problem, own.weighted, donors, n, hopeless, rng)
+        anew = _sample_near_other_kinds(kind, problem, own.weighted, donors, n, hopeless, rng)
         found = anew.samples
-        if anew.promised < hopeless:
-            particles[k] = replace(own, log_z_limit=max(anew.promised, own.log_z) + _RULED_OUT)
+        if anew.highest_log_z < hopeless:
+            particles[k] = replace(own, log_z_limit=max(anew.highest_log_z, own.log_z) + _RULED_OUT)
             continue
         if found is None or found.n_eff < _FEWEST:
             particles[k] = replace(own, strained=own.strained or own.hurried)
@@ -286,14 +286,14 @@ def _with_rivals_sampled_again(
 
 
 @dataclass(frozen=True, eq=False)
-class _SamplesFromOthers:
-    """Samples of a kind, None if none was found, and the log evidence that fits promise, infinite without fits."""
+class _SamplesNearOtherKinds:
+    """Samples of a kind, None if none was found, and the largest log evidence by fits, infinite without fits."""
 
     samples: Weighted | None
-    promised: float = math.inf
+    highest_log_z: float = math.inf
 
 
-def _sample_from_others(
+def _sample_near_other_kinds(
     kind: HypothesisKind,
     problem: SensorProblem,
     own: Weighted,
@@ -301,21 +301,21 @@ def _sample_from_others(
     n: int,
     hopeless: float,
     rng: np.random.Generator,
-) -> _SamplesFromOthers:
-    """Sample a kind's posterior with what others believe: refits of it, or the samples themselves for a noise law.
+) -> _SamplesNearOtherKinds:
+    """Sample a kind's posterior from samples of other kinds: by refits or, for a noise model, from these directly.
 
-    No samples are drawn if the fits promise less than `hopeless`.
+    No samples are drawn if the largest log evidence by fits is below `hopeless`.
     """
     noise = declared_noise(kind.likelihood)
     if kind.effect is not None:
         if noise is None:
-            return _SamplesFromOthers(None)
+            return _SamplesNearOtherKinds(None)
         sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
         found = fit_kind(kind, problem, donors, noise_sd=sd, rng=rng)
         if found.highest_log_z < hopeless:
-            return _SamplesFromOthers(None, found.highest_log_z)
+            return _SamplesNearOtherKinds(None, found.highest_log_z)
         with_own = own.log_z > hopeless
-        return _SamplesFromOthers(
+        return _SamplesNearOtherKinds(
             sampled_about_fits(found, problem, own, n_draws=2 * n, with_own=with_own, rng=rng), found.highest_log_z
         )
     n_own = len(kind.prior.names)
@@ -323,9 +323,9 @@ def _sample_from_others(
     if own.log_z > hopeless:
         points.append(own.samples(n // 2, rng=rng))
     try:
-        return _SamplesFromOthers(importance_resampled(np.concatenate(points), problem, rng=rng, n_draws=n))
+        return _SamplesNearOtherKinds(importance_resampled(np.concatenate(points), problem, rng=rng, n_draws=n))
     except NotConvergedError:
-        return _SamplesFromOthers(None)
+        return _SamplesNearOtherKinds(None)
 
 
 def _n_samples_of_kind(kind: HypothesisKind, probability: float, n_particles: int) -> int:
@@ -352,14 +352,14 @@ def _reestimated_where_doubtful(
 ) -> Posterior:
     """Re-estimate kinds until none has an evidence whose error could change its probability by more than `most_off`."""
     particles, settled = list(now.particles), set[int]()
-    while (k := _most_doubtful(now, settled, most_off)) is not None:
+    while (k := _kind_with_most_doubtful_evidence(now, settled, most_off)) is not None:
         settled.add(k)
         particles[k] = _reestimate_kind(particles[k], problems[k], n, from_scratch, rng)
         now = replace(now, particles=tuple(particles))
     return now
 
 
-def _most_doubtful(now: Posterior, settled: set[int], most_off: float) -> int | None:
+def _kind_with_most_doubtful_evidence(now: Posterior, settled: set[int], most_off: float) -> int | None:
     """Return the kind whose evidence error has the largest effect on its probability; None if all are negligible.
 
     In a run that doubts its sensor, a kind whose samples are in doubt counts where it has a say in the shape.
@@ -424,7 +424,7 @@ def _with_bridged_evidence(particles: Particles, problem: SensorProblem, rng: np
     )
 
 
-def _as_independent_start(particles: Particles, found: Bridged) -> Particles:
+def _as_independent_start(particles: Particles, found: BridgedEvidence) -> Particles:
     """Give the samples a new evidence, and make them an independent start: each is its own ancestor."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)

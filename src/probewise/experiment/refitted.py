@@ -23,7 +23,7 @@ from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.pace import EACH_S, run_time_s
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
-from probewise.nested.weights import resampled
+from probewise.nested.weights import resampled_rows
 
 _STARTS = 90
 _STEPS = 8
@@ -48,7 +48,7 @@ class Fits:
     theta
         The fits, (n_starts, n_params).
     score
-        Log likelihood plus log prior of each, (n_starts,); minus infinity where a start led nowhere.
+        Log likelihood plus log prior of each, (n_starts,); minus infinity if the fit failed.
     precision
         Inverse covariances about them, (n_starts, n_params, n_params).
     """
@@ -58,8 +58,8 @@ class Fits:
     precision: FloatArray
 
     @cached_property
-    def good(self) -> IntArray:
-        """The fits that are not much worse than the best, best first; empty where no start led anywhere."""
+    def good_rows(self) -> IntArray:
+        """Rows of the fits that are not much worse than the best, best first; empty if every fit failed."""
         order = np.argsort(-self.score)
         return (
             order[self.score[order] > self.score[order[0]] - _WORSE] if math.isfinite(self.score.max()) else order[:0]
@@ -68,9 +68,9 @@ class Fits:
     @cached_property
     def log_z(self) -> FloatArray:
         """Log evidence by the Gaussian about each good fit, (n_good,)."""
-        log_det = np.linalg.slogdet(self.precision[self.good])[1]
+        log_det = np.linalg.slogdet(self.precision[self.good_rows])[1]
         log_volume = 0.5 * self.theta.shape[1] * math.log(2 * math.pi) - 0.5 * log_det
-        return np.asarray(self.score[self.good] + log_volume)
+        return np.asarray(self.score[self.good_rows] + log_volume)
 
     @property
     def highest_log_z(self) -> float:
@@ -203,16 +203,16 @@ def sampled_about_fits(
     The samples; None where hardly a draw is possible.
     """
     n_params = found.theta.shape[1]
-    best = found.good[np.argsort(-found.log_z)][:_KEPT]
+    best = found.good_rows[np.argsort(-found.log_z)][:_KEPT]
     densities = [LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse_precision(found.precision[best]))]
     if with_own and len(rows := _resampled_rows(own, n_params, rng)):
-        densities.append(LocalKernels.about(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
+        densities.append(LocalKernels.fitted_to(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
     first = _importance_sampled(own, problem, densities, n_draws // 2, rng)
     if first is None or not len(rows := _resampled_rows(first, n_params, rng)):
         return first
     # A posterior is more curved than the Gaussians about its fits: once more, about what these have found.
-    near = LocalKernels.about(first.theta[rows], rng=rng, most=_KERNELS)
-    far = LocalKernels.about(first.theta[rows], rng=rng, widened=_FAR, most=_KERNELS)
+    near = LocalKernels.fitted_to(first.theta[rows], rng=rng, most=_KERNELS)
+    far = LocalKernels.fitted_to(first.theta[rows], rng=rng, widened=_FAR, most=_KERNELS)
     return _importance_sampled(first, problem, [near, near, far, *densities], n_draws, rng) or first
 
 
@@ -225,7 +225,7 @@ def _inverse_precision(precision: FloatArray) -> FloatArray:
 
 def _resampled_rows(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
     """Resample rows of a posterior; none where too few are distinct to fit kernels."""
-    rows = resampled(posterior.weight, len(posterior.theta), rng)
+    rows = resampled_rows(posterior.weight, len(posterior.theta), rng)
     return rows if len(np.unique(rows)) > 4 * n_params else rows[:0]
 
 

@@ -3,7 +3,7 @@
 The effects and their typical sizes are those of the diagnosis. A run is no recording, though: before its first reading
 nothing is known of places and times. Effects of the pose and of the footprint take their scales from a scan of
 100 mm, as a calibration has it; effects that change with the place, from the whole field; with time, from five minutes.
-What a dozen readings could not show leaves nothing out that matters (`Shown`).
+What a dozen readings could not show leaves nothing out that matters (`EffectLargeEnoughForRun`).
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from probewise.effects import (
     OffsetDrift,
 )
 from probewise.errors import ParameterError
-from probewise.experiment.noise_rivals import noise_laws
-from probewise.experiment.pace import EACH_S, EffectWithSentence, FromRest, Paced
-from probewise.experiment.shown import Shown
+from probewise.experiment.effect_large_enough import EffectLargeEnoughForRun
+from probewise.experiment.noise_rivals import noise_likelihoods
+from probewise.experiment.pace import EACH_S, EffectInRunTime, EffectWithSentence, FromRest
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import cards_of
@@ -113,7 +113,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
             found += [Rival(name, effect=way) for way in _effects_in_run(effect, field_mm)]
     noise = declared_noise(likelihood)
     if noise is not None:
-        laws = noise_laws(*noise, (model.levels.i_min, model.levels.i_max))
+        laws = noise_likelihoods(*noise, (model.levels.i_min, model.levels.i_max))
         found += [Rival(name, likelihood=law) for name, law in laws.items()]
     return tuple(found)
 
@@ -121,11 +121,11 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
 def _effects_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[EffectWithSentence]:
     """List the forms in which an effect may act in a run: one that changes with time does so at the run's own pace."""
     if effect.name in OF_MOTION:
-        return [Shown(effect, field_mm), FromRest(Shown(effect, field_mm))]
+        return [EffectLargeEnoughForRun(effect, field_mm), FromRest(EffectLargeEnoughForRun(effect, field_mm))]
     if effect.name not in _IN_TIME:
-        return [Shown(effect, field_mm)]
-    ways = [effect, GainLoss.like(effect)] if isinstance(effect, GainDrift) else [effect]
-    return [Paced(Shown(way, field_mm)) for way in ways]
+        return [EffectLargeEnoughForRun(effect, field_mm)]
+    ways = [effect, GainLoss.with_scales_of(effect)] if isinstance(effect, GainDrift) else [effect]
+    return [EffectInRunTime(EffectLargeEnoughForRun(way, field_mm)) for way in ways]
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class GainLoss(GainDrift):
     """A lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
 
     @classmethod
-    def like(cls, drift: GainDrift) -> Self:
+    def with_scales_of(cls, drift: GainDrift) -> Self:
         """Take the scales of `drift`, whose signal ends as calibrated."""
         return cls(drift.typical, drift.shortest_s, drift.longest_s)
 

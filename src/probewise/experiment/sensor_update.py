@@ -22,7 +22,7 @@ from probewise.sensor.stages import require_columns
 
 
 @dataclass(frozen=True)
-class Change:
+class SensorChangeSds:
     """Prior sds of a sensor's changes since its calibration.
 
     `log_size` of the footprint along each axis (0.3: a third wider or narrower), `shift_mm` of its
@@ -66,12 +66,12 @@ class AdjustedMixture:
         )
 
 
-def sensor_prior(sensor: FittedSensor, change: Change | None = None) -> Product:
+def sensor_prior(sensor: FittedSensor, change: SensorChangeSds | None = None) -> Product:
     """Return the prior of the sensor: the calibration's posterior, widened for possible changes.
 
     The parameters are those of `AdjustedMixture`, then I_min and I_max.
     """
-    change = Change() if change is None else change
+    change = SensorChangeSds() if change is None else change
     n = sensor.n_gaussians
     moments = _footprint_moments(footprint_of(sensor.samples[:, : 6 * n], n))
     mean, sd = sensor.mean(), sensor.sd()

@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise._kinds import did_you_mean
-from probewise.arm import LegoScale, Pose, Reach, Reading, SimulatedArm, Workspace
+from probewise.arm import Pose, Reach, Reading, ReadingScale, SimulatedArm, Workspace
 from probewise.calibration import FittedSensor
 from probewise.calibration.sensor_file import require_sensor
 from probewise.effects import Estimated, Known
@@ -43,7 +43,7 @@ from probewise.scene import (
 from probewise.scene.albedo import require_shape
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FreeLevels, NaiveSensor, Stage
 from probewise.sensor.stages import AnyEffect
-from probewise.world import Covered, Oval, Spot, Surface, World
+from probewise.world import CoveredSurface, Oval, Spot, Surface, World
 
 Model: TypeAlias = Literal["ssf", "naive"]
 
@@ -52,11 +52,11 @@ _USUAL_HEIGHT_MM = 14.0  # height of the paper's sensor above the surface
 _PAINTED_VERTICES = 512  # vertices of a curved outline that is not an ellipse: within 0.01 mm of a circle of 150 mm
 
 
-class Streams(NamedTuple):
+class RandomStreams(NamedTuple):
     """Independent random streams of one simulated run: robot, hidden shape, shadow run, noise.
 
     `noise` is a number, from which each reading's generator is made; see `arm_over`. `levels` is that of readings over
-    black and white before the run, see `levels_in`.
+    black and white before the run, see `naive_levels_from_world`.
     """
 
     run: np.random.Generator
@@ -66,13 +66,13 @@ class Streams(NamedTuple):
     levels: np.random.Generator
 
     @classmethod
-    def of(cls, rng: np.random.Generator) -> Streams:
+    def of(cls, rng: np.random.Generator) -> RandomStreams:
         """Spawn them from one generator, so that one seed gives the whole run."""
         run, truth, shadow, noise, levels = rng.spawn(5)
         return cls(run, truth, shadow, int(noise.integers(2**63)), levels)
 
 
-def sensor_named(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
+def sensor_entry(sensor: FittedSensor, path: str | os.PathLike[str] | None = None) -> dict[str, str]:
     """Return a journal's entry for the sensor: its fingerprint, and its file if any."""
     require_sensor(sensor)
     named = {} if path is None else {"sensor_file": os.fspath(path)}
@@ -169,11 +169,13 @@ def experiment_for(
     require_sensor(sensor, "in the order experiment_for(sensor, shape, field)")
     if model not in get_args(Model):
         raise ParameterError("model", model, " or ".join(map(repr, get_args(Model))))
-    sensor = sensor.leading()  # a mean over several hypotheses describes none of them
+    sensor = sensor.with_leading_effects()  # a mean over several hypotheses describes none of them
     levels, noise_sd, scale = levels_of(sensor), float(sensor.noise_sd.mean()), scale_of(sensor.instrumentation)
     scene = CardedScene(shape, cards) if cards else HypothesisScene(shape)
     pose = partial(
-        posing(sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm),
+        experiment_without_inference(
+            sensor, shape, field, model, orientations_rad=orientations_rad, repeats=repeats, heights_mm=heights_mm
+        ),
         utility=Finishing() if utility is None else utility,
         batch=batch,
         n_live=n_live,
@@ -196,7 +198,7 @@ def experiment_for(
     return pose(chain, likelihood)
 
 
-def posing(
+def experiment_without_inference(
     sensor: FittedSensor,
     shape: Shape,
     field: Field,
@@ -236,7 +238,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
     """
     means = sensor.mean()
     effects: list[AnyEffect] = []
-    for effect in sensor.carried_effects:
+    for effect in sensor.effects_on_new_scans:
         if effect.stage is Stage.NOISE:  # noise of readings far apart in place and time is independent
             continue
         names = [f"{effect.name}.{name}" for name in effect.prior.names]
@@ -262,7 +264,7 @@ TRUST = 0.9
 """Default prior probability that a sensor model is complete."""
 
 
-def usual_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
+def default_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
     """Return the default trust in a sensor.
 
     It is 1 if no rivals are available, for several shapes, or with a user's own utility.
@@ -282,12 +284,12 @@ def calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[floa
     return height_mm
 
 
-def scale_of(instrumentation: Instrumentation) -> LegoScale:
+def scale_of(instrumentation: Instrumentation) -> ReadingScale:
     """Return the scale of readings: the LEGO brick's for its unit, otherwise the declared step and range."""
     if instrumentation.unit == "LEGO":
-        return LegoScale()
+        return ReadingScale()
     low, high = instrumentation.min, instrumentation.max
-    return LegoScale(-math.inf if low is None else low, math.inf if high is None else high, instrumentation.step)
+    return ReadingScale(-math.inf if low is None else low, math.inf if high is None else high, instrumentation.step)
 
 
 def world_like(sensor: FittedSensor) -> World:
@@ -304,10 +306,10 @@ def world_like(sensor: FittedSensor) -> World:
 
 def surface_of(name: str, theta: FloatArray, field: Field) -> Surface:
     """Return the world's surface of a shape; only geometry is shared with the models."""
-    return surface_under(SHAPES[name](field).region(theta[None, :]), name)
+    return surface_of_region(SHAPES[name](field).region(theta[None, :]), name)
 
 
-def surface_under(region: Region, name: str) -> Surface:
+def surface_of_region(region: Region, name: str) -> Surface:
     """Return the world's surface of the region of one hypothesis.
 
     Raises
@@ -328,10 +330,10 @@ def surface_under(region: Region, name: str) -> Surface:
 
 def with_cards(surface: Surface, cards: Sequence[Card]) -> Surface:
     """Add cards to a surface of the world; only geometry and albedo are shared."""
-    if not cards or isinstance(surface, Covered):
+    if not cards or isinstance(surface, CoveredSurface):
         return surface
     laid = [Polygon(tuple((float(x), float(y)) for x, y in card.corners_mm), inside=card.albedo) for card in cards]
-    return Covered(surface, tuple(laid))
+    return CoveredSurface(surface, tuple(laid))
 
 
 def arm_over(
@@ -342,7 +344,7 @@ def arm_over(
     seed: int,
     taken: Sequence[Reading] = (),
     workspace: Workspace | None = None,
-    scale: LegoScale | None = None,
+    scale: ReadingScale | None = None,
 ) -> SimulatedArm:
     """Return a simulated arm over a surface.
 
@@ -371,7 +373,7 @@ def arm_over(
     return SimulatedArm(
         light,
         reach=reach,
-        scale=LegoScale() if scale is None else scale,
+        scale=ReadingScale() if scale is None else scale,
         height_mm=world.height_mm,
         last=taken[-1] if taken else None,
     )

@@ -15,7 +15,7 @@ from probewise.experiment.state import Exploration, Step
 from probewise.inquiry import prior_entropy
 
 
-def run_from(
+def run_from_place(
     first: Pose, instrument: Instrument, experiment: Experiment, *, rng: np.random.Generator, max_readings: int = 100
 ) -> Exploration:
     """Run the loop of `explore` from a given first place.
@@ -40,7 +40,7 @@ def run_from(
     """
     if max_readings < 1:
         raise ParameterError("max_readings", max_readings, "1 or more")
-    field = ArmOverGrid.under(instrument, experiment.grid)
+    field = ArmOverGrid.of(instrument, experiment.grid)
     prior_bits = prior_entropy(experiment.prior, rng=rng)
     state = dataclasses.replace(begin(experiment, field, rng=rng), next_pose=first, planned=())
     steps: list[Step] = []

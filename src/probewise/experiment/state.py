@@ -13,7 +13,7 @@ from probewise._display import ShowsItself
 from probewise._kinds import require_kind
 from probewise.arm.instrument import Pose, Reading
 from probewise.experiment.configuration import Experiment, widest_mm
-from probewise.experiment.hidden import Hidden
+from probewise.experiment.hidden import HiddenShape
 from probewise.experiment.journal import recording_of
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
@@ -121,7 +121,7 @@ class Step(ShowsItself):
         return max(self.shapes, key=self.shapes.__getitem__, default="")
 
     @property
-    def stance(self) -> str:
+    def orientation_and_height(self) -> str:
         """Orientation and height of the sensor, as far as they were chosen, as text after the place."""
         pose, designs = self.reading.pose, self.map.designs
         turned = f", turned {math.degrees(pose.orientation_rad):.0f}°" if len(designs.orientations_rad) > 1 else ""
@@ -139,8 +139,8 @@ class Step(ShowsItself):
         if self.shapes:
             believed = f"{self.likely_shape} (p = {self.shapes[self.likely_shape]:.2f}): {believed}"
         return (
-            f"reading {self.number}: {self.reading.value:g} at ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm{self.stance}; "
-            f"{believed}; {self.bits:.1f} bits"
+            f"reading {self.number}: {self.reading.value:g} at ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"
+            f"{self.orientation_and_height}; {believed}; {self.bits:.1f} bits"
         )
 
 
@@ -152,12 +152,12 @@ class ArmError:
     ----------
     slopes
         By how much each independent error of one sd moves the posterior mean, (n_params, n_errors).
-    moved
-        Such errors, drawn for each sample of the posterior, (n_samples, n_params).
+    shifts
+        Shift of each posterior sample by an error of the arm drawn for it, (n_samples, n_params).
     """
 
     slopes: FloatArray
-    moved: FloatArray
+    shifts: FloatArray
 
     @property
     def sd(self) -> FloatArray:
@@ -179,7 +179,7 @@ class Exploration(ShowsItself):
 
     experiment: Experiment
     steps: tuple[Step, ...]
-    hidden: Hidden | None = None
+    hidden: HiddenShape | None = None
 
     @property
     def arm(self) -> ArmError | None:
@@ -203,7 +203,7 @@ class Exploration(ShowsItself):
         if self.arm is None:
             return found
         theta = found.theta.copy()
-        theta[:, self.experiment.shape_columns] += self.arm.moved
+        theta[:, self.experiment.shape_columns] += self.arm.shifts
         return replace(found, theta=theta)
 
     @property
@@ -224,7 +224,7 @@ class Exploration(ShowsItself):
     def reached(self) -> bool:
         """Whether the target precision was reached, arm included, with a hypothesis that explains the readings."""
         trusted = self.last.p_value >= self.experiment.doubt_p
-        return trusted and self.experiment.is_known(self.sd, self.last.shapes, self.last.chance_off)
+        return trusted and self.experiment.may_stop(self.sd, self.last.shapes, self.last.chance_off)
 
     @property
     def seconds(self) -> float:

@@ -1,4 +1,4 @@
-"""Summaries of a posterior: moments, goodness of fit, stopping rule."""
+"""Summaries of a posterior: mean and sd, goodness of fit, stopping rule."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ OFF_SDS = 3.0
 """Error, in units of the stopping rule's sd, above which a length counts as wrong: 12 mm for 4 mm."""
 
 
-def information(posterior: Weighted) -> float:
+def information_nats(posterior: Weighted) -> float:
     """Return the relative entropy of posterior to prior, nats: mean log likelihood minus log evidence."""
     some = posterior.weight > 0  # excluded samples have a log likelihood of minus infinity
     return float(posterior.weight[some] @ posterior.log_likelihood[some]) - posterior.log_z
 
 
-def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+def shape_moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     """Return mean and sd of the shape's parameters, (n_params,) each, and shape probabilities.
 
     For a set of shapes: given the most probable shape, with NaN for parameters that it does not have.
@@ -34,7 +34,7 @@ def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, Fl
     if not isinstance(experiment.shape, AnyOf):
         mean = weight @ theta
         return mean, np.sqrt(weight @ (theta - mean) ** 2), {}
-    which = experiment.shape.which(theta)
+    which = experiment.shape.shape_index(theta)
     share = np.bincount(which, weights=weight, minlength=len(experiment.shape.labels))
     likely = int(share.argmax())
     columns = experiment.shape.prior.columns[likely]
@@ -46,19 +46,19 @@ def moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, Fl
     return mean, sd, dict(zip(experiment.shape.labels, (float(p) for p in share / share.sum()), strict=True))
 
 
-def chance_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
+def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
     """Return the probability that a length differs by more than `off_mm` from its posterior mean.
 
     For a set of shapes: from the mean given the most probable shape, and other shapes count as wrong.
     """
     theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
-    mean, _, _ = moments(experiment, posterior)
+    mean, _, _ = shape_moments(experiment, posterior)
     lengths = [
         k for k, name in enumerate(experiment.shape.prior.names) if name.endswith("_mm") and np.isfinite(mean[k])
     ]
     off = (np.abs(theta[:, lengths] - mean[lengths]) > off_mm).any(axis=1)
     if isinstance(experiment.shape, AnyOf):
-        which = experiment.shape.which(theta)
+        which = experiment.shape.shape_index(theta)
         off |= which != np.bincount(which, weights=weight).argmax()
     return float(weight[off].sum() / weight.sum())
 

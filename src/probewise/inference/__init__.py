@@ -6,7 +6,7 @@ out), and Gaussian likelihoods; any sensor model works with any of them.
 
 from probewise.inference.gaussian import GaussianInferred, GaussianKnown
 from probewise.inference.naive import Naive
-from probewise.inference.noise_bounds import reading_span, sd_ceiling, sd_floor, student_t
+from probewise.inference.noise_bounds import reading_span, sd_ceiling, sd_floor, student_t_of
 from probewise.inference.problem import Likelihood, Problem, SensorProblem
 from probewise.inference.rounded import Rounded
 from probewise.inference.student_t import PooledSigma, StudentT, log_sigma_integral
@@ -25,5 +25,8 @@ __all__ = [
     "reading_span",
     "sd_ceiling",
     "sd_floor",
-    "student_t",
+    "student_t_of",
 ]
+
+student_t = student_t_of
+"""The old name of `student_t_of`."""

@@ -39,7 +39,7 @@ def sd_ceiling(recording: Recording) -> float:
     return max(reading_span(recording), 10.0 * sd_floor(recording))
 
 
-def student_t(recording: Recording, groups: IntArray | None = None) -> StudentT:
+def student_t_of(recording: Recording, groups: IntArray | None = None) -> StudentT:
     """Build the Student-t likelihood of a recording's usable readings, with the bounds of this module.
 
     Parameters

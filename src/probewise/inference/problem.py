@@ -44,7 +44,7 @@ def require_model(model: object) -> None:
     require_like("model", model, ("names", "predict"), allowed)
 
 
-def scores(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+def checked_log_prob(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return the log likelihood of each prediction, (n_points,), (n_samples, n_points) -> (n_samples,).
 
     Raises ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
@@ -89,12 +89,14 @@ class SensorProblem:
         """
         at_once = max(_MOST_NUMBERS // max(len(self.recording), 1), 1)
         if len(theta) > at_once:
-            return np.concatenate([self._of_block(theta[at : at + at_once]) for at in range(0, len(theta), at_once)])
-        return self._of_block(theta)
+            return np.concatenate(
+                [self._log_likelihood_of_block(theta[at : at + at_once]) for at in range(0, len(theta), at_once)]
+            )
+        return self._log_likelihood_of_block(theta)
 
-    def _of_block(self, theta: FloatArray) -> FloatArray:
+    def _log_likelihood_of_block(self, theta: FloatArray) -> FloatArray:
         usable = self.recording.usable
         predicted = self.model.predict(theta, self.recording.plan)
         if usable.all():
-            return scores(self.likelihood, self.recording.readings, predicted)
-        return scores(self.likelihood, self.recording.readings[usable], predicted[:, usable])
+            return checked_log_prob(self.likelihood, self.recording.readings, predicted)
+        return checked_log_prob(self.likelihood, self.recording.readings[usable], predicted[:, usable])

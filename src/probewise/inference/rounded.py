@@ -56,11 +56,11 @@ class Rounded:
         away = np.abs(residuals(readings, predicted)) / self.sd
         at_end = (readings >= self.high) | (readings <= self.low)
         if at_end.any():
-            within = self._log_cell(away[:, ~at_end]).sum(axis=1)
-            return np.asarray(within + self._log_end(readings[at_end], predicted[:, at_end]).sum(axis=1))
-        return np.asarray(self._log_cell(away).sum(axis=1))
+            within = self._log_cell_probability(away[:, ~at_end]).sum(axis=1)
+            return np.asarray(within + self._log_end_probability(readings[at_end], predicted[:, at_end]).sum(axis=1))
+        return np.asarray(self._log_cell_probability(away).sum(axis=1))
 
-    def _log_cell(self, away: FloatArray) -> FloatArray:
+    def _log_cell_probability(self, away: FloatArray) -> FloatArray:
         """Look up the log probability of a cell, by its distance from the prediction in sds."""
         position = np.minimum(away, _FAR - 1.0) * _PER_SD
         entry = position.astype(np.int64)
@@ -71,7 +71,7 @@ class Rounded:
             out[far] = self._log_cell_exactly(away[far])
         return np.asarray(out)
 
-    def _log_end(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+    def _log_end_probability(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the log probability of a clipped reading: everything beyond that end of the scale."""
         inward = np.where(readings >= self.high, predicted - readings, readings - predicted)
         return np.asarray(log_ndtr((inward + 0.5 * self.step) / self.sd))

@@ -52,7 +52,7 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
     fits = t_low < a  # residuals below the floor: both ends in the lower tail
     huge = t_high > a  # residuals beyond the ceiling: both ends in the upper tail
     if not (fits.any() or huge.any()):
-        return _log_usual(s, a, t_low, t_high) - math.log(2.0)
+        return _log_twice_integral_over_peak(s, a, t_low, t_high) - math.log(2.0)
     s, a, t_low, t_high = np.broadcast_arrays(s, a, t_low, t_high)
     out = np.empty(s.shape)
     if fits.any():
@@ -67,11 +67,11 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
         out[huge] = difference + b * (math.log(2.0) - np.log(s[huge]))
     usual = ~(fits | huge)
     if usual.any():
-        out[usual] = _log_usual(s[usual], a[usual], t_low[usual], t_high[usual])
+        out[usual] = _log_twice_integral_over_peak(s[usual], a[usual], t_low[usual], t_high[usual])
     return out - math.log(2.0)
 
 
-def _log_usual(s: FloatArray, a: FloatArray, t_low: FloatArray, t_high: FloatArray) -> FloatArray:
+def _log_twice_integral_over_peak(s: FloatArray, a: FloatArray, t_low: FloatArray, t_high: FloatArray) -> FloatArray:
     """Return the log of twice the integral, for t_low above a and t_high below."""
     share = gammainc(a, t_low) - gammainc(a, t_high)
     return np.asarray(gammaln(a) + np.log(share) + a * (math.log(2.0) - np.log(s)))
@@ -137,7 +137,7 @@ class StudentT:
         groups = frozen_int(self.groups)
         if groups.ndim != 1:
             raise ShapeError(f"groups have shape {groups.shape}; allowed: (n_points,)")
-        _require_bounds(self.sd_floor, self.sd_ceiling)
+        _require_ordered_bounds(self.sd_floor, self.sd_ceiling)
         object.__setattr__(self, "groups", groups)
 
     @cached_property
@@ -212,7 +212,7 @@ class PooledSigma:
     sd_ceiling: float
 
     def __post_init__(self) -> None:
-        _require_bounds(self.sd_floor, self.sd_ceiling)
+        _require_ordered_bounds(self.sd_floor, self.sd_ceiling)
         object.__setattr__(self, "square", frozen(self.square))
 
     def log_density(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
@@ -248,6 +248,6 @@ class PooledSigma:
         return log_sigma_integral(self.square, self.n, self.sd_floor, self.sd_ceiling)
 
 
-def _require_bounds(sd_floor: float, sd_ceiling: float) -> None:
+def _require_ordered_bounds(sd_floor: float, sd_ceiling: float) -> None:
     if not 0 < sd_floor < sd_ceiling < math.inf:
         raise ParameterError("(sd_floor, sd_ceiling)", (sd_floor, sd_ceiling), "0 < floor < ceiling, finite")

@@ -21,11 +21,10 @@ from probewise.inquiry.grid import Grid
 from probewise.inquiry.information import bits_gained, gaussian_entropy, neighbour_entropy, prior_entropy
 from probewise.inquiry.labels import FunctionValue, Label, ParameterValue, WhichShape
 from probewise.inquiry.named import UTILITY_NAMES, utility_named
-from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.inquiry.tabulated import DiscForecast, TabulatedForecast, forecast_of
 from probewise.inquiry.tabulated_effects import TabulatedChain
-from probewise.inquiry.telling_apart import Rival, tell_apart
+from probewise.inquiry.telling_apart import Rival, information_about_rivals
 from probewise.inquiry.utility import (
     InformationAbout,
     InformationGain,
@@ -34,6 +33,7 @@ from probewise.inquiry.utility import (
     Utility,
     label_entropy,
 )
+from probewise.inquiry.utility_input import Goal, UtilityInput
 from probewise.inquiry.utility_map import UtilityMap, entropy_map, reachable_rows, utility_map
 
 __all__ = [
@@ -58,7 +58,6 @@ __all__ = [
     "PerSecond",
     "Predictive",
     "PredictiveDistributions",
-    "Prospect",
     "ReadingEntropy",
     "ReadingNoise",
     "Readout",
@@ -66,6 +65,7 @@ __all__ = [
     "TabulatedChain",
     "TabulatedForecast",
     "Utility",
+    "UtilityInput",
     "UtilityMap",
     "WhichShape",
     "best_places",
@@ -79,12 +79,12 @@ __all__ = [
     "fewest_readings",
     "forecast_of",
     "gaussian_entropy",
+    "information_about_rivals",
     "label_entropy",
     "neighbour_entropy",
     "prior_entropy",
     "reachable_rows",
     "target_entropy",
-    "tell_apart",
     "utility_map",
     "utility_named",
 ]
@@ -100,3 +100,9 @@ Outlook = PredictiveDistributions
 
 TabledChain = TabulatedChain
 """The old name of `TabulatedChain`."""
+
+Prospect = UtilityInput
+"""The old name of `UtilityInput`."""
+
+tell_apart = information_about_rivals
+"""The old name of `information_about_rivals`."""

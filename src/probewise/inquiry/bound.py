@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.inquiry.forecast import spread_levels
+from probewise.inquiry.forecast import evenly_spaced_levels
 from probewise.inquiry.readout import Readout, entropy_bits
 
 _PER_SD = 4.0
@@ -36,19 +36,22 @@ class Bound:
     capacity_bits: float
 
     @property
-    def search(self) -> float:
+    def readings_of_search(self) -> float:
         """Number of readings until the shape is found."""
         return self.search_bits / self.search_capacity_bits
 
     @property
-    def refinement(self) -> float:
+    def readings_of_refinement(self) -> float:
         """Number of readings from there until the target precision."""
         return self.refinement_bits / self.capacity_bits
 
     @property
     def readings(self) -> float:
         """Total number of readings."""
-        return self.search + self.refinement
+        return self.readings_of_search + self.readings_of_refinement
+
+    # Old names.
+    search, refinement = readings_of_search, readings_of_refinement
 
 
 def fewest_readings(
@@ -91,7 +94,7 @@ def capacity_bits(low: float, high: float, readout: Readout) -> float:
     """
     if not low < high:
         raise ParameterError("(low, high)", (low, high), "low < high")
-    levels = spread_levels(low, high, readout.noise_sd / _PER_SD)
+    levels = evenly_spaced_levels(low, high, readout.noise_sd / _PER_SD)
     chance = readout.probability(levels)
     given = -entropy_bits(chance)
     share: FloatArray = np.full(len(levels), 1.0 / len(levels))

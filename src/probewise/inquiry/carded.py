@@ -17,7 +17,7 @@ from probewise.inquiry.forecast import (
     weight_by_level,
 )
 from probewise.recordings.plan import Plan
-from probewise.scene.cards import Card, CardedScene, seen_with_cards
+from probewise.scene.cards import Card, CardedScene, mean_albedo_with_cards
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.sensor.chain import Layout, response
 from probewise.sensor.stages import Poses, SensorModel
@@ -54,20 +54,20 @@ class CardedModel:
         return cards_of(self.chain)
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `SensorModel.predict`."""
-        covered = self.covered(Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan)
-        dark, bright = self.ends
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
+        covered = self.share_on_cards(Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan)
+        dark, bright = self.black_and_white
         seen = (self.plain.predict(theta, plan) - dark) / (bright - dark)
-        return np.asarray(dark + (bright - dark) * seen_with_cards(seen, self.cards, covered))
+        return np.asarray(dark + (bright - dark) * mean_albedo_with_cards(seen, self.cards, covered))
 
     @property
-    def ends(self) -> tuple[float, float]:
+    def black_and_white(self) -> tuple[float, float]:
         """Readings over black and over white."""
         levels = self.chain.levels
         assert isinstance(levels, FixedLevels)
         return levels.i_min, levels.i_max
 
-    def covered(self, poses: Poses, plan: Plan) -> list[FloatArray]:
+    def share_on_cards(self, poses: Poses, plan: Plan) -> list[FloatArray]:
         """Return the share of the footprint on each card, (n_samples or 1, n_points) each."""
         mixture = self.chain.ssf
         assert isinstance(mixture, FixedMixture)
@@ -99,26 +99,26 @@ class CardedForecast:
 
     @property
     def model(self) -> CardedModel:
-        """See `Forecast.model`."""
+        """The sensor model, with the cards."""
         return CardedModel(self.chain, self.base.model)
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `Forecast.predict`."""
+        """Predict noise-free readings, with cards: (n_samples, n_params) -> (n_samples, n_points)."""
         return CardedModel(self.chain, _ForecastAsModel(self.base)).predict(theta, plan)
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """See `Forecast.predictive`."""
+        """Return the predictive distribution at `rows`: by tables; near cards, by predictions of some hypotheses."""
         base = self.base.predictive(theta, weight, designs, plan, rows, noise_sd)
         there, model = plan.take(rows), self.model
-        covered = model.covered(Poses(there.x_mm[None], there.y_mm[None], there.orientation_rad[None]), there)
+        covered = model.share_on_cards(Poses(there.x_mm[None], there.y_mm[None], there.orientation_rad[None]), there)
         near = np.flatnonzero(sum(share[0] for share in covered) > _SHOWS)
         if not near.size:
             return base
-        asked, share = resampled_hypotheses(weight, _MOST_ASKED)
-        answers = model.predict(theta[asked], there.take(near))
-        return _CardedPredictive(base, asked, share / weight[asked], answers, near, len(rows))
+        chosen, share = resampled_hypotheses(weight, _MOST_ASKED)
+        answers = model.predict(theta[chosen], there.take(near))
+        return _CardedPredictive(base, chosen, share / weight[chosen], answers, near, len(rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,10 +137,10 @@ class _ForecastAsModel:
 
 @dataclass(frozen=True, eq=False)
 class _CardedPredictive:
-    """Predictions by tables except for designs near a card; `answers` are predictions of `asked` hypotheses there."""
+    """Predictions by tables except for designs near a card; `answers` are predictions of `chosen` hypotheses there."""
 
     base: PredictiveDistributions
-    asked: IntArray
+    chosen: IntArray
     stands_for: FloatArray
     answers: FloatArray
     near: IntArray
@@ -150,15 +150,15 @@ class _CardedPredictive:
     def levels(self) -> FloatArray:
         return self.base.levels
 
-    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `PredictiveDistributions.maps`."""
-        own, n = weight[self.asked] * self.stands_for, len(self.near)
+    def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield the weight of each level at each design: that of the tables, replaced at designs near a card."""
+        own, n = weight[self.chosen] * self.stands_for, len(self.near)
         levels = self.levels
         index = nearest_level(self.answers, levels)
         mass_there = weight_by_level(np.clip(index, 0, len(levels) - 1), own, len(levels))
         number = np.full(self.n_rows, -1)
         number[self.near] = np.arange(n)
-        for at, mass in self.base.maps(weight):
+        for at, mass in self.base.level_weights(weight):
             sees = np.flatnonzero(number[at] >= 0)
             if sees.size:
                 mass = mass.copy()

@@ -13,7 +13,7 @@ from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, HypothesisScene, outlines
 from probewise.sensor import Chain, FixedLevels, FixedMixture
-from probewise.sensor.commanded import is_commanded
+from probewise.sensor.commanded import has_commanded_height_or_led
 from probewise.sensor.stages import SensorModel
 
 _REACH = 6.0  # sds of the footprint beyond which it is negligible: 1e-9 of the levels' difference
@@ -35,7 +35,7 @@ class CullingBounds:
 
         Only the shape matters for a known mixture and known levels without effects.
         """
-        if not isinstance(model, Chain) or model.effects or is_commanded(plan) or len(plan) == 0:
+        if not isinstance(model, Chain) or model.effects or has_commanded_height_or_led(plan) or len(plan) == 0:
             return None
         if not isinstance(model.ssf, FixedMixture) or not isinstance(model.levels, FixedLevels):
             return None

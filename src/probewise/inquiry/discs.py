@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.effects import EdgeBlur, Halo, Known
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
-from probewise.inquiry.scanlines import ROWS, Interval, Ring, Spans, to_single_precision
+from probewise.inquiry.scanlines import ROWS, Interval, PlacesNearEdges, ScanlineIntervals, to_single_precision
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, Circle, HypothesisScene
 from probewise.sensor import Chain, FixedMixture, NaiveSensor
@@ -62,7 +62,7 @@ class DiscTable:
         """Tabulate a model, or return None if that is not possible.
 
         A table holds a known mixture, or the naive sensor, over a single circle, with no effects but those of
-        `is_alike_everywhere`; it must see no farther than 80 mm.
+        `is_uniform_and_known`; it must see no farther than 80 mm.
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
@@ -76,7 +76,7 @@ class DiscTable:
         if isinstance(model, NaiveSensor):
             dark, bright = _levels_outside_and_inside(model, high)
             return cls(dark, bright, 0.0, bends, frozen(np.empty((0, 0, 0))))
-        if not isinstance(model.ssf, FixedMixture) or not all(map(is_alike_everywhere, model.effects)):
+        if not isinstance(model.ssf, FixedMixture) or not all(map(is_uniform_and_known, model.effects)):
             return None
         dark, bright = _levels_outside_and_inside(model, high)
         directions = _unit_vectors(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
@@ -85,7 +85,7 @@ class DiscTable:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
         fine = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _FINE_MM)) + 1)
-        asked = np.stack([_levels_about(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)])
+        asked = np.stack([_levels_around_disc(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)])
         asked = np.concatenate([asked, asked[:, :1]], axis=1)
         levels = np.ascontiguousarray(CubicSpline(coarse, asked, axis=-1)(fine))  # so that it is flat for free
         return cls(dark, bright, margin, bends, frozen(levels))
@@ -133,16 +133,16 @@ class DiscTable:
         along_bend = along_bend[hypothesis]
         flat = self.levels.reshape(-1)
 
-        def between(first: IntArray) -> FloatArray:
+        def interpolated_in_distance(first: IntArray) -> FloatArray:
             low = flat[first]
             return np.asarray(low + along * (flat[first + 1] - low))
 
-        def ring(first: IntArray) -> FloatArray:
-            low = between(first)
-            return np.asarray(low + along_turn * (between(first + n_distances) - low))
+        def interpolated_in_direction(first: IntArray) -> FloatArray:
+            low = interpolated_in_distance(first)
+            return np.asarray(low + along_turn * (interpolated_in_distance(first + n_distances) - low))
 
-        low = ring(corner)
-        np.put(out, near, low + along_bend * (ring(corner + n_directions * n_distances) - low))
+        low = interpolated_in_direction(corner)
+        np.put(out, near, low + along_bend * (interpolated_in_direction(corner + n_directions * n_distances) - low))
         return out
 
     def level_histogram(
@@ -175,14 +175,14 @@ class DiscTable:
         turn = turn_rad.reshape(grid.n_y, grid.n_x)
         for start in range(0, grid.n_y, ROWS):
             y_mm = to_single_precision(grid.y_mm[start : start + ROWS])
-            spans = _spans_of_discs(discs, grid, y_mm, margin)
-            ring = spans.ring()
+            intervals = _intervals_of_discs(discs, grid, y_mm, margin)
+            ring = intervals.places_near_edges()
             level: IntArray = np.full(len(ring.place), bright)  # a place exactly on the edge is inside
             if margin > 0.0:
-                away = _EdgePairs.of(discs, spans, ring, y_mm, turn[start : start + ROWS].ravel())
+                away = _EdgePairs.of(discs, intervals, ring, y_mm, turn[start : start + ROWS].ravel())
                 level = nearest.reshape(-1)[self._nearest_entry(away)]
             rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
-            mass[rows] = spans.histogram(weight, ring, level, (dark, bright), n_levels)
+            mass[rows] = intervals.histogram(weight, ring, level, (dark, bright), n_levels)
         return mass
 
     mass = level_histogram  # its old name
@@ -220,25 +220,25 @@ class DiscTable:
         return float((self.levels.shape[0] - 1) / (self.bend_per_mm[1] - self.bend_per_mm[0]))
 
 
-def is_alike_everywhere(effect: AnyEffect) -> bool:
+def is_uniform_and_known(effect: AnyEffect) -> bool:
     """Return whether an effect is known and changes the footprint equally everywhere, so that a table can hold it."""
     return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
 
 
-def _spans_of_discs(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> Spans:
+def _intervals_of_discs(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_mm: float) -> ScanlineIntervals:
     """Return the intervals in which discs, (n_samples, 3), cross rows of a grid, (n_rows,), in single precision."""
     x, y, radius = discs.T
     every_up = y_mm[:, None] - y
     row, hypothesis = np.nonzero(np.abs(every_up) <= radius + np.float32(margin_mm))
     x, radius, up = x[hypothesis], radius[hypothesis], every_up[row, hypothesis]
 
-    def within(reach: FloatArray) -> Interval:
+    def interval_within(reach: FloatArray) -> Interval:
         half = np.sqrt(np.maximum(reach * reach - up * up, 0.0))
         return np.where(np.abs(up) < reach, x - half, np.inf), x + half
 
     outer = radius + np.float32(margin_mm)
     inner = np.maximum(radius - np.float32(margin_mm), 0.0)
-    return Spans.between(grid, len(y_mm), row, hypothesis, within(outer), within(inner))
+    return ScanlineIntervals.of_ends(grid, len(y_mm), row, hypothesis, interval_within(outer), interval_within(inner))
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,12 +251,19 @@ class _EdgePairs:
     distance_mm: FloatArray
 
     @classmethod
-    def of(cls, discs: FloatArray, spans: Spans, ring: Ring, y_mm: FloatArray, turn_rad: FloatArray) -> Self:
-        own = discs[spans.hypothesis]
-        up, radius = (y_mm[spans.row] - own[:, 1])[ring.span], own[:, 2][ring.span]
+    def of(
+        cls,
+        discs: FloatArray,
+        intervals: ScanlineIntervals,
+        ring: PlacesNearEdges,
+        y_mm: FloatArray,
+        turn_rad: FloatArray,
+    ) -> Self:
+        own = discs[intervals.hypothesis]
+        up, radius = (y_mm[intervals.row] - own[:, 1])[ring.interval], own[:, 2][ring.interval]
         x = to_single_precision(ring.column)
-        x *= np.float32(spans.grid.width_mm / (spans.grid.n_x - 1))
-        x -= own[:, 0][ring.span]
+        x *= np.float32(intervals.grid.width_mm / (intervals.grid.n_x - 1))
+        x -= own[:, 0][ring.interval]
         distance = np.sqrt(x * x + up * up) - radius
         if turn_rad.any():
             cosine, sine = (to_single_precision(f(turn_rad))[ring.place] for f in (np.cos, np.sin))
@@ -284,7 +291,9 @@ def _index_and_fraction(position: FloatArray, n: int) -> tuple[IntArray, FloatAr
     return below, position - below
 
 
-def _levels_about(model: SensorModel, radius_mm: float, directions: FloatArray, distance_mm: FloatArray) -> FloatArray:
+def _levels_around_disc(
+    model: SensorModel, radius_mm: float, directions: FloatArray, distance_mm: FloatArray
+) -> FloatArray:
     """Evaluate the model at places about one disc, -> (n_directions, n_distances)."""
     away = (radius_mm + distance_mm)[:, None] * directions[:, None, :]
     places = away.reshape(-1, 2)
@@ -298,7 +307,7 @@ def _levels_about(model: SensorModel, radius_mm: float, directions: FloatArray, 
 def _levels_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[float, float]:
     """Return the levels far outside and at the middle of a large disc."""
     east = np.array([[1.0, 0.0]])
-    dark, bright = _levels_about(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
+    dark, bright = _levels_around_disc(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
     if dark == bright:
         raise ParameterError(
             "levels", (dark, bright), "two different levels: a sensor that tells the disc from its surroundings"
@@ -313,7 +322,7 @@ def _margin_of_discs(
     margin = _COARSE_MM
     for radius in (low_mm, high_mm):
         distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)
-        asked = _levels_about(model, radius, directions, distance)
+        asked = _levels_around_disc(model, radius, directions, distance)
         off = np.abs(asked - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
         margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
     return margin

@@ -20,20 +20,21 @@ _TINY = np.float32(1e-6)
 class Ellipses:
     """Ellipses in the lab frame and, for each Gaussian of the footprint, in the frame in which it is the unit Gaussian.
 
-    In the lab an ellipse is where xx dx^2 + 2 xy dx dy + yy dy^2 <= 1, dx and dy from the place at which the
-    footprint's centre is over the ellipse's: `lab` (5, n_ellipses) holds that place, then xx, xy, yy. `grows` is the
-    largest increase of each ellipse's scale per sd of the footprint, `off` the increase by the Gaussians' offsets from
-    the centre. `into` maps a place to the frames of the semi-axes `axes`, (n_gaussians, 2, n_ellipses), major and
-    minor: (n_gaussians, 2, 3, n_ellipses), the last but one what is multiplied with x, with y, and added. `rows_mm` (2,
-    n_ellipses) are the lowest and the highest point.
+    In the lab an ellipse is where xx dx^2 + 2 xy dx dy + yy dy^2 <= 1. dx and dy count from the place of the sensor
+    at which the footprint's centre is over the ellipse's centre: `lab` (5, n_ellipses) holds x and y of that place,
+    then xx, xy, yy. `growth_per_sd` is the largest increase of each ellipse's scale per sd of the footprint,
+    `growth_by_offsets` the increase by the Gaussians' offsets from the centre. `axes` (n_gaussians, 2, n_ellipses) are
+    the semi-axes, major and minor. `to_axes_frame` (n_gaussians, 2, 3, n_ellipses) maps a place to their frames: for
+    each axis the factor of x, the factor of y, and a constant. `rows_mm` (2, n_ellipses) are the lowest and the
+    highest point.
     """
 
     rows_mm: FloatArray
     share: FloatArray
     lab: FloatArray
-    grows: FloatArray
-    off: FloatArray
-    into: FloatArray
+    growth_per_sd: FloatArray
+    growth_by_offsets: FloatArray
+    to_axes_frame: FloatArray
     axes: FloatArray
 
     @classmethod
@@ -45,8 +46,8 @@ class Ellipses:
         middle = footprint.weights @ footprint.means_mm
         root = np.linalg.cholesky(footprint.covs_mm2)
         squared, frame = np.linalg.eigh(np.einsum("gki,nkl,glj->gnij", root, form, root, optimize=True))
-        into = np.einsum("gnki,gkj->gnij", frame, np.linalg.inv(root))
-        constant = np.einsum("gnij,gnj->gni", into, footprint.means_mm[:, None] - region.center_mm)
+        to_axes_frame = np.einsum("gnki,gkj->gnij", frame, np.linalg.inv(root))
+        constant = np.einsum("gnij,gnj->gni", to_axes_frame, footprint.means_mm[:, None] - region.center_mm)
         axes = squared.transpose(0, 2, 1) ** -0.5
         away = np.linalg.norm(footprint.means_mm - middle, axis=1).max()
         half_mm = np.linalg.norm(turn[:, :, 1] * region.semi_axes_mm, axis=1)
@@ -58,17 +59,26 @@ class Ellipses:
             ),
             to_single_precision((1.0 / axes[:, 1]).max(axis=0)),
             to_single_precision(away / region.semi_axes_mm.min(axis=1)),
-            to_single_precision(np.concatenate([into, constant[..., None]], axis=-1).transpose(0, 2, 3, 1)),
+            to_single_precision(np.concatenate([to_axes_frame, constant[..., None]], axis=-1).transpose(0, 2, 3, 1)),
             to_single_precision(axes),
         )
 
-    def along(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
-        """Intersect ellipse number `which` with the row of places at `y_mm`; both (n_crossings,)."""
-        lab, grows, off, into, axes = (
-            values.take(which, axis=-1) for values in (self.lab, self.grows, self.off, self.into, self.axes)
+    def crossed_by_rows(self, which: IntArray, y_mm: FloatArray) -> CrossedEllipses:
+        """Intersect each ellipse of `which` (by number) with a horizontal row at `y_mm`; both (n_crossings,)."""
+        lab, growth_per_sd, growth_by_offsets, to_axes_frame, axes = (
+            values.take(which, axis=-1)
+            for values in (self.lab, self.growth_per_sd, self.growth_by_offsets, self.to_axes_frame, self.axes)
         )
         lab[1] = y_mm - lab[1]
-        return CrossedEllipses(self.share, lab, grows, off, into[:, :, 0], into[:, :, 1] * y_mm + into[:, :, 2], axes)
+        return CrossedEllipses(
+            self.share,
+            lab,
+            growth_per_sd,
+            growth_by_offsets,
+            to_axes_frame[:, :, 0],
+            to_axes_frame[:, :, 1] * y_mm + to_axes_frame[:, :, 2],
+            axes,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,25 +91,25 @@ class CrossedEllipses:
 
     share: FloatArray
     lab: FloatArray
-    grows: FloatArray
-    off: FloatArray
+    growth_per_sd: FloatArray
+    growth_by_offsets: FloatArray
     slope: FloatArray
     base: FloatArray
     axes: FloatArray
 
-    def within(self, reach: float) -> Interval:
+    def interval_within(self, reach: float) -> Interval:
         """Return the interval of x deeper than `reach` sds inside the edge; if negative, up to that far outside.
 
         An ellipse scaled by 1 + d / (its shortest semi-axis) contains all points within d of it; and likewise inwards.
         """
         x_mm, up, xx, xy, yy = self.lab
-        scale = 1.0 - np.float32(reach) * self.grows - np.float32(np.sign(reach)) * self.off
+        scale = 1.0 - np.float32(reach) * self.growth_per_sd - np.float32(np.sign(reach)) * self.growth_by_offsets
         room = scale * scale * xx - (xx * yy - xy * xy) * up * up
         half = np.sqrt(np.maximum(room, 0.0)) / xx
         middle = x_mm - xy / xx * up
         return np.where((room > 0) & (scale > 0), middle - half, np.inf), middle + half
 
-    def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
+    def footprint_share(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
         """Return the share of the footprint over the ellipse for places of crossings, both (n_pairs,).
 
         The nearest point is found by one step along the circle of curvature from the point on the same ray.

@@ -10,8 +10,8 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
 from probewise.inquiry.forecast import resampled_hypotheses
 from probewise.inquiry.given_reading import GivenReading
-from probewise.inquiry.prospect import Goal, Prospect
 from probewise.inquiry.utility import InformationGain, Utility
+from probewise.inquiry.utility_input import Goal, UtilityInput
 
 _NEAR = 15.0  # times the target sd: beyond it, no single reading ends a run
 _MOST_ASKED = 800  # hypotheses
@@ -45,17 +45,17 @@ class Finishing:
         """Label of the other utility and of its replacement near the end."""
         return f"{self.of.label}, or chance to finish"
 
-    def __call__(self, prospect: Prospect) -> FloatArray:
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Return the utility of every available design, (n,), all by the same measure."""
-        return self.measure(prospect)[0]
+        return self.measure(utility_input)[0]
 
-    def measure(self, prospect: Prospect) -> tuple[FloatArray, str]:
+    def measure(self, utility_input: UtilityInput) -> tuple[FloatArray, str]:
         """Return the utility of every available design, (n,), and the label of the measure used."""
-        plain = self.of(prospect)
-        if prospect.goal is None or not _is_near(prospect, prospect.goal):
+        plain = self.of(utility_input)
+        if utility_input.goal is None or not _may_end_with_one_more(utility_input, utility_input.goal):
             return plain, self.of.label
         best = np.argsort(-plain, kind="stable")[:_MOST_DESIGNS]
-        chance = _probability_of_ending(prospect, prospect.goal, best)
+        chance = _probability_of_ending(utility_input, utility_input.goal, best)
         if chance.max() < self.least:
             return plain, self.of.label
         out = np.zeros(len(plain))
@@ -63,20 +63,22 @@ class Finishing:
         return out, "probability that a reading there ends the run"
 
 
-def _is_near(prospect: Prospect, goal: Goal) -> bool:
+def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
     """Return whether one more reading may end the run."""
-    lengths = prospect.theta[:, goal.columns]
-    spread = prospect.weight @ (lengths - prospect.weight @ lengths) ** 2
+    lengths = utility_input.theta[:, goal.columns]
+    spread = utility_input.weight @ (lengths - utility_input.weight @ lengths) ** 2
     return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)
 
 
-def _probability_of_ending(prospect: Prospect, goal: Goal, designs: IntArray) -> FloatArray:
+def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
     """Return the probability that a reading at each design reaches the target precision, (n_designs,)."""
-    rows, share = resampled_hypotheses(prospect.weight, _MOST_ASKED)
-    away = prospect.theta[rows][:, goal.columns]
+    rows, share = resampled_hypotheses(utility_input.weight, _MOST_ASKED)
+    away = utility_input.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()
-    answers = prospect.forecast.predict(prospect.theta[rows], prospect.plan.take(prospect.rows[designs]))
-    given = GivenReading(answers, share, prospect.readout)
+    answers = utility_input.forecast.predict(
+        utility_input.theta[rows], utility_input.plan.take(utility_input.rows[designs])
+    )
+    given = GivenReading(answers, share, utility_input.readout)
     ends = np.ones(given.weight_by_cell.shape, dtype=np.bool_)
     for length in away.T:
         mean = given.sum_by_cell(length) / given.weight_by_cell

@@ -31,7 +31,7 @@ class PredictiveDistributions(Protocol):
         """Evenly spaced noise-free readings, (n_levels,); a prediction counts for the nearest."""
         ...
 
-    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+    def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
         """Yield the weight of each level, for one combination of settings with all places after another.
 
         Parameters
@@ -84,35 +84,35 @@ class DirectForecast:
     model: SensorModel
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `Forecast.predict`."""
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
         return predict_where_visible(self.model, theta, plan)
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """See `Forecast.predictive`."""
-        asked, share = resampled_hypotheses(weight, _MOST_ASKED)
-        answers = predict_where_visible(self.model, theta[asked], plan.take(rows))
-        levels = spread_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD, most=MOST_LEVELS)
+        """Return the predictive distribution at `rows`, by predictions of at most 400 resampled hypotheses."""
+        chosen, share = resampled_hypotheses(weight, _MOST_ASKED)
+        answers = predict_where_visible(self.model, theta[chosen], plan.take(rows))
+        levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD, most=MOST_LEVELS)
         per_level = 1.0 / (levels[1] - levels[0])
         index = np.rint((answers - levels[0]) * per_level).astype(np.int32)
-        return _DirectPredictive(asked, share / weight[asked], index, levels, rows, designs.grid.n_places)
+        return _DirectPredictive(chosen, share / weight[chosen], index, levels, rows, designs.grid.n_places)
 
 
 @dataclass(frozen=True, eq=False)
 class _DirectPredictive:
-    """Predictions of the hypotheses `asked` as the `index` of the nearest level, (n_asked, n_designs)."""
+    """Predictions of the hypotheses `chosen` as the `index` of the nearest level, (n_asked, n_designs)."""
 
-    asked: IntArray
+    chosen: IntArray
     stands_for: FloatArray
     index: IntArray
     levels: FloatArray
     rows: IntArray
     n_places: int
 
-    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `PredictiveDistributions.maps`."""
-        own, n_levels = weight[self.asked] * self.stands_for, len(self.levels)
+    def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield the weight of each level, one combination of settings after another, from all places at once."""
+        own, n_levels = weight[self.chosen] * self.stands_for, len(self.levels)
         for _, at, _ in rows_by_combination(self.rows, self.n_places):
             yield at, weight_by_level(self.index[:, at], own, n_levels)
 
@@ -154,7 +154,7 @@ def predict_where_visible(model: SensorModel, theta: FloatArray, plan: Plan) -> 
     return out
 
 
-def spread_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
+def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int | None = None) -> FloatArray:
     """Return evenly spaced levels between two readings: at most `spacing` apart, unless that takes more than `most`."""
     low, high = min(low, high), max(low, high)
     n = max(2, int(np.ceil((high - low) / spacing)) + 1)

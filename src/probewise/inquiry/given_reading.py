@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.inquiry.forecast import MOST_LEVELS, nearest_level, spread_levels, weight_by_level
+from probewise.inquiry.forecast import MOST_LEVELS, evenly_spaced_levels, nearest_level, weight_by_level
 from probewise.inquiry.readout import Readout
 
 _PER_SD = 2.0  # levels of the predicted reading per noise sd
@@ -33,7 +33,9 @@ class GivenReading:
     """
 
     def __init__(self, answers: FloatArray, weight: FloatArray, readout: Readout, *, fine: float = 1.0) -> None:
-        levels = spread_levels(float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
+        levels = evenly_spaced_levels(
+            float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD, most=MOST_LEVELS
+        )
         self._index = nearest_level(answers, levels)
         self._weight = weight
         self._chance = readout.probability(levels, fine=fine, most=MOST_LEVELS)

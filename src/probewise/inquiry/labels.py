@@ -34,7 +34,7 @@ class ParameterValue:
         return self.name
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
-        """See `Label`."""
+        """Return the bin of each hypothesis's parameter: (n_samples, n_params), (n_samples,) -> (n_samples,)."""
         if self.name not in names:
             raise ParameterError("parameter", self.name, f"one of {', '.join(names)}")
         return _bins_of_equal_weight(theta[:, names.index(self.name)], weight, self.n_bins)
@@ -54,7 +54,7 @@ class FunctionValue:
         return "a function of the parameters"
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
-        """See `Label`."""
+        """Return the bin of the function's value at each hypothesis, (n_samples,)."""
         return _bins_of_equal_weight(np.asarray(self.function(theta)), weight, self.n_bins)
 
 
@@ -66,7 +66,7 @@ class WhichShape:
         return "the shape"
 
     def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
-        """See `Label`."""
+        """Return the number of each hypothesis's shape in the set, (n_samples,)."""
         if "shape" not in names:
             raise ParameterError("names", names, "shape among them: the hypotheses of two shapes or more")
         return np.floor(theta[:, names.index("shape")]).astype(np.int64)

@@ -64,8 +64,8 @@ class EdgesInFootprintSds:
             opening,
         )
 
-    def along(self, which: IntArray, y_mm: FloatArray) -> CrossedPolygons:
-        """Intersect polygon number `which` with the row of places at `y_mm`; both (n_crossings,)."""
+    def crossed_by_rows(self, which: IntArray, y_mm: FloatArray) -> CrossedPolygons:
+        """Intersect each polygon of `which` (by number) with a horizontal row at `y_mm`; both (n_crossings,)."""
         slope, up, offset = (values.take(which, axis=-1) for values in (self.across, self.up, self.offset))
         return CrossedPolygons(self.share, slope, up * y_mm + offset, self.opening, which)
 
@@ -83,7 +83,7 @@ class CrossedPolygons:
     opening: IntArray
     which: IntArray
 
-    def within(self, reach: float) -> Interval:
+    def interval_within(self, reach: float) -> Interval:
         """Return the interval of x deeper than `reach` sds inside every edge; if negative, up to that far outside.
 
         For several Gaussians, the outermost counts outside the polygon, and the innermost inside.
@@ -95,7 +95,7 @@ class CrossedPolygons:
         outermost, innermost = (np.min, np.max) if reach < 0 else (np.max, np.min)
         return outermost(low, axis=0).max(axis=0), innermost(high, axis=0).min(axis=0)
 
-    def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
+    def footprint_share(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
         """Return the share of the footprint over the polygon for places of crossings, both (n_pairs,)."""
         which = self.which.take(crossing)
         out = to_single_precision(np.zeros(x_mm.shape))

@@ -19,16 +19,16 @@ Interval = tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class Ring:
+class PlacesNearEdges:
     """Pairs of a span and a place near the edge, (n_pairs,): indices of span, column, and place."""
 
-    span: IntArray
+    interval: IntArray
     column: IntArray
     place: IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Spans:
+class ScanlineIntervals:
     """Intersections of shapes with some rows of a grid, (n_spans,) each: row, shape, and columns.
 
     The row is counted from the first of them. Columns from `first` to `last` are in the shape or near its edge,
@@ -45,7 +45,7 @@ class Spans:
     inner_last: IntArray
 
     @classmethod
-    def between(
+    def of_ends(
         cls, grid: Grid, n_rows: int, row: IntArray, hypothesis: IntArray, outer: Interval, inner: Interval
     ) -> Self:
         """Find the columns of intervals, (n_spans,) each: in the shape or near its edge, and deep inside.
@@ -70,20 +70,20 @@ class Spans:
         inner_first[none], inner_last[none] = last[none] + 1, last[none]
         return cls(grid, n_rows, row, hypothesis, first, last, inner_first, inner_last)
 
-    def ring(self) -> Ring:
+    def places_near_edges(self) -> PlacesNearEdges:
         """Pairs of span and place in the ring about the edge: left of the interior, then right of it."""
         n = len(self.row)
         count = np.concatenate([self.inner_first - self.first, self.last - self.inner_last])
         begin = np.concatenate([self.first, self.inner_last + 1])
         # Repeating is the slow step: it is done once, and everything else is indexed.
-        span = np.repeat(np.arange(2 * n), count)
-        column = to_int32(begin - np.cumsum(count) + count)[span]
-        column += to_int32(np.arange(len(span)))
-        span[int(count[:n].sum()) :] -= n
-        return Ring(span, column, column + to_int32(self.row * self.grid.n_x)[span])
+        interval = np.repeat(np.arange(2 * n), count)
+        column = to_int32(begin - np.cumsum(count) + count)[interval]
+        column += to_int32(np.arange(len(interval)))
+        interval[int(count[:n].sum()) :] -= n
+        return PlacesNearEdges(interval, column, column + to_int32(self.row * self.grid.n_x)[interval])
 
     def histogram(
-        self, weight: FloatArray, ring: Ring, level: IntArray, ends: tuple[int, int], n_levels: int
+        self, weight: FloatArray, ring: PlacesNearEdges, level: IntArray, ends: tuple[int, int], n_levels: int
     ) -> FloatArray:
         """Return the weighted histogram of levels at every place of the rows.
 
@@ -101,7 +101,7 @@ class Spans:
         Weight by place and level, (n_rows * n_x, n_levels), each row summing to that of all shapes.
         """
         n_places = self.n_rows * self.grid.n_x
-        near = np.bincount(ring.place * n_levels + level, weight[self.hypothesis][ring.span], n_places * n_levels)
+        near = np.bincount(ring.place * n_levels + level, weight[self.hypothesis][ring.interval], n_places * n_levels)
         mass = near.reshape(n_places, n_levels).astype(np.float64, copy=False)  # integers if there are no pairs
         inside = self._weight_deep_inside(weight)
         outside = weight.sum() - inside - mass.sum(axis=1)

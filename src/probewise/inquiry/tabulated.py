@@ -12,15 +12,15 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.carded import CardedForecast, cards_of
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.discs import DiscTable, is_alike_everywhere
+from probewise.inquiry.discs import DiscTable, is_uniform_and_known
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
     DirectForecast,
     Forecast,
     PredictiveDistributions,
+    evenly_spaced_levels,
     predict_where_visible,
     rows_by_combination,
-    spread_levels,
 )
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.tabulated_effects import TabulatedChain
@@ -48,14 +48,14 @@ class DiscForecast:
     table: DiscTable
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `Forecast.predict`."""
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points), by the table."""
         return predict_where_visible(self.model, theta, plan)
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """See `Forecast.predictive`."""
-        levels = spread_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
+        """Return the predictive distribution at `rows`, of all hypotheses by the table."""
+        levels = evenly_spaced_levels(self.table.dark, self.table.bright, noise_sd / _PER_SD, most=MOST_LEVELS)
         turns = plan.orientation_rad.reshape(-1, designs.grid.n_places)
         return _DiscPredictive(self.table, theta, designs.grid, turns, rows, levels)
 
@@ -71,8 +71,8 @@ class _DiscPredictive:
     rows: IntArray
     levels: FloatArray
 
-    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `PredictiveDistributions.maps`: one map per orientation of the sensor; the table has no other setting."""
+    def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield the weight of each level, one orientation of the sensor after another."""
         some = weight > 0
         stood, mass = None, np.empty(0)
         for number, at, places in rows_by_combination(self.rows, self.grid.n_places):
@@ -118,7 +118,10 @@ class TabulatedForecast:
         return made if made._is_faithful(max(highest, 1.0)) else None
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `Forecast.predict`: by the tables; for many places, only where shapes are visible."""
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points), by the tables.
+
+        At many places, only hypotheses are evaluated whose shape is visible there.
+        """
         if len(plan) > _FEW:
             return predict_where_visible(self.model, theta, plan)
         ways, which = np.unique(np.stack([plan.orientation_rad, _relative_heights(plan)]), axis=1, return_inverse=True)
@@ -129,13 +132,16 @@ class TabulatedForecast:
             if shapes is None or ways.shape[1] > _MOST_WAYS:
                 return predict_where_visible(self.model, theta, plan)
             dark, bright = self._levels_at(way[1])
-            out[:, rows] = dark + (bright - dark) * shapes.seen(plan.x_mm[rows], plan.y_mm[rows])
+            out[:, rows] = dark + (bright - dark) * shapes.footprint_share(plan.x_mm[rows], plan.y_mm[rows])
         return out
 
     def predictive(
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
-        """See `Forecast.predictive`; by direct predictions if the orientation changes from place to place."""
+        """Return the predictive distribution at `rows`: by tables where these apply, otherwise by direct predictions.
+
+        The tables need one orientation for all places of a map, and no other setting than the height.
+        """
         turns, heights = (a.reshape(-1, designs.grid.n_places) for a in (plan.orientation_rad, _relative_heights(plan)))
         asked = partial(DirectForecast(self.model).predictive, theta, weight, designs, plan, rows, noise_sd)
         if (turns != turns[:, :1]).any() or set(plan.covariates) - {"height_mm"}:
@@ -149,7 +155,7 @@ class TabulatedForecast:
             shapes_at[turn, height] = _ShapesAt(shapes, *self._levels_at(height))
         low = min(min(each.dark, each.bright) for each in shapes_at.values())
         high = max(max(each.dark, each.bright) for each in shapes_at.values())
-        levels = spread_levels(low, high, noise_sd / _PER_SD, most=MOST_LEVELS)
+        levels = evenly_spaced_levels(low, high, noise_sd / _PER_SD, most=MOST_LEVELS)
         return _TabulatedPredictive(shapes_at, ways, designs.grid, rows, levels)
 
     def _shapes_under_sensor(self, theta: FloatArray, turn_rad: float, height: float) -> TabulatedShapes | None:
@@ -178,7 +184,7 @@ class TabulatedForecast:
         for row, outline in enumerate(outlines(self.shape.region(theta))):
             place = outline[rng.integers(len(outline), size=_PLACES)] + rng.uniform(-reach, reach, (_PLACES, 2))
             plan = _plan_at(place, highest)
-            quick.append(shapes.seen(plan.x_mm, plan.y_mm)[row])
+            quick.append(shapes.footprint_share(plan.x_mm, plan.y_mm)[row])
             asked.append(self.model.predict(theta[[row]], plan)[0])
         off = np.array(quick) - (np.array(asked) - dark) / (bright - dark)
         return bool(np.sqrt((off**2).mean()) < _MOST_OFF)
@@ -197,17 +203,17 @@ class _TabulatedPredictive:
     """Shapes over a grid of places, for each orientation and height of the sensor."""
 
     shapes_at: dict[tuple[float, float], _ShapesAt]
-    ways: list[tuple[float, float]]
+    turns_and_heights: list[tuple[float, float]]
     grid: Grid
     rows: IntArray
     levels: FloatArray
 
-    def maps(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
-        """See `PredictiveDistributions.maps`: one map per orientation and height, for all numbers of repeats."""
+    def level_weights(self, weight: FloatArray) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Yield the weight of each level, one orientation and height after another; repeats share them."""
         stood, mass = None, np.empty(0)
         for number, at, places in rows_by_combination(self.rows, self.grid.n_places):
-            if stood != self.ways[number]:
-                stood = self.ways[number]
+            if stood != self.turns_and_heights[number]:
+                stood = self.turns_and_heights[number]
                 shapes, dark, bright = self.shapes_at[stood]
                 mass = shapes.level_histogram(weight, self.grid, dark, bright, self.levels)
             yield at, mass if len(places) == len(mass) else mass[places]
@@ -230,7 +236,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
 
 def _tabulated_chain(model: Chain) -> TabulatedChain | None:
     """Return a chain with effects over the table of the chain without those that no table holds; None if impossible."""
-    table = DiscTable.of(replace(model, effects=tuple(filter(is_alike_everywhere, model.effects))))
+    table = DiscTable.of(replace(model, effects=tuple(filter(is_uniform_and_known, model.effects))))
     return None if table is None else TabulatedChain.of(model, table)
 
 

@@ -9,16 +9,16 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.inquiry.carded import CardedModel
-from probewise.inquiry.discs import DiscTable, is_alike_everywhere
+from probewise.inquiry.discs import DiscTable, is_uniform_and_known
 from probewise.recordings.plan import Plan
-from probewise.scene.cards import seen_with_cards
+from probewise.scene.cards import mean_albedo_with_cards
 from probewise.sensor import Chain
 from probewise.sensor.stages import SensorModel, Stage, View
 
 
 @dataclass(frozen=True, eq=False)
 class TabulatedChain:
-    """A chain over one disc whose effects change neither the disc nor, but for what the table holds, the footprint."""
+    """A chain over one disc. No effect changes the disc; effects on the footprint must be those of the table."""
 
     chain: Chain
     table: DiscTable
@@ -34,7 +34,7 @@ class TabulatedChain:
         if not isinstance(table, DiscTable) or chain.names[:3] != table.names:
             return None
         seen = (effect for effect in chain.effects if effect.stage in (Stage.SCENE, Stage.FOOTPRINT))
-        if not all(map(is_alike_everywhere, seen)):
+        if not all(map(is_uniform_and_known, seen)):
             return None
         return cls(chain, table, cards)
 
@@ -44,10 +44,10 @@ class TabulatedChain:
         return self.chain.names
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """See `SensorModel.predict`."""
+        """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points), by the table and the effects."""
         poses, disc, table = self.chain.poses(theta, plan), theta[:, :3], self.table
         level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
         seen = (level - table.dark) / (table.bright - table.dark)
         if self.cards is not None:
-            seen = seen_with_cards(seen, self.cards.cards, self.cards.covered(poses, plan))
-        return self.chain.read(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)
+            seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.share_on_cards(poses, plan))
+        return self.chain.readings_of_view(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)

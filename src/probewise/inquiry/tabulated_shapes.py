@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.ellipses import Ellipses
 from probewise.inquiry.grid import Grid
 from probewise.inquiry.polygons import EdgesInFootprintSds
-from probewise.inquiry.scanlines import ROWS, Interval, Spans, to_int32, to_single_precision
+from probewise.inquiry.scanlines import ROWS, Interval, ScanlineIntervals, to_int32, to_single_precision
 from probewise.inquiry.unit_gaussian import REACH
 from probewise.scene import EllipseRegion, MixtureOfRegions, PolygonRegion, Region
 from probewise.sensor import FixedMixture
@@ -22,11 +22,11 @@ from probewise.sensor import FixedMixture
 class _CrossedShapes(Protocol):
     """Shapes of one kind, each intersected by a row of places."""
 
-    def within(self, reach: float) -> Interval:
+    def interval_within(self, reach: float) -> Interval:
         """Return the interval in which the footprint is `reach` sds inside, or at most -`reach` sds outside."""
         ...
 
-    def seen(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
+    def footprint_share(self, crossing: IntArray, x_mm: FloatArray) -> FloatArray:
         """Return the share of the footprint over the shape for places of crossings, both (n_pairs,)."""
         ...
 
@@ -39,7 +39,7 @@ class _ShapesOfOneKind(Protocol):
         """Lowest and highest y of each shape, (2, n_shapes)."""
         ...
 
-    def along(self, which: IntArray, y_mm: FloatArray) -> _CrossedShapes:
+    def crossed_by_rows(self, which: IntArray, y_mm: FloatArray) -> _CrossedShapes:
         """Intersect shapes with rows of places, arrays of one shape."""
         ...
 
@@ -68,13 +68,13 @@ class TabulatedShapes:
         widest = np.sqrt(np.linalg.eigvalsh(footprint.covs_mm2).max())
         return cls(region.n_regions, tuple(parts), (float(off), float(widest)))
 
-    def seen(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    def footprint_share(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Return the share of the footprint over every shape at places, (n_places,) -> (n_shapes, n_places)."""
         out = np.empty((self.n_shapes, len(x_mm)))
         for rows, kind in self.parts:
             every = np.repeat(np.arange(len(rows)), len(x_mm))
-            crossed = kind.along(every, np.tile(to_single_precision(y_mm), len(rows)))
-            seen = crossed.seen(np.arange(len(every)), np.tile(to_single_precision(x_mm), len(rows)))
+            crossed = kind.crossed_by_rows(every, np.tile(to_single_precision(y_mm), len(rows)))
+            seen = crossed.footprint_share(np.arange(len(every)), np.tile(to_single_precision(x_mm), len(rows)))
             out[rows] = seen.reshape(len(rows), len(x_mm))
         return out
 
@@ -112,13 +112,15 @@ class TabulatedShapes:
             for start in range(0, grid.n_y, ROWS):
                 y_mm = to_single_precision(grid.y_mm[start : start + ROWS])
                 row, which = np.nonzero((y_mm[:, None] >= bottom) & (y_mm[:, None] <= top) & (own > 0))
-                crossed = kind.along(which, y_mm[row])
-                spans = Spans.between(grid, len(y_mm), row, which, crossed.within(-reach), crossed.within(reach))
-                ring = spans.ring()
-                seen = crossed.seen(ring.span, to_single_precision(grid.x_mm)[ring.column])
+                crossed = kind.crossed_by_rows(which, y_mm[row])
+                intervals = ScanlineIntervals.of_ends(
+                    grid, len(y_mm), row, which, crossed.interval_within(-reach), crossed.interval_within(reach)
+                )
+                ring = intervals.places_near_edges()
+                seen = crossed.footprint_share(ring.interval, to_single_precision(grid.x_mm)[ring.column])
                 level = to_int32(lowest + per_share * seen + 0.5)
                 block = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
-                mass[block] += spans.histogram(own, ring, level, ends, n_levels)
+                mass[block] += intervals.histogram(own, ring, level, ends, n_levels)
         return mass
 
 

@@ -9,7 +9,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen
 from probewise.errors import ParameterError, ShapeError
-from probewise.inquiry.forecast import MOST_LEVELS, nearest_level, predict_where_visible, spread_levels, weight_by_level
+from probewise.inquiry.forecast import (
+    MOST_LEVELS,
+    evenly_spaced_levels,
+    nearest_level,
+    predict_where_visible,
+    weight_by_level,
+)
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
@@ -37,7 +43,7 @@ class Rival:
             raise ParameterError("probability", self.probability, "finite, 0 or more")
 
 
-def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatArray:
+def information_about_rivals(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatArray:
     """Return the expected information in bits of each reading of a plan on which rival is true.
 
     It is the Jensen-Shannon divergence of the rivals' predictive distributions, marginalised over their parameters: the
@@ -64,7 +70,7 @@ def tell_apart(rivals: Sequence[Rival], plan: Plan, readout: Readout) -> FloatAr
         )
     answers = [predict_where_visible(rival.model, rival.theta, plan) for rival in rivals]
     low, high = min(a.min() for a in answers), max(a.max() for a in answers)
-    levels = spread_levels(float(low), float(high), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
+    levels = evenly_spaced_levels(float(low), float(high), readout.noise_sd / _PER_SD, most=MOST_LEVELS)
     chance = readout.probability(levels, most=MOST_LEVELS)
     bits = np.zeros(len(plan))
     for start in range(0, len(plan), _BLOCK):

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.inquiry.labels import Label
-from probewise.inquiry.prospect import Prospect
+from probewise.inquiry.utility_input import UtilityInput
 
 
 class Utility(Protocol):
@@ -21,7 +21,7 @@ class Utility(Protocol):
         """Label with unit, for a colour bar."""
         ...
 
-    def __call__(self, prospect: Prospect) -> FloatArray:
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Return the utility of every available design, (n,)."""
         ...
 
@@ -44,9 +44,9 @@ class ReadingEntropy:
         if not (0 < self.bin_width < np.inf):
             raise ParameterError("bin_width", self.bin_width, "finite, greater than 0")
 
-    def __call__(self, prospect: Prospect) -> FloatArray:
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Entropy in bits at every design, (n,)."""
-        return label_entropy(np.rint(prospect.predicted / self.bin_width))
+        return label_entropy(np.rint(utility_input.predicted / self.bin_width))
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,9 @@ class InformationGain:
 
     label: ClassVar[str] = "expected information (bits)"
 
-    def __call__(self, prospect: Prospect) -> FloatArray:
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Bits at every design, (n,)."""
-        return prospect.information(prospect.weight)
+        return utility_input.information(utility_input.weight)
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,14 @@ class InformationAbout:
         """Label of the information and its target."""
         return f"information about {self.of} (bits)"
 
-    def __call__(self, prospect: Prospect) -> FloatArray:
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Bits at every design, (n,)."""
-        labels = self.of(prospect.names, prospect.theta, prospect.weight)
-        bits = prospect.reading_entropy(prospect.weight)
+        labels = self.of(utility_input.names, utility_input.theta, utility_input.weight)
+        bits = utility_input.reading_entropy(utility_input.weight)
         for value in np.unique(labels):
-            weight = np.where(labels == value, prospect.weight, 0.0)
+            weight = np.where(labels == value, utility_input.weight, 0.0)
             if weight.sum() > 0:
-                bits -= weight.sum() * prospect.reading_entropy(weight)
+                bits -= weight.sum() * utility_input.reading_entropy(weight)
         return np.maximum(bits, 0.0)
 
 
@@ -101,13 +101,15 @@ class PerSecond:
         """Label of the other utility, per second."""
         return f"{self.of.label} per second"
 
-    def __call__(self, prospect: Prospect) -> FloatArray:
+    def __call__(self, utility_input: UtilityInput) -> FloatArray:
         """Return the utility per second at every design, (n,)."""
-        if not (prospect.cost_s > 0).all():
+        if not (utility_input.cost_s > 0).all():
             raise ParameterError(
-                "cost_s", float(prospect.cost_s.min()), "greater than 0: a reading takes time where the arm stands, too"
+                "cost_s",
+                float(utility_input.cost_s.min()),
+                "greater than 0: a reading takes time where the arm stands, too",
             )
-        return self.of(prospect) / prospect.cost_s
+        return self.of(utility_input) / utility_input.cost_s
 
 
 def label_entropy(labels: FloatArray) -> FloatArray:

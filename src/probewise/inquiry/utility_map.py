@@ -13,9 +13,9 @@ from probewise.inquiry.designs import Designs
 from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.forecast import DirectForecast
 from probewise.inquiry.grid import Grid
-from probewise.inquiry.prospect import Prospect
 from probewise.inquiry.readout import Readout
 from probewise.inquiry.utility import ReadingEntropy, Utility
+from probewise.inquiry.utility_input import UtilityInput
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import SensorModel
 
@@ -73,7 +73,7 @@ class UtilityMap:
         return design.x_mm, design.y_mm
 
 
-def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
+def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
     """Compute the utility of every available design (paper, the machine learning system).
 
     Raises
@@ -84,16 +84,18 @@ def utility_map(prospect: Prospect, utility: Utility) -> UtilityMap:
         If one of its values is not finite.
     """
     # The utility with two measures reports which one these values are.
-    value, label = utility.measure(prospect) if isinstance(utility, Finishing) else (utility(prospect), utility.label)
+    value, label = (
+        utility.measure(utility_input) if isinstance(utility, Finishing) else (utility(utility_input), utility.label)
+    )
     found = np.asarray(value, dtype=np.float64)
-    if found.shape != prospect.rows.shape:
-        raise ShapeError(f"the utility gives {found.shape} values; allowed: {prospect.rows.shape}, one per design")
-    values = np.zeros(len(prospect.designs))
-    reachable = np.zeros(len(prospect.designs), dtype=np.bool_)
-    values[prospect.rows], reachable[prospect.rows] = found, True
+    if found.shape != utility_input.rows.shape:
+        raise ShapeError(f"the utility gives {found.shape} values; allowed: {utility_input.rows.shape}, one per design")
+    values = np.zeros(len(utility_input.designs))
+    reachable = np.zeros(len(utility_input.designs), dtype=np.bool_)
+    values[utility_input.rows], reachable[utility_input.rows] = found, True
     best_places(values, reachable)  # raises if a value is not finite
     values.flags.writeable = False
-    return UtilityMap(prospect.designs, values, reachable, label)
+    return UtilityMap(utility_input.designs, values, reachable, label)
 
 
 def entropy_map(
@@ -130,10 +132,10 @@ def entropy_map(
     """
     rows = reachable_rows(reachable, grid.n_places)
     even = np.full(len(theta), 1.0 / len(theta))
-    prospect = Prospect(
+    utility_input = UtilityInput(
         DirectForecast(model), Readout(noise_sd), theta, even, theta, Designs(grid), plan, rows, np.ones(rows.size)
     )
-    return utility_map(prospect, ReadingEntropy() if utility is None else utility)
+    return utility_map(utility_input, ReadingEntropy() if utility is None else utility)
 
 
 def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1) -> IntArray:

@@ -7,7 +7,7 @@ each round records the plan that the previous diagnosis advised, and diagnoses a
 from probewise.investigation.budget import Budget
 from probewise.investigation.folder import RoundsFolder, Take
 from probewise.investigation.loop import MOST_ROUNDS, Record, investigate
-from probewise.investigation.rounds import SURE, Investigation, Round, settled_by
+from probewise.investigation.rounds import SURE, Investigation, Round, reason_if_settled
 from probewise.investigation.simulated import SimulatedRecorder, parse_concealed
 
 __all__ = [
@@ -22,5 +22,8 @@ __all__ = [
     "Take",
     "investigate",
     "parse_concealed",
-    "settled_by",
+    "reason_if_settled",
 ]
+
+settled_by = reason_if_settled
+"""The old name of `reason_if_settled`."""

@@ -31,7 +31,7 @@ class Budget:
         """Subtract the cost of a plan that begins after a time; the budget stays at 0 or more."""
         return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes_of_plan(plan, after_s), 0.0))
 
-    def affordable(self, plan: Plan, after_s: float) -> Plan | None:
+    def affordable_scans(self, plan: Plan, after_s: float) -> Plan | None:
         """Return the leading scans of a plan that fit the budget; None if not even the first does."""
         kept = np.zeros(0, dtype=np.int64)
         for rows in plan.rows_by_scan():
@@ -42,6 +42,9 @@ class Budget:
         if len(kept) == len(plan):
             return plan
         return plan.take(kept) if kept.size else None
+
+    affordable = affordable_scans
+    """The old name of `affordable_scans`."""
 
 
 def _minutes_of_plan(plan: Plan, after_s: float) -> float:

@@ -17,7 +17,7 @@ from probewise.arm import Reading, readings_of, recorded
 from probewise.errors import FileError
 from probewise.progress import Progress, silent
 from probewise.recordings import (
-    json_of,
+    parse_json_file_text,
     read_plan,
     read_recording,
     read_text,
@@ -94,7 +94,7 @@ class RoundsFolder:
         return sum(len(recording) for recording in self._recordings_of_rounds())
 
     @property
-    def ended_s(self) -> float:
+    def last_time_s(self) -> float:
         """Time of the last reading; 0 if there is none."""
         return max((float(recording.plan.time_s.max()) for recording in self._recordings_of_rounds()), default=0.0)
 
@@ -103,7 +103,7 @@ class RoundsFolder:
 
 
 def _require_same_settings(file: Path, wanted: Mapping[str, Any]) -> None:
-    before = json_of(file, read_text(file, _ALLOWED), _ALLOWED)
+    before = parse_json_file_text(file, read_text(file, _ALLOWED), _ALLOWED)
     if not isinstance(before, dict):
         raise FileError(file, "no JSON object", _ALLOWED)
     for name, value in wanted.items():

@@ -8,11 +8,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from probewise._kinds import require_kind, require_rng, require_takes_places, require_whole
+from probewise._kinds import require_accepts_positional, require_kind, require_rng, require_whole
 from probewise.diagnosis import Diagnosis, NextMeasurement, SensorPrior, diagnose
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.investigation.budget import Budget
-from probewise.investigation.rounds import Round, settled_by
+from probewise.investigation.rounds import Round, reason_if_settled
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Plan, Recording, require_plan
 
@@ -66,7 +66,7 @@ def investigate(
     ParameterError
         If an argument is invalid; see also `diagnose`.
     """
-    require_takes_places("record", record, 3, "a function of a round's number, its plan and the plan in words")
+    require_accepts_positional("record", record, 3, "a function of a round's number, its plan and the plan in words")
     require_plan(plan)
     require_rng(rng)
     if budget is not None:
@@ -96,20 +96,20 @@ def _rounds_until_stop(
     for number, rng in enumerate(rngs, start=1):
         recordings.append(record(number, wanted, asked))
         diagnosis = diagnosed(recordings, rng=rng)
-        settled, following = settled_by(diagnosis), diagnosis.next_measurement
+        settled, following = reason_if_settled(diagnosis), diagnosis.next_measurement
         over_s = max(float(each.plan.time_s.max()) for each in recordings)
-        affordable = None if following is None else budget.affordable(following.plan, over_s)
+        affordable_scans = None if following is None else budget.affordable_scans(following.plan, over_s)
         reason = (
             settled
             or _reason_without_plan(following)
             or (f"the limit of {rounds} rounds is reached" if number == rounds else None)
-            or ("the budget of readings is spent" if affordable is None else None)
+            or ("the budget of readings is spent" if affordable_scans is None else None)
         )
         yield Round(number, recordings[-1], asked, diagnosis, reason, settled is not None)
-        if reason is not None or following is None or affordable is None:
+        if reason is not None or following is None or affordable_scans is None:
             return
-        budget = budget.minus(affordable, over_s)
-        asked, wanted = following.description, affordable
+        budget = budget.minus(affordable_scans, over_s)
+        asked, wanted = following.description, affordable_scans
 
 
 def _reason_without_plan(following: NextMeasurement | None) -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import attrgetter
 
 from probewise._display import ShowsItself
 from probewise.diagnosis import Diagnosis
@@ -21,7 +22,7 @@ class Round:
         From 1.
     recording
         Recording of this round.
-    asked
+    reason_for_readings
         Reason for these readings, in words.
     diagnosis
         Diagnosis of this and all earlier readings.
@@ -33,15 +34,19 @@ class Round:
 
     number: int
     recording: Recording
-    asked: str
+    reason_for_readings: str
     diagnosis: Diagnosis
     stop_reason: str | None
     settled: bool
 
     @property
-    def believed(self) -> tuple[tuple[str, float], ...]:
+    def hypothesis_probabilities(self) -> tuple[tuple[str, float], ...]:
         """The hypotheses after this round with their probabilities, most probable first."""
         return tuple((h.label, h.probability) for h in self.diagnosis.hypotheses)
+
+    # Old names.
+    believed = hypothesis_probabilities
+    asked = property(attrgetter("reason_for_readings"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +69,9 @@ class Investigation(ShowsItself):
         """Return a plain-text summary of the rounds."""
         lines = []
         for each in self.rounds:
-            label, probability = each.believed[0]
+            label, probability = each.hypothesis_probabilities[0]
             lines.append(
-                f"round {each.number}: {len(each.recording)} readings ({each.asked}); "
+                f"round {each.number}: {len(each.recording)} readings ({each.reason_for_readings}); "
                 f"{each.diagnosis.verdict}, {label} {probability:.3f}"
             )
         lines.append(f"ended: {self.last.stop_reason}")
@@ -74,8 +79,8 @@ class Investigation(ShowsItself):
         return "\n".join(lines)
 
 
-def settled_by(diagnosis: Diagnosis) -> str | None:
-    """Return the hypothesis that settles a diagnosis, the first with probability `SURE`, in words; else None.
+def reason_if_settled(diagnosis: Diagnosis) -> str | None:
+    """Return a sentence on the leading hypothesis if its probability, `SURE` or more, settles the diagnosis; else None.
 
     Aliased effects, which the verdict does not state, are not settled.
     """

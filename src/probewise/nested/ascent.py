@@ -33,8 +33,8 @@ class Top:
 
     `met`: the highest point met on the way there, maybe on another peak.
 
-    `root` is a root of the covariance, (n_params, n_params); at a rounded top that `climb` has found, the best quarter
-    of draws lies within 0.2 nats. All in the sampling coordinates.
+    `root` is a root of the covariance, (n_params, n_params); at a rounded top that `climb_to_top` has found, the best
+    quarter of draws lies within 0.2 nats. All in the sampling coordinates.
     """
 
     highest: Points
@@ -85,5 +85,5 @@ def climb_to_top(
 def top_from_live_points(run: NestedResult, evaluate: Evaluator) -> Top:
     """Describe the last live points of a run: the highest one, their mean and a root of their covariance."""
     last = slice(-run.n_live, None)
-    live = evaluate.known(run.theta[last], run.log_likelihood[last], run.label[last])
+    live = evaluate.points_from_known_values(run.theta[last], run.log_likelihood[last], run.label[last])
     return Top(live.take(live.order()[-1:]), live.u.mean(axis=0), principal_root(live.u))

@@ -22,7 +22,7 @@ _MOST_SHARE = 1 / 8  # of the run's evaluations, for these draws
 _MOST_PEAKS = 5
 
 
-def higher_peaks(
+def find_higher_peaks(
     run: NestedResult, top: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> list[Top]:
     """Return the tops of higher peaks than the one on which a run ended.

@@ -25,12 +25,12 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
-from probewise.nested.hills import Hill, evidence_not_met
+from probewise.nested.hills import Hill, log_evidence_of_unmet_hills
 from probewise.nested.hops import HoppingMove
-from probewise.nested.missing import DISAGREE, Missing, look_for_missing, raised_by
+from probewise.nested.missing import DISAGREE, MissedHills, find_missed_hills, rise_in_errors
 from probewise.nested.moves import Move, SliceMove
-from probewise.nested.repartition import Repartitioned, groups_of, repartitioned
-from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible
+from probewise.nested.repartition import Repartitioned, repartitioned, split_into_clusters
+from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible_draws
 from probewise.nested.space import space_of
 
 # Above this many errors the second estimate is repeated with more live points.
@@ -80,19 +80,19 @@ class _EvidenceRoute:
         """The chains, after hops where there are `modes`."""
         return self.chain if self.modes is None else HoppingMove(self.chain, self.modes)
 
-    def found_expected_posterior(self, found: NestedResult) -> bool:
-        """Return whether a run of this route found the expected posterior: its information plus log Z is the mean."""
+    def is_confirmed_by(self, found: NestedResult) -> bool:
+        """Return whether a run of this route has the expected mean log likelihood: its information plus log Z."""
         return self.expected is None or abs(found.information + found.log_z - self.expected) < _SAME_MEAN
 
     @property
-    def least_calls(self) -> int:
+    def least_calls_to_start(self) -> int:
         """Evaluations of the first live points and of one round, with a margin of two: fewer are not worth a start."""
         n_steps = max(self.chain.fewest_steps, math.ceil(self.chain.steps_per_param * len(self.problem.prior.names)))
         return math.ceil(self.n_live * (1 + n_steps * self.chain.target))
 
 
 @dataclass
-class _Budget:
+class _CallBudget:
     """The evaluations that a check may use, those of the first run included: `limit` in all, `spent` so far."""
 
     search: SingleRun
@@ -101,14 +101,14 @@ class _Budget:
     rng: np.random.Generator
 
     @property
-    def left(self) -> int:
+    def calls_left(self) -> int:
         """Number of evaluations that may still be used."""
         return int(self.limit - self.spent)
 
     def run_route(self, route: _EvidenceRoute) -> NestedResult | None:
         """Run nested sampling by a route; None if the budget or the route's limit does not suffice."""
-        left = int(min(self.left, route.most_calls))
-        if left < route.least_calls:
+        left = int(min(self.calls_left, route.most_calls))
+        if left < route.least_calls_to_start:
             return None
         found = self.search(route.problem, n_live=route.n_live, move=route.move, max_calls=left, rng=self.rng)
         self.spent += found.n_calls
@@ -135,14 +135,14 @@ class _SecondEstimate:
     def n_calls(self) -> int:
         return sum(each.n_calls for each in self.runs)
 
-    def distance(self, run: NestedResult) -> float:
+    def distance_in_errors(self, run: NestedResult) -> float:
         """Return a run's log Z minus this one, in combined standard errors; negative if it is below."""
         log_z, error = self.log_z
         return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
     def disagrees_or_is_doubtful(self, run: NestedResult, most: float) -> bool:
         """Return whether a run is more than `most` errors away, or this estimate is itself doubtful."""
-        return abs(self.distance(run)) > most or bool(self.runs[-1].warnings)
+        return abs(self.distance_in_errors(run)) > most or bool(self.runs[-1].warnings)
 
     def is_too_low_on_curve(self, first: NestedResult, longer: NestedResult) -> bool:
         """Return whether this estimate is too low: the posterior is curved, and two runs that agree lie above it.
@@ -150,8 +150,8 @@ class _SecondEstimate:
         Along a curve the prior of a second pass is thin where the posterior is not, so it can miss a part. Chains of
         `longer` are twice as long: if those of `first` were too short, the two would differ.
         """
-        below = min(self.distance(run) for run in (first, longer))
-        alike = abs(_SecondEstimate(self.route, (longer,), self.curved).distance(first)) < _ALIKE
+        below = min(self.distance_in_errors(run) for run in (first, longer))
+        alike = abs(_SecondEstimate(self.route, (longer,), self.curved).distance_in_errors(first)) < _ALIKE
         return self.curved and below > _APART and alike and not first.warnings
 
 
@@ -192,22 +192,22 @@ def check_and_repeat(
         estimate. A warning is added if the two still disagree, or if the second does not end within the limits.
     """
     limit = max_cost * first.n_calls if max_calls is None else min(max_cost * first.n_calls, max_calls)
-    budget = _Budget(search, limit, first.n_calls, rng)
-    now, missing, notes = first, Missing(), tuple[str, ...]()
+    budget = _CallBudget(search, limit, first.n_calls, rng)
+    now, missing, notes = first, MissedHills(), tuple[str, ...]()
     try:
-        missing = look_for_missing(first, problem, max_calls=budget.left, rng=rng)
+        missing = find_missed_hills(first, problem, max_calls=budget.calls_left, rng=rng)
         budget.spent += missing.n_calls
         modes = None
-        if raised_by(first, evidence_not_met(missing.lost, first)) > _MATTERS:
-            modes = _modes_with_lost(first, missing.lost, problem, rng)
+        if rise_in_errors(first, log_evidence_of_unmet_hills(missing.lost, first)) > _MATTERS:
+            modes = _clusters_of_met_and_lost_modes(first, missing.lost, problem, rng)
             chain = move if isinstance(move, SliceMove) else SliceMove()
             again = budget.run_route(_EvidenceRoute(problem, first.n_live, chain, "the run with hops", modes=modes))
             if again is not None:
                 now = again
-                more = look_for_missing(now, problem, max_calls=budget.left, rng=rng, lost=missing.lost)
+                more = find_missed_hills(now, problem, max_calls=budget.calls_left, rng=rng, lost=missing.lost)
                 budget.spent += more.n_calls
                 missing = replace(more, n_calls=missing.n_calls + more.n_calls)
-        route, second = _second_estimate(now, problem, move, least_live, budget)
+        route, second = _estimate_again(now, problem, move, least_live, budget)
         if second is None:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
             notes = (
@@ -216,11 +216,13 @@ def check_and_repeat(
             )
         else:
             if second.disagrees_or_is_doubtful(now, _APART):
-                second = _with_sharper_estimate(second, now, first, budget)
+                second = _with_run_of_more_live_points(second, now, first, budget)
             n_check = second.n_calls + missing.n_calls
             if second.disagrees_or_is_doubtful(now, DISAGREE):
                 again = budget.run_route(
-                    _EvidenceRoute(problem, now.n_live, _with_longer_chains(move), "the run again", modes=modes)
+                    _EvidenceRoute(
+                        problem, now.n_live, _slice_move_of_longer_chains(move), "the run again", modes=modes
+                    )
                 )
                 now, second = _agreeing_run_and_estimate(second, now, again)
             now = _with_check_stored(now, second, n_check)
@@ -230,34 +232,37 @@ def check_and_repeat(
     return replace(now, n_calls=budget.spent, warnings=(*now.warnings, *notes, *missing.doubts(now)))
 
 
-def _modes_with_lost(
+def _clusters_of_met_and_lost_modes(
     first: NestedResult, lost: Iterable[Hill], problem: Samplable, rng: np.random.Generator
 ) -> Clusters:
     """Return the clusters of a run's posterior and the modes it lost, in the sampling coordinates."""
     space = space_of(problem.prior, getattr(problem, "periodic", ()))
-    met = groups_of(space.enter(first.samples(_N_SAMPLES, rng=rng)))
-    return Clusters.of([*met, *(space.enter(hill.theta) for hill in lost)])
+    met = split_into_clusters(space.enter(first.samples(_N_SAMPLES, rng=rng)))
+    return Clusters.from_groups([*met, *(space.enter(hill.theta) for hill in lost)])
 
 
-def _second_estimate(
-    now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _Budget
+def _estimate_again(
+    now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _CallBudget
 ) -> tuple[_EvidenceRoute, _SecondEstimate | None]:
     """Estimate the evidence by the first route that is confirmed, else by the last; None if that did not end."""
     curved, second = False, None
-    for route in _second_routes(now, problem, move, least_live, budget.rng):
+    for route in _routes_to_second_estimate(now, problem, move, least_live, budget.rng):
         found = budget.run_route(route)
         second = None if found is None else _SecondEstimate(route, (found,), curved)
-        if found is not None and route.found_expected_posterior(found):
+        if found is not None and route.is_confirmed_by(found):
             break
         curved = route.expected is not None
     return route, second
 
 
-def _with_sharper_estimate(
-    second: _SecondEstimate, now: NestedResult, first: NestedResult, budget: _Budget
+def _with_run_of_more_live_points(
+    second: _SecondEstimate, now: NestedResult, first: NestedResult, budget: _CallBudget
 ) -> _SecondEstimate:
-    """Add a run with more live points to a second estimate: as many as the first run has, if the budget allows it."""
-    route, left, again_costs = second.route, budget.left, _AGAIN * first.n_calls
+    """Add a run with more live points, at most as many as the first run has, to a second estimate.
+
+    It replaces a run that was doubtful. If the budget does not allow it, the estimate is returned as it was.
+    """
+    route, left, again_costs = second.route, budget.calls_left, _AGAIN * first.n_calls
     room = left - again_costs if left > again_costs else left
     n_live = int(min(max(route.n_live, now.n_live), room / second.runs[0].n_calls * route.n_live))
     if n_live <= route.n_live:
@@ -285,7 +290,7 @@ def _agreeing_run_and_estimate(
     return now, second
 
 
-def _second_routes(
+def _routes_to_second_estimate(
     first: NestedResult, problem: Samplable, move: Move, least_live: int, rng: np.random.Generator
 ) -> Iterator[_EvidenceRoute]:
     """Yield the routes to a second estimate, the cheapest first; the last one is an estimate whatever it finds."""
@@ -294,53 +299,53 @@ def _second_routes(
         wanted = _SHARE * first.n_live * first.information / max(nats, 1.0)
         enough = 2.0 * first.n_live * nats / first.information  # for an error below the first run's
         n_live = int(max(min(wanted, enough, first.n_live / 2), least_live, min(_LEAST_LIVE, first.n_live)))
-        return _EvidenceRoute(near, n_live, _with_longer_chains(move), "a second pass from near the posterior")
+        return _EvidenceRoute(near, n_live, _slice_move_of_longer_chains(move), "a second pass from near the posterior")
 
     if first.information > 0:
         theta = first.samples(_N_SAMPLES, rng=rng)
         # Clusters describe a posterior that they cover. A curved ridge they may not, and then mislead the live points.
-        clustered = _repartitioned_near(problem, theta, clustered=True)
+        clustered = _repartitioned_if_possible(problem, theta, clustered=True)
         if clustered is not None and len(clustered.prior.parts) == 1:
             clustered = None  # the single prior below
         if (
             clustered is not None
-            and (nats := _information_near(first, clustered)) < _FEW_NATS < _GAIN * first.information
+            and (nats := _information_of_second_pass(first, clustered)) < _FEW_NATS < _GAIN * first.information
         ):
             most, expected = _MOST_COST * first.n_calls, nats + first.log_z
             yield replace(route_near_posterior(clustered, nats), most_calls=most, expected=expected)
-        single = _repartitioned_near(problem, theta, clustered=False)
+        single = _repartitioned_if_possible(problem, theta, clustered=False)
         # With a log Z that is far too large the nats come out too few, or negative.
-        if single is not None and (nats := _information_near(first, single)) < _GAIN * first.information:
+        if single is not None and (nats := _information_of_second_pass(first, single)) < _GAIN * first.information:
             yield route_near_posterior(single, nats)
             return
     n_live = max(first.n_live // 8, least_live, min(_LEAST_LIVE, first.n_live))
-    yield _EvidenceRoute(problem, n_live, _with_longer_chains(move), "a second run with longer chains")
+    yield _EvidenceRoute(problem, n_live, _slice_move_of_longer_chains(move), "a second run with longer chains")
 
 
-def _repartitioned_near(problem: Samplable, theta: FloatArray, *, clustered: bool) -> Repartitioned | None:
-    """Repartition the problem about posterior samples; None where the prior or the samples do not allow it."""
+def _repartitioned_if_possible(problem: Samplable, theta: FloatArray, *, clustered: bool) -> Repartitioned | None:
+    """Give the problem a prior near its posterior samples; None where the prior or the samples do not allow it."""
     if not hasattr(problem.prior, "log_prob"):
         return None
     try:
         near = repartitioned(problem, theta, clustered=clustered)
-        return near if near.prior.invertible else None
+        return near if near.prior.has_invertible_axes else None
     except (ParameterError, np.linalg.LinAlgError):
         return None
 
 
-def _information_near(first: NestedResult, near: Repartitioned) -> float:
+def _information_of_second_pass(first: NestedResult, near: Repartitioned) -> float:
     """Return the information of a second pass, nats: the mean of its log likelihood over the posterior, less log Z."""
     possible = first.log_weight > -math.inf
     log_prior_ratio = near.prior.log_prior_ratio(first.theta[possible])
     return float(first.weight[possible] @ (first.log_likelihood[possible] + log_prior_ratio)) - first.log_z
 
 
-def _with_longer_chains(move: Move) -> SliceMove:
+def _slice_move_of_longer_chains(move: Move) -> SliceMove:
     """Double the length of the chains, to twice the default at least; other moves are replaced by slice sampling."""
-    least = SliceMove().longer()
+    least = SliceMove().with_twice_the_steps()
     if not isinstance(move, SliceMove):
         return least
-    double = move.longer()
+    double = move.with_twice_the_steps()
     return replace(
         double,
         steps_per_param=max(double.steps_per_param, least.steps_per_param),
@@ -356,7 +361,7 @@ def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple
 
 def _with_check_stored(now: NestedResult, second: _SecondEstimate, n_check: int) -> NestedResult:
     """Store the check in the result, with a warning where the estimates disagree."""
-    (log_z, error), distance, name = second.log_z, second.distance(now), second.route.name
+    (log_z, error), distance, name = second.log_z, second.distance_in_errors(now), second.route.name
     warnings = now.warnings
     if abs(distance) > DISAGREE:
         warnings = (
@@ -370,7 +375,7 @@ def _with_check_stored(now: NestedResult, second: _SecondEstimate, n_check: int)
         warnings = (*warnings, f"{name}, which checks the evidence, is itself doubtful: {why}")
     else:
         # A poorly known share of possible hypotheses, or error, no longer matters once a second estimate agrees.
-        settled = [warning_of_few_possible(now.log_start, now.log_start_error, now.n_live)]
+        settled = [warning_of_few_possible_draws(now.log_start, now.log_start_error, now.n_live)]
         if error < now.log_z_error:
             settled.append(warning_of_few_lineages(now.memory))
         warnings = tuple(note for note in warnings if note not in settled)

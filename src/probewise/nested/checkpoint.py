@@ -29,8 +29,8 @@ _POINTS = ("u", "theta", "log_density", "log_likelihood", "label")
 
 
 @dataclass(frozen=True, eq=False)
-class Origin:
-    """Origin of points; all arrays are (n,).
+class BirthRecords:
+    """How points were born; all arrays are (n,).
 
     `log_birth`, `birth_label`: the bound above which each was drawn. `ident`: its number in order of birth; `parent`:
     the number of the point at which its chain began, -1 for none.
@@ -42,31 +42,31 @@ class Origin:
     parent: IntArray
 
     @classmethod
-    def of_prior(cls, n: int) -> Origin:
-        """Return the origin of `n` draws from the prior, numbered from 0."""
+    def of_prior_draws(cls, n: int) -> BirthRecords:
+        """Return the records of `n` draws from the prior, numbered from 0."""
         return cls(np.full(n, -np.inf), np.ones(n), np.arange(n), np.full(n, -1))
 
-    def take(self, rows: IntArray) -> Origin:
+    def take(self, rows: IntArray) -> BirthRecords:
         """Select rows."""
-        return Origin(*(getattr(self, f.name)[rows] for f in fields(self)))
+        return BirthRecords(*(getattr(self, f.name)[rows] for f in fields(self)))
 
     @classmethod
-    def join(cls, *parts: Origin) -> Origin:
+    def join(cls, *parts: BirthRecords) -> BirthRecords:
         """Concatenate."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
 @dataclass(frozen=True, eq=False)
-class Live:
+class LivePoints:
     """The live points and the log of the prior volume they fill."""
 
     points: Points
-    origin: Origin
+    births: BirthRecords
     log_volume: float
 
 
 @dataclass(frozen=True, eq=False)
-class Dead:
+class DeadOfRound:
     """The points that one round removed, worst first, and the insertion ranks of their successors.
 
     `n_at_death`: number of points alive when each died, itself included. `rank`: how many of the
@@ -74,14 +74,14 @@ class Dead:
     """
 
     points: Points
-    origin: Origin
+    births: BirthRecords
     n_at_death: IntArray
     rank: IntArray
     n_ranked: IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class RunState:
     """The state of the sampler after a round: everything that the rest of the run depends on.
 
     `log_start`, `log_start_error`: log of the share of the prior with nonzero likelihood. `best`: greatest log
@@ -89,8 +89,8 @@ class Run:
     that never left their start; `last_cost`: evaluations of the last round; `ended`: the stop reason, if it is over.
     """
 
-    live: Live
-    dead: tuple[Dead, ...]
+    live: LivePoints
+    dead: tuple[DeadOfRound, ...]
     moving: Move
     log_start: float
     log_start_error: float
@@ -104,7 +104,7 @@ class Run:
     rng_state: Mapping[str, Any] = field(default_factory=dict)
 
 
-def settings_of(
+def settings_of_run(
     names: tuple[str, ...], n_live: int, n_replaced: int, move: Move, stop: StopRule, seed_state: str
 ) -> dict[str, object]:
     """Describe the settings that a resumed run must share with the interrupted one.
@@ -141,7 +141,7 @@ class CheckpointFile:
     settings: dict[str, object]
     _last_saving: float = field(default_factory=time.monotonic)
     _saving_time_s: float = 0.0
-    _state_in_file: Run | None = None
+    _state_in_file: RunState | None = None
 
     def __post_init__(self) -> None:
         if not self.every_s >= 0:
@@ -156,12 +156,12 @@ class CheckpointFile:
                 self.path, f"cannot be written ({error.strerror})", "a file in an existing, writable folder"
             ) from error
 
-    def save_if_due(self, now: Run) -> None:
+    def save_if_due(self, now: RunState) -> None:
         """Save at most every `every_s` seconds and every ten times the saving time; always if `every_s` is 0."""
         if self.every_s == 0 or time.monotonic() - self._last_saving >= max(self.every_s, 10.0 * self._saving_time_s):
             self.save(now)
 
-    def save(self, now: Run) -> None:
+    def save(self, now: RunState) -> None:
         """Write the file unless it holds this state already; a failure only warns, as the run itself is sound."""
         if now is self._state_in_file:
             return
@@ -175,7 +175,7 @@ class CheckpointFile:
             self._last_saving = time.monotonic()
             self._saving_time_s = self._last_saving - begun
 
-    def _file_content(self, now: Run) -> bytes:
+    def _file_content(self, now: RunState) -> bytes:
         head = {
             "format": _FORMAT,
             "settings": self.settings,
@@ -186,18 +186,18 @@ class CheckpointFile:
             **{name: getattr(now, name) for name in _PLAIN},
         }
         arrays = {f"live_{name}": getattr(now.live.points, name) for name in _POINTS}
-        arrays |= {f"live_{name}": getattr(now.live.origin, name) for name in _ORIGIN}
+        arrays |= {f"live_{name}": getattr(now.live.births, name) for name in _BIRTHS}
         if now.dead:
             dead = Points.join(*(d.points for d in now.dead))
             arrays |= {f"dead_{name}": getattr(dead, name) for name in _POINTS}
-            origin = Origin.join(*(d.origin for d in now.dead))
-            arrays |= {f"dead_{name}": getattr(origin, name) for name in _ORIGIN}
+            births = BirthRecords.join(*(d.births for d in now.dead))
+            arrays |= {f"dead_{name}": getattr(births, name) for name in _BIRTHS}
             arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
         buffer = io.BytesIO()
         np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_as_json)), **arrays)
         return buffer.getvalue()
 
-    def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> Run | None:
+    def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> RunState | None:
         """Read the file and restore the generator's state; None where there is no file.
 
         Raises
@@ -218,7 +218,7 @@ class CheckpointFile:
                 # Read the state only then: another version or move may have stored other fields.
                 same = found == _FORMAT and settings == self.settings
                 now = (
-                    _run_from_file(head, {name: file[name] for name in file.files if name != "head"}, move)
+                    _run_state_from_file(head, {name: file[name] for name in file.files if name != "head"}, move)
                     if same
                     else None
                 )
@@ -229,14 +229,14 @@ class CheckpointFile:
         if found != _FORMAT:
             raise FileError(self.path, f"format {found!r}", f"{_FORMAT!r}; delete the file to start anew")
         if now is None:
-            raise self._error_of_other_run(settings)
+            raise self._error_for_other_settings(settings)
         self._require_same_problem(now, evaluate)
         evaluate.n_calls = now.n_calls
         rng.bit_generator.state = now.rng_state
         self._last_saving, self._state_in_file = time.monotonic(), now
         return now
 
-    def _error_of_other_run(self, settings: dict[str, object]) -> FileError:
+    def _error_for_other_settings(self, settings: dict[str, object]) -> FileError:
         """Report the first setting in which the file differs from this run."""
         name = next(n for n in (*self.settings, *settings) if settings.get(n) != self.settings.get(n))
         if name == "seed_state":
@@ -253,7 +253,7 @@ class CheckpointFile:
             "the same problem, settings and seed; give another file, or delete this one to start anew",
         )
 
-    def _require_same_problem(self, now: Run, evaluate: Evaluator) -> None:
+    def _require_same_problem(self, now: RunState, evaluate: Evaluator) -> None:
         points, way_out = now.live.points, "give another file, or delete this one to start anew"
         theta, log_density = evaluate.space.leave(points.u)
         scale = np.abs(points.theta).max(axis=0)
@@ -284,28 +284,28 @@ _PLAIN = (
     "n_calls",
     "ended",
 )
-_ORIGIN = ("log_birth", "birth_label", "ident", "parent")
+_BIRTHS = ("log_birth", "birth_label", "ident", "parent")
 _RECORD = ("n_at_death", "rank", "n_ranked")
 
 
-def _run_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> Run:
+def _run_state_from_file(head: dict[str, object], arrays: dict[str, np.ndarray], move: Move) -> RunState:
     """Rebuild the state of a run from the head and the arrays of a checkpoint; `move` is the one given on resuming."""
     ends = np.cumsum(np.asarray(head["sizes"], dtype=np.int64))
     dead = []
     for end, size in zip(ends, np.diff(ends, prepend=0), strict=True):
         rows = slice(int(end - size), int(end))
         points = Points(*(arrays[f"dead_{name}"][rows] for name in _POINTS))
-        origin = Origin(*(arrays[f"dead_{name}"][rows] for name in _ORIGIN))
-        dead.append(Dead(points, origin, *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
-    live = Live(
+        births = BirthRecords(*(arrays[f"dead_{name}"][rows] for name in _BIRTHS))
+        dead.append(DeadOfRound(points, births, *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
+    live = LivePoints(
         Points(*(arrays[f"live_{name}"] for name in _POINTS)),
-        Origin(*(arrays[f"live_{name}"] for name in _ORIGIN)),
+        BirthRecords(*(arrays[f"live_{name}"] for name in _BIRTHS)),
         float(str(head["log_volume"])),
     )
     plain = {name: head[name] for name in _PLAIN}
     plain["notes"] = tuple(plain["notes"])  # type: ignore[arg-type]
     moving = _with_numeric_fields(move, head["moving"])
-    return Run(live, tuple(dead), moving, rng_state=_state_with_arrays(head["rng_state"]), **plain)  # type: ignore[arg-type]
+    return RunState(live, tuple(dead), moving, rng_state=_generator_state_with_arrays(head["rng_state"]), **plain)  # type: ignore[arg-type]
 
 
 def _nearly_equal(a: FloatArray, b: FloatArray, scale: FloatArray | float) -> bool:
@@ -338,7 +338,7 @@ def _as_json(value: object) -> object:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
-def _state_with_arrays(value: object) -> dict[str, Any]:
+def _generator_state_with_arrays(value: object) -> dict[str, Any]:
     """Convert the lists in a generator's state back to arrays."""
     if not isinstance(value, dict):
         raise ValueError("no state of a random generator")

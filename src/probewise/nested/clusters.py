@@ -37,7 +37,7 @@ class Clusters:
         return np.asarray(np.argmin(0.5 * np.einsum("cni,cni->cn", z, z) + self.log_det[:, None], axis=0))
 
     @staticmethod
-    def of(groups: list[FloatArray]) -> Clusters:
+    def from_groups(groups: list[FloatArray]) -> Clusters:
         """Compute mean and covariance of groups of points, each (n, n_params)."""
         mean = np.stack([g.mean(axis=0) for g in groups])
         root = np.stack([_covariance_root(g) for g in groups])
@@ -45,7 +45,7 @@ class Clusters:
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         return Clusters(mean, root, inverse, log_det, np.array([len(g) for g in groups]))
 
-    def counterparts(self, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
+    def map_between(self, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
         """Map points of clusters `home` to clusters `goal`, affinely; also return the log of the volume ratio.
 
         Points are (n, n_params), clusters (n,).
@@ -54,12 +54,12 @@ class Clusters:
         moved = self.mean[goal] + np.matmul(self.root[goal], z)[:, :, 0]
         return moved, self.log_det[goal] - self.log_det[home]
 
-    def joined(self, other: Clusters) -> Clusters:
+    def followed_by(self, other: Clusters) -> Clusters:
         """Return these clusters followed by the others."""
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Clusters(*map(np.concatenate, pairs))
 
-    def without_point_itself(self, u: FloatArray, home: IntArray) -> Clusters:
+    def leave_one_out(self, u: FloatArray, home: IntArray) -> Clusters:
         """Return for each point the mean and covariance of its cluster without the point itself.
 
         Parameters
@@ -99,7 +99,7 @@ def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
     equal modes 5 sd apart gain a quarter of a nat per point. A false split costs little: the moves are exact
     however space is divided.
     """
-    least = _least_points(points.shape[1]) if least is None else least
+    least = _least_points_of_cluster(points.shape[1]) if least is None else least
     queue, done = [points], list[FloatArray]()
     while queue:
         group = queue.pop()
@@ -108,12 +108,12 @@ def find_clusters(points: FloatArray, *, least: int | None = None) -> Clusters:
             done.append(group)
         else:
             queue.extend(halves)
-    clusters = Clusters.of(done)
+    clusters = Clusters.from_groups(done)
     if len(done) > 1:
         # Recompute the clusters from the division of space that will be used.
         home = clusters.assign(points)
         if np.bincount(home, minlength=len(done)).min() >= least:
-            clusters = Clusters.of([points[home == k] for k in range(len(done))])
+            clusters = Clusters.from_groups([points[home == k] for k in range(len(done))])
     return clusters
 
 
@@ -138,7 +138,7 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
         for _ in range(_N_REFINEMENTS):
             if not least <= side.sum() <= n - least:
                 break
-            pair = Clusters.of([points[~side], points[side]])
+            pair = Clusters.from_groups([points[~side], points[side]])
             refined = pair.assign(points) == 1
             if np.array_equal(refined, side):
                 break
@@ -154,7 +154,7 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
     return halves
 
 
-def _least_points(n_params: int) -> int:
+def _least_points_of_cluster(n_params: int) -> int:
     """Fewest points of a cluster, so that its covariance is well determined."""
     return 2 * n_params + 2
 

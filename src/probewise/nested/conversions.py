@@ -30,21 +30,21 @@ def to_anesthetic(result: DeadPoints) -> Any:
         If anesthetic is not installed.
     """
     anesthetic = _import_optional("anesthetic")
-    death, birth = _strict_levels(result)
+    death, birth = _levels_without_ties(result)
     return anesthetic.NestedSamples(
         data=np.array(result.theta), columns=list(result.names), logL=death, logL_birth=birth, label="probewise"
     )
 
 
 def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.random.Generator, n: int) -> Any:
-    """Convert to ArviZ's container: `n` equally weighted samples as one chain, and what the run says of itself.
+    """Convert to ArviZ's container: `n` equally weighted samples as one chain, and attributes of the run.
 
     Parameters
     ----------
     result
         The dead points to draw from.
     attributes
-        What the container says of the whole: the evidence, its error, versions.
+        Attributes of the container: the evidence, its error, versions.
     rng
         Source of randomness, for drawing the samples.
     n
@@ -80,7 +80,7 @@ def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.ra
     return arviz.from_dict(**groups, attrs=dict(attributes))
 
 
-def _strict_levels(result: DeadPoints) -> tuple[FloatArray, FloatArray]:
+def _levels_without_ties(result: DeadPoints) -> tuple[FloatArray, FloatArray]:
     """Log likelihoods at death and birth, (n_dead,), with ties broken in the order of the labels."""
     order = np.lexsort((result.label, result.log_likelihood))
     strict = result.log_likelihood[order] + result.log_start

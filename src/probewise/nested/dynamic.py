@@ -20,13 +20,13 @@ import numpy as np
 from probewise._arrays import IntArray
 from probewise._kinds import require_rng, require_whole
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
-from probewise.nested.checkpoint import Live, Origin
+from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integrate
-from probewise.nested.merging import JoinedRecord, combined_p_value, seeds_of
+from probewise.nested.merging import JoinedRecord, combined_p_value, generator_states_of
 from probewise.nested.moves import Move, SliceMove
-from probewise.nested.result import NestedResult, versions
-from probewise.nested.sampler import least_live, move_at_volume, plain_state, step
+from probewise.nested.result import NestedResult, software_versions
+from probewise.nested.sampler import generator_state_as_json, least_live, move_at_volume, step
 
 Goal: TypeAlias = Literal["posterior", "evidence"]
 
@@ -70,7 +70,7 @@ def intensified(
     Returns
     -------
     NestedResult
-        The run with the new points. Its `n_live` is still the run's; `n_at_death` says how many points were alive at
+        The run with the new points. Its `n_live` is still the run's; `n_at_death` is the number of points alive at
         each level. `memory` and `check` are the run's, `warnings` too, with one more if the new points' insertion
         ranks are not uniform.
 
@@ -93,7 +93,7 @@ def intensified(
         require_whole("max_calls", max_calls, least=n_live)
     evaluate = Evaluator(problem)
     _require_complete_run_of(result, evaluate)
-    seed_state = plain_state(rng.bit_generator.state)
+    seed_state = generator_state_as_json(rng.bit_generator.state)
     first, last = _rows_to_intensify(result, goal)
     thread = _draw_thread(result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng)
     return _join_thread_to_run(result, thread, seed_state, evaluate.n_calls, rng)
@@ -101,14 +101,14 @@ def intensified(
 
 @dataclass(frozen=True, eq=False)
 class _Thread:
-    """New points with their origins, in order of death.
+    """New points with the records of their births, in order of death.
 
     `started`: the row of the run's point at which each one's chain began, -1 where that is another new point, (n,).
-    `rank` among the `n_ranked` points alive at each insertion.
+    `rank`: how many of the `n_ranked` points alive at each insertion were worse than the new one, (n_inserted,) each.
     """
 
     points: Points
-    origin: Origin
+    births: BirthRecords
     started: IntArray
     rank: IntArray
     n_ranked: IntArray
@@ -160,17 +160,17 @@ def _draw_thread(
     end = (float(result.log_likelihood[last]), float(result.label[last]))
     bound = Bound(float(result.log_likelihood[first]), float(result.label[first]))
     above = _rows_alive_after(result, first)
-    known = evaluate.known(result.theta[above], result.log_likelihood[above], result.label[above])
+    known = evaluate.points_from_known_values(result.theta[above], result.log_likelihood[above], result.label[above])
     log_volume = float(result.log_volume[first])
     begin = np.concatenate([rng.permutation(len(above)) for _ in range(math.ceil(n_live / len(above)))])[:n_live]
     now = move_at_volume(move, log_volume)
     drawn, tally = now.draw(known.take(begin), bound, known.u, evaluate, rng)
     started = np.where(now is move, above[begin], -1)
-    origin = Origin(
+    births = BirthRecords(
         np.full(n_live, bound.log_likelihood), np.full(n_live, bound.label), np.arange(n_live), np.full(n_live, -1)
     )
-    live, moving = Live(drawn, origin, log_volume), move.adapted(tally) if now is move else move
-    dead, ranks, counts = list[tuple[Points, Origin]](), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    live, moving = LivePoints(drawn, births, log_volume), move.adapted(tally) if now is move else move
+    dead, ranks, counts = list[tuple[Points, BirthRecords]](), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     n_replaced, cost = n_live // 2, tally.n_evaluated
     while True:
         worst = live.points.order()[n_replaced - 1]
@@ -181,14 +181,14 @@ def _draw_thread(
         live, gone, tally = step(live, now, evaluate, n_replaced=n_replaced, rng=rng)
         cost = tally.n_evaluated
         moving = moving.adapted(tally) if now is moving else moving
-        dead.append((gone.points, gone.origin))
+        dead.append((gone.points, gone.births))
         ranks.append(gone.rank)
         counts.append(gone.n_ranked)
     order = live.points.order()
-    dead.append((live.points.take(order), live.origin.take(order)))
-    points, origin = Points.join(*(points for points, _ in dead)), Origin.join(*(origins for _, origins in dead))
-    began = np.where(origin.ident < n_live, started[np.minimum(origin.ident, n_live - 1)], -1)
-    return _Thread(points, origin, began, np.concatenate(ranks), np.concatenate(counts))
+    dead.append((live.points.take(order), live.births.take(order)))
+    points, births = Points.join(*(points for points, _ in dead)), BirthRecords.join(*(born for _, born in dead))
+    began = np.where(births.ident < n_live, started[np.minimum(births.ident, n_live - 1)], -1)
+    return _Thread(points, births, began, np.concatenate(ranks), np.concatenate(counts))
 
 
 def _rows_alive_after(result: NestedResult, row: int) -> IntArray:
@@ -206,15 +206,15 @@ def _join_thread_to_run(
     rng: np.random.Generator,
 ) -> NestedResult:
     """Join a run and new points into one run, in order of death."""
-    points, origin = thread.points, thread.origin
+    points, births = thread.points, thread.births
     n_old = result.n_dead
     row_of = np.empty(len(points), dtype=np.int64)
-    row_of[origin.ident] = n_old + np.arange(len(points))
-    parents = np.where(origin.parent >= 0, row_of[origin.parent], thread.started)
-    record = JoinedRecord.of(
+    row_of[births.ident] = n_old + np.arange(len(points))
+    parents = np.where(births.parent >= 0, row_of[births.parent], thread.started)
+    record = JoinedRecord.from_records(
         [
             (result.log_likelihood, result.label, result.log_birth, result.birth_label),
-            (points.log_likelihood, points.label, origin.log_birth, origin.birth_label),
+            (points.log_likelihood, points.label, births.log_birth, births.birth_label),
         ]
     )
     evidence = integrate(
@@ -243,7 +243,7 @@ def _join_thread_to_run(
         log_weight=evidence.log_weight,
         log_birth=record.log_birth,
         birth_label=record.birth_label,
-        parent=record.parents(np.concatenate([result.parent, parents])),
+        parent=record.parents_in_joined_order(np.concatenate([result.parent, parents])),
         n_at_death=record.n_at_death,
         log_z=evidence.log_z,
         log_z_error=error,
@@ -253,8 +253,8 @@ def _join_thread_to_run(
         insertion_rank=np.concatenate([result.insertion_rank, thread.rank]),
         insertion_n_ranked=np.concatenate([result.insertion_n_ranked, thread.n_ranked]),
         insertion_p_value=combined_p_value([result.insertion_p_value, own]),
-        seed_state=json.dumps([*seeds_of(result), seed_state]),
-        versions=versions(),
+        seed_state=json.dumps([*generator_states_of(result), seed_state]),
+        versions=software_versions(),
         warnings=notes,
         check=check,
     )

@@ -70,7 +70,7 @@ class Points:
         self.log_likelihood[rows] = points.log_likelihood[which]
 
     def order(self) -> IntArray:
-        """Row numbers from worst to best, ties by label."""
+        """Return the row numbers from the least to the greatest log likelihood, ties by label, (n,)."""
         return np.lexsort((self.label, self.log_likelihood))
 
     @staticmethod
@@ -130,14 +130,18 @@ class Evaluator:
         self.names = self.problem.prior.names
         self.space = space_of(self.problem.prior, getattr(self.problem, "periodic", ()))
 
-    def from_prior(self, n: int, rng: np.random.Generator) -> Points:
+    def draw_from_prior(self, n: int, rng: np.random.Generator) -> Points:
         """Draw from the prior and evaluate."""
         return self(self.space.draw(n, rng=rng), rng)
 
-    def known(self, theta: FloatArray, log_likelihood: FloatArray, label: FloatArray) -> Points:
-        """Make points of hypotheses (n, n_params) that were evaluated before."""
+    from_prior = draw_from_prior  # its earlier name
+
+    def points_from_known_values(self, theta: FloatArray, log_likelihood: FloatArray, label: FloatArray) -> Points:
+        """Make points of hypotheses (n, n_params) whose log likelihood and label, (n,), are known; evaluate nothing."""
         u = self.space.enter(theta)
         return Points(u, theta, self.space.leave(u)[1], log_likelihood, label)
+
+    known = points_from_known_values  # its earlier name
 
     def __call__(self, u: FloatArray, rng: np.random.Generator) -> Points:
         """Evaluate `u`, (n, n_params), inside the space, and give every point a new label.
@@ -215,18 +219,19 @@ class Evaluator:
             raise NotConvergedError(
                 f"the likelihood returned a masked array with {n_masked} of {answer.size} values masked; allowed: "
                 "plain numbers; return answer.filled(-np.inf) if masked means impossible; "
-                f"{self._first_as_text(theta)}"
+                f"{self._first_hypothesis_as_text(theta)}"
             )
         if np.asarray(answer).dtype.kind == "c":
             raise NotConvergedError(
                 "the likelihood returned complex numbers; allowed: real ones; return their real part if that is "
-                f"meant; {self._first_as_text(theta)}"
+                f"meant; {self._first_hypothesis_as_text(theta)}"
             )
         try:
             values = np.asarray(answer, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise NotConvergedError(
-                f"the likelihood returned something other than numbers ({error}); {self._first_as_text(theta)}"
+                f"the likelihood returned something other than numbers ({error}); "
+                f"{self._first_hypothesis_as_text(theta)}"
             ) from error
         if values.shape == () and len(theta) == 1:
             return values.reshape(1)  # many functions drop the axis of a batch of one, scipy.stats among them
@@ -234,7 +239,7 @@ class Evaluator:
             raise NotConvergedError(
                 f"the likelihood returned shape {values.shape}; "
                 f"allowed: ({len(theta)},), one number per hypothesis: theta is a batch of shape {theta.shape}, "
-                f"one hypothesis per row; {self._first_as_text(theta)}"
+                f"one hypothesis per row; {self._first_hypothesis_as_text(theta)}"
             )
         return values
 
@@ -251,7 +256,7 @@ class Evaluator:
         if culprit is not None:
             return f"the likelihood raised {why}; at {self._parameters_as_text(culprit)}"
         batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
-        return f"the likelihood raised {why}; {batch}; {self._first_as_text(theta)}"
+        return f"the likelihood raised {why}; {batch}; {self._first_hypothesis_as_text(theta)}"
 
     def _failing_row(self, theta: FloatArray) -> FloatArray | None:
         """Find by bisection a hypothesis that fails by itself; None where only the batch as a whole fails."""
@@ -270,7 +275,7 @@ class Evaluator:
             return True
         return False
 
-    def _first_as_text(self, theta: FloatArray) -> str:
+    def _first_hypothesis_as_text(self, theta: FloatArray) -> str:
         return f"first of the {len(theta)} hypotheses asked for: {self._parameters_as_text(theta[0])}"
 
     def _parameters_as_text(self, row: FloatArray) -> str:

@@ -50,7 +50,7 @@ def chain_memory(parent: IntArray, birth_row: IntArray, n_at_death: IntArray, lo
     n_rounds = len(ends) - 1
     if n_rounds // 4 < _LEAST_LAG:
         return 1.0
-    half, quarter = (genealogy.memory(ends, n_rounds // part) for part in (2, 4))
+    half, quarter = (genealogy.memory_of_windows(ends, n_rounds // part) for part in (2, 4))
     return max(1.0, 1.5 * half - 0.5 * quarter)
 
 
@@ -67,13 +67,14 @@ class _Genealogy:
         n_alive = n_at_death[np.minimum(self._births + 1, len(n_at_death) - 1)]
         self._chance = np.concatenate([[0.0], np.cumsum(2.0 * (self._left[self._births + 1] / n_alive) ** 2)])
 
-    def memory(self, ends: IntArray, lag: int) -> float:
+    def memory_of_windows(self, ends: IntArray, lag: int) -> float:
         """Estimate the variance ratio from windows of `lag` rounds."""
         starts = np.unique(np.linspace(0, len(ends) - 1 - lag, _MOST_WINDOWS).astype(int))
-        excess, own = np.array([self._excess_variance(ends[i], ends[i + lag]) for i in starts]).sum(axis=0)
+        windows = [self._excess_and_shrinkage_variance(ends[i], ends[i + lag]) for i in starts]
+        excess, own = np.array(windows).sum(axis=0)
         return 1.0 + float(excess / own)
 
-    def _excess_variance(self, first: int, last: int) -> tuple[float, float]:
+    def _excess_and_shrinkage_variance(self, first: int, last: int) -> tuple[float, float]:
         """Excess variance of log Z over that of independent draws, and the variance of the shrinkage, in a window.
 
         Lineages are traced back from `last` to `first`; the points alive at `last` share the evidence beyond it.

@@ -1,4 +1,4 @@
-"""Weigh a hill of the posterior by importance sampling, and ask whether a run has met it."""
+"""Estimate the evidence of a hill of the posterior by importance sampling, and whether a run has met the hill."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.nested.ascent import Top
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
-from probewise.nested.importance import HeldOut, Posterior, Weighted, weigh_draws
+from probewise.nested.importance import HeldOutSamples, Posterior, Weighted, draw_and_weigh
 from probewise.nested.mixture import single_student_t
 from probewise.nested.moves import SliceMove
 from probewise.nested.repartition import principal_root
@@ -47,11 +47,11 @@ class Hill:
     radius: float
 
     @classmethod
-    def of(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> Hill:
+    def from_draws(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> Hill:
         """Make a hill of weighted draws on it."""
         theta = drawn.samples(_N_SAMPLES, rng=rng)
         x = space.enter(theta)
-        shape = Clusters.of([x])
+        shape = Clusters.from_groups([x])
         return cls(drawn.log_z, theta, space, shape, float(np.quantile(_distance_in_sds(x, shape), _INSIDE)))
 
     def is_met_by(self, run: Posterior) -> bool:
@@ -66,7 +66,7 @@ def _distance_in_sds(x: FloatArray, shape: Clusters) -> FloatArray:
     return np.asarray(np.linalg.norm((x - shape.mean[0]) @ shape.inverse_root[0].T, axis=1))
 
 
-def evidence_not_met(hills: Iterable[Hill], run: Posterior) -> float:
+def log_evidence_of_unmet_hills(hills: Iterable[Hill], run: Posterior) -> float:
     """Return the log of the joint evidence of those hills that a run has not met; -inf where it met all."""
     return float(logsumexp([-math.inf, *(hill.log_z for hill in hills if not hill.is_met_by(run))]))
 
@@ -75,12 +75,12 @@ def _n_points_on_hill(n_params: int) -> int:
     return max(_PER_PARAM * n_params, 20)
 
 
-def calls_to_weigh_hill(n_params: int) -> float:
+def calls_for_hill_evidence(n_params: int) -> float:
     """Return about how many evaluations it takes to weigh a hill: two or three rounds of chains."""
     return 2.5 * _n_points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
 
 
-def drawn_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Points:
+def draw_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Points:
     """Draw points uniformly from the upper part of a hill, whose covariance is that of a whole normal hill."""
     n_params = top.root.shape[0]
     n = _n_points_on_hill(n_params)
@@ -102,17 +102,20 @@ def drawn_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> 
     return drawn
 
 
-def weigh_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
-    """Weigh a hill by draws from a Student t about points on it, fitted anew if need be; None where none fits."""
+def estimate_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
+    """Compute a hill's evidence by draws from a Student t about points on it; None where no Student t fits.
+
+    Where there are too few effective samples, the Student t is fitted anew to the weighted draws.
+    """
     space = unbounded_space_of(evaluate.problem.prior)
     x, n_params = space.enter(settled.theta), settled.theta.shape[1]
     mean, covariance = x.mean(axis=0), np.atleast_2d(np.cov(x, rowvar=False))
     n_draws, enough = max(_DRAWS_PER_PARAM * n_params, 200), _ENOUGH * n_params
     for _ in range(_FITS):
         proposal = single_student_t(mean, _WIDER**2 * covariance)
-        drawn = weigh_draws(proposal, 0.0, HeldOut.empty(), space, evaluate, n_draws=n_draws, rng=rng)
+        drawn = draw_and_weigh(proposal, 0.0, HeldOutSamples.empty(), space, evaluate, n_draws=n_draws, rng=rng)
         if drawn.n_eff > enough:
-            return Hill.of(drawn, space, rng)
+            return Hill.from_draws(drawn, space, rng)
         if not drawn.n_eff > 1:
             return None
         # A power of the weights that leaves enough of them for a covariance.

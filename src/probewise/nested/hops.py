@@ -17,7 +17,7 @@ _HOPS = 3
 
 @dataclass(frozen=True, eq=False)
 class HoppingMove:
-    """Hops between modes, then the chains of `then`.
+    """Hops between modes, then the chains of `chains`.
 
     A hop takes a point to its counterpart in another mode, by the affine map between their covariances, and is accepted
     with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes in which there are enough live
@@ -25,7 +25,7 @@ class HoppingMove:
     have about its shape far below its top too, so the maps serve from where modes separate.
     """
 
-    then: SliceMove
+    chains: SliceMove
     modes: Clusters
 
     def draw(
@@ -34,17 +34,17 @@ class HoppingMove:
         """Return the ends of one chain from each start; see `Move`."""
         n_before, now = evaluate.n_calls, start.copy()
         for _ in range(_HOPS):
-            self._hop(now, bound, evaluate, rng)
+            self._hop_in_place(now, bound, evaluate, rng)
         n_hops = evaluate.n_calls - n_before
-        new, tally = self.then.draw(now, bound, live, evaluate, rng)
+        new, tally = self.chains.draw(now, bound, live, evaluate, rng)
         return new, Tally(tally.n_evaluated + n_hops, tally.n_accepted, tally.n_stuck, tally.n_tried)
 
-    def _hop(self, now: Points, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
+    def _hop_in_place(self, now: Points, bound: Bound, evaluate: Evaluator, rng: np.random.Generator) -> None:
         """Try one hop of each point to another mode, chosen at random; those that succeed are overwritten."""
         modes, space = self.modes, evaluate.space
         home = modes.assign(now.u)
         goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
-        u, log_growth = modes.counterparts(now.u, home, goal)
+        u, log_growth = modes.map_between(now.u, home, goal)
         # The way back must be the same map.
         able = is_within(space, u) & (modes.assign(u) == goal)
         level = now.log_density - log_growth - rng.standard_exponential(len(home))
@@ -58,4 +58,4 @@ class HoppingMove:
 
     def adapted(self, tally: Tally) -> HoppingMove:
         """Adapt the chains; see `SliceMove`."""
-        return HoppingMove(self.then.adapted(tally), self.modes)
+        return HoppingMove(self.chains.adapted(tally), self.modes)

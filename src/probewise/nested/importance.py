@@ -21,11 +21,11 @@ from probewise._arrays import FloatArray, frozen
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
-from probewise.nested.proposal import Proposal, find_parts, fit_proposals
+from probewise.nested.proposal import Proposal, find_disconnected_clusters, fit_wide_and_narrow_proposals
 from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, unbounded_space_of
 from probewise.nested.weighted_samples import WeightedSamples
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 
 # Pareto k above which the mean of the weights converges too slowly for a reliable error (Vehtari et al. 2024).
 _MOST_K = 0.7
@@ -201,11 +201,11 @@ def update(
     log_weight = log_weight + np.maximum(-math.log(1000) - previous.log_weight[rows], 0.0)
     n_eff, k = n_effective(log_weight), math.inf
     if n_eff >= max(_SURPRISED * len(rows), 3 * len(evaluate.names)):
-        proposal = fit_proposals(
+        proposal = fit_wide_and_narrow_proposals(
             resampled_for_fit(theta, log_weight - float(logsumexp(log_weight)), space, rng), rng=rng
         )[-1]
-        found = weigh_draws(proposal, prior_share, HeldOut.empty(), space, evaluate, n_draws=n_draws, rng=rng)
-        found = with_loss_in_error(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
+        found = draw_and_weigh(proposal, prior_share, HeldOutSamples.empty(), space, evaluate, n_draws=n_draws, rng=rng)
+        found = with_error_of_lost_parts(found, effective_lineages(previous) * n_eff / len(rows), space, rng)
         if found.sound:
             return found
         k = found.pareto_k
@@ -225,7 +225,7 @@ def update(
 
 
 @dataclass(frozen=True, eq=False)
-class HeldOut:
+class HeldOutSamples:
     """Posterior samples held out from the fit, and their effective number.
 
     `x` (n, n_params) in unbounded coordinates; the prior's log density there and the log likelihood, (n,).
@@ -237,7 +237,7 @@ class HeldOut:
     n_independent: float
 
     @classmethod
-    def empty(cls) -> HeldOut:
+    def empty(cls) -> HeldOutSamples:
         """Return an empty set, for plain importance sampling."""
         return cls(np.empty((0, 0)), np.empty(0), np.empty(0), 0.0)
 
@@ -253,16 +253,16 @@ def effective_lineages(found: Posterior) -> float:
     return found.n_live / max(found.information * found.memory, 1.0)
 
 
-def split_samples(
+def split_off_held_out(
     found: Posterior, n_lineages: float, space: Space, rng: np.random.Generator
-) -> tuple[FloatArray, HeldOut]:
+) -> tuple[FloatArray, HeldOutSamples]:
     """Split samples at random into those for fitting a density, (n, n_params), and held-out ones."""
     lot = rng.random(len(found.theta)) < _HELD_OUT
     chosen = np.flatnonzero(lot & (found.log_weight > -math.inf))
     weight = np.exp(found.log_weight[chosen])
-    rows = chosen[resampled(weight, min(_MOST_HELD, chosen.size), rng)]
+    rows = chosen[resampled_rows(weight, min(_MOST_HELD, chosen.size), rng)]
     x = space.enter(found.theta[rows])
-    held = HeldOut(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
+    held = HeldOutSamples(x, space.leave(x)[1], found.log_likelihood[rows], _HELD_OUT * n_lineages)
     return resampled_for_fit(found.theta[~lot], found.log_weight[~lot], space, rng), held
 
 
@@ -274,25 +274,25 @@ def resampled_for_fit(theta: FloatArray, log_weight: FloatArray, space: Space, r
     """
     weight = np.exp(log_weight - log_weight.max())
     n = int(min(max(n_effective(log_weight), 4 * theta.shape[1] + 4), _MOST_FITTED))
-    rows = [resampled(weight, n, rng), resampled(np.sqrt(weight), n // 3, rng)]
+    rows = [resampled_rows(weight, n, rng), resampled_rows(np.sqrt(weight), n // 3, rng)]
     return space.enter(theta[np.unique(np.concatenate(rows))])
 
 
-def with_loss_in_error(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
+def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, rng: np.random.Generator) -> Weighted:
     """Add to the error the share of the posterior that a run of `n_lineages` effective samples may have lost."""
     if not found.n_eff > 1:
         return found
     n = int(min(found.n_eff, 1000))
-    parts = find_parts(space.enter(found.theta[np.unique(found.rows(n, rng=rng))]))
+    parts = find_disconnected_clusters(space.enter(found.theta[np.unique(found.rows(n, rng=rng))]))
     share = parts.size / parts.size.sum()
     lost = float(share @ np.exp(-n_lineages * share))
     return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))
 
 
-def weigh_draws(
+def draw_and_weigh(
     proposal: Proposal,
     prior_share: float,
-    held: HeldOut,
+    held: HeldOutSamples,
     space: Space,
     evaluate: Evaluator,
     *,
@@ -300,7 +300,10 @@ def weigh_draws(
     rng: np.random.Generator,
     tail: float = 3.0,
 ) -> Weighted:
-    """Draw from a proposal and the prior, evaluate, and weight the draws; `tail` as for `pareto_k`."""
+    """Draw from a mixture of a proposal and the prior, evaluate, and weight the draws.
+
+    `held`: posterior samples that correct the evidence by bridge sampling; `tail` as for `pareto_k`.
+    """
     n_prior = round(prior_share * n_draws)
 
     def log_proposal(x: FloatArray, log_density: FloatArray) -> FloatArray:

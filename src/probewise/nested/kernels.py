@@ -39,7 +39,7 @@ class Kernels:
     width: float
 
     @classmethod
-    def about(cls, points: FloatArray, *, rng: np.random.Generator) -> Kernels:
+    def at_points(cls, points: FloatArray, *, rng: np.random.Generator) -> Kernels:
         """Place kernels at up to a hundred of the points, (n_points, n_params), whitened by the covariance of all."""
         n_points, n_params = points.shape
         mean = points.mean(axis=0)
@@ -121,7 +121,7 @@ class KernelMove:
         """Return the ends of one chain from each start; see `Move`."""
         n_chains = len(start)
         space = evaluate.space
-        kernels = Kernels.about(live, rng=rng)
+        kernels = Kernels.at_points(live, rng=rng)
         n_tries = n_chains * self.n_proposals
         u = kernels.draw(n_tries, rng=rng)
         log_target = -kernels.log_density(u)
@@ -152,7 +152,7 @@ class KernelMove:
 
 
 @dataclass(frozen=True, eq=False)
-class _LastAccepted:
+class _LastAcceptedProposals:
     """Index of the proposal each chain accepted last, -1 for none, (n_chains,), and the number of acceptances."""
 
     index: FloatArray
@@ -161,7 +161,7 @@ class _LastAccepted:
 
 def _accept_in_turn(
     possible: BoolArray, log_target: FloatArray, log_now: FloatArray, log_odds: FloatArray
-) -> _LastAccepted:
+) -> _LastAcceptedProposals:
     """Let every chain accept or reject its proposals in turn (Metropolis-Hastings, independent proposals).
 
     `possible` and `log_target`, the log of target over proposal density, have one entry per proposal,
@@ -175,7 +175,7 @@ def _accept_in_turn(
         now[accept] = log_target[k][accept]
         index[accept] = k * n_chains + np.flatnonzero(accept)
         n_accepted += int(accept.sum())
-    return _LastAccepted(index, n_accepted)
+    return _LastAcceptedProposals(index, n_accepted)
 
 
 def diversify_by_kernels(
@@ -226,7 +226,7 @@ def diversify_by_kernels(
     if n_steps == 0:
         return start, DiversifyTally(0, 0, 0.0, len(np.unique(start, axis=0)), 0.0)
     n_samples = len(start)
-    kernels = Kernels.about(cloud, rng=rng)
+    kernels = Kernels.at_points(cloud, rng=rng)
     now = start.copy()
     log_now = problem.prior.log_prob(now) + evaluate.log_likelihood(now) - kernels.log_density(now)
     if not np.isfinite(log_now).all():

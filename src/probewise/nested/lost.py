@@ -38,8 +38,8 @@ def _n_early_dead_points(run: NestedResult) -> int:
     return int(np.searchsorted(np.cumsum(run.weight), _BULK))
 
 
-def scale_of_bulk(run: NestedResult, space: Space) -> FloatArray:
-    """Sds, in coordinates of the space, of the next points to die after the early ones, (n_params,)."""
+def sds_of_next_dead_points(run: NestedResult, space: Space) -> FloatArray:
+    """Sds of the next 600 points to die after the first tenth of the mass, in coordinates of the space, (n_params,)."""
     last = _n_early_dead_points(run)
     return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
 
@@ -58,25 +58,25 @@ def tops_from_early_points(
         return []
     # Denser in the beginning: a mode that dies out late has points there, too.
     rows = np.unique((last * np.linspace(0.0, 1.0, n_starts) ** 3).astype(np.int64))
-    start = evaluate.known(first.theta[rows], first.log_likelihood[rows], first.label[rows])
+    start = evaluate.points_from_known_values(first.theta[rows], first.log_likelihood[rows], first.label[rows])
     samples = np.unique(first.rows(_N_KNOWN, rng=rng))
-    known = evaluate.known(first.theta[samples], first.log_likelihood[samples], first.label[samples])
+    known = evaluate.points_from_known_values(first.theta[samples], first.log_likelihood[samples], first.label[samples])
     u = evaluate.space.enter(first.theta[: last + _BLOCK])
-    scale = scale_of_bulk(first, evaluate.space)
-    apart = np.flatnonzero(lie_apart(start, known, scale, 1, evaluate, rng))
+    scale = sds_of_next_dead_points(first, evaluate.space)
+    apart = np.flatnonzero(are_beyond_dip(start, known, scale, 1, evaluate, rng))
     if not apart.size:
         return []
-    chosen = apart[_order_by_distance(start.u[apart] / scale, start.log_likelihood[apart])]
+    chosen = apart[_rows_far_apart(start.u[apart] / scale, start.log_likelihood[apart])]
     roots = np.stack([principal_root(u[row : row + _BLOCK]) for row in rows[chosen]])
-    now, scales = _climb_on_random_lines(start.take(chosen), roots, evaluate, rng)
+    now, scales = _climb_along_random_lines(start.take(chosen), roots, evaluate, rng)
     # Of the evidence below a level a lost mode holds no more than its share of live points there.
     enough = first.log_likelihood[last] - _FROM_TOP * n_params
     high = np.flatnonzero(now.log_likelihood > enough)
-    high = high[lie_apart(now.take(high), known, scale, _NEAREST, evaluate, rng)]
+    high = high[are_beyond_dip(now.take(high), known, scale, _NEAREST, evaluate, rng)]
     return [Top(now.take(slice(k, k + 1)), now.u[k], scales[k] * roots[k]) for k in high]
 
 
-def _climb_on_random_lines(
+def _climb_along_random_lines(
     start: Points, root: FloatArray, evaluate: Evaluator, rng: np.random.Generator
 ) -> tuple[Points, FloatArray]:
     """Move points to higher places on random lines; steps grow where they succeed and shrink where they fail.
@@ -106,7 +106,7 @@ def _climb_on_random_lines(
     return now, scale
 
 
-def lie_apart(
+def are_beyond_dip(
     points: Points, known: Points, scale: FloatArray, n_nearest: int, evaluate: Evaluator, rng: np.random.Generator
 ) -> BoolArray:
     """Mark the points, (n,), with a dip of the likelihood on the straight line to each of their nearest known points.
@@ -129,8 +129,8 @@ def lie_apart(
     return np.asarray(dip.reshape(n, -1).all(axis=1))
 
 
-def _order_by_distance(x: FloatArray, height: FloatArray) -> IntArray:
-    """Choose among points (n, n_params) the highest one, then each time the one furthest from those chosen."""
+def _rows_far_apart(x: FloatArray, height: FloatArray) -> IntArray:
+    """Return rows of points (n, n_params) that lie far apart: the highest, then the furthest from those before it."""
     chosen = [int(height.argmax())]
     square = ((x - x[chosen[0]]) ** 2).sum(axis=1)
     while len(chosen) < _MOST_HILLS and square.max() > 0:

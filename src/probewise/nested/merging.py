@@ -16,7 +16,7 @@ from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import weighted_mean
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
 from probewise.nested.missing import DISAGREE
-from probewise.nested.result import Agreement, Check, NestedResult, versions
+from probewise.nested.result import Agreement, Check, NestedResult, software_versions
 
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
@@ -53,12 +53,12 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
     """
     parts = tuple(results)
     seeds = _require_mergeable(parts)
-    record = JoinedRecord.of([(r.log_likelihood, r.label, r.log_birth, r.birth_label) for r in parts])
+    record = JoinedRecord.from_records([(r.log_likelihood, r.label, r.log_birth, r.birth_label) for r in parts])
     first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
     parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
     # Each run has its own estimate: in the joined record a run is never complete between two rounds.
     remembered = float(np.average([r.memory for r in parts], weights=[r.n_live for r in parts]))
-    log_start, log_start_error = _possible_share(parts)
+    log_start, log_start_error = _pooled_log_possible_share(parts)
     evidence = integrate(
         record.log_likelihood, record.n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error
     )
@@ -77,7 +77,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         log_weight=evidence.log_weight,
         log_birth=record.log_birth,
         birth_label=record.birth_label,
-        parent=record.parents(parent),
+        parent=record.parents_in_joined_order(parent),
         n_at_death=record.n_at_death,
         log_start=log_start,
         log_start_error=log_start_error,
@@ -94,7 +94,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         insertion_n_ranked=np.concatenate([r.insertion_n_ranked for r in parts]),
         insertion_p_value=p_value,
         seed_state=json.dumps(seeds),
-        versions=versions(),
+        versions=software_versions(),
         warnings=(*doubts, *inherited),
         agreement=agreement,
         check=check,
@@ -154,15 +154,15 @@ class JoinedRecord:
     n_at_death: IntArray
 
     @classmethod
-    def of(cls, parts: Sequence[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]) -> JoinedRecord:
-        """Join log likelihood, label, log birth and birth label of each run, all (n_dead of the run,)."""
+    def from_records(cls, parts: Sequence[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]) -> JoinedRecord:
+        """Join the records of all runs: log likelihood, label, log birth and birth label, (n_dead of the run,) each."""
         together = [np.concatenate(each) for each in zip(*parts, strict=True)]
         order = np.lexsort((together[1], together[0]))
         log_likelihood, label, log_birth, birth_label = (each[order] for each in together)
         n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
         return cls(order, log_likelihood, label, log_birth, birth_label, n_at_death)
 
-    def parents(self, parent: IntArray) -> IntArray:
+    def parents_in_joined_order(self, parent: IntArray) -> IntArray:
         """Convert rows of parents in the concatenated records, -1 for none, to rows in order of death, (n_dead,)."""
         place = np.argsort(self.order)
         return np.asarray(np.where(parent >= 0, place[parent], -1)[self.order])
@@ -224,7 +224,7 @@ def _require_mergeable(parts: Sequence[NestedResult]) -> list[object]:
                 "not what births and deaths give",
                 "complete runs of nested sampling, in the order of log likelihood and label",
             )
-        for one in seeds_of(result):
+        for one in generator_states_of(result):
             if one in seeds:
                 raise ParameterError(
                     f"seed_state of run {number}",
@@ -235,14 +235,14 @@ def _require_mergeable(parts: Sequence[NestedResult]) -> list[object]:
     return seeds
 
 
-def seeds_of(result: NestedResult) -> list[object]:
+def generator_states_of(result: NestedResult) -> list[object]:
     """Return the states of all generators that a result began with."""
     state = json.loads(result.seed_state)
     return state if isinstance(state, list) else [state]
 
 
-def _possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
-    """Pool the shares of the prior with nonzero likelihood: possible hypotheses over all drawn.
+def _pooled_log_possible_share(parts: Sequence[NestedResult]) -> tuple[float, float]:
+    """Pool the shares of the prior with nonzero likelihood; return the log of the pooled share and its error.
 
     A share s = m / n has the relative error sqrt((1 - s) / m), from which m follows; if all were
     possible, m is the number of live points.

@@ -16,11 +16,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise.nested.ascent import Top, climb_to_top, top_from_live_points
-from probewise.nested.beyond import higher_peaks
+from probewise.nested.beyond import find_higher_peaks
 from probewise.nested.evaluate import Evaluator, Points, Samplable
-from probewise.nested.hills import Hill, calls_to_weigh_hill, drawn_from_hill, evidence_not_met, weigh_hill
+from probewise.nested.hills import (
+    Hill,
+    calls_for_hill_evidence,
+    draw_from_hill,
+    estimate_hill,
+    log_evidence_of_unmet_hills,
+)
 from probewise.nested.importance import Posterior
-from probewise.nested.lost import lie_apart, scale_of_bulk, tops_from_early_points
+from probewise.nested.lost import are_beyond_dip, sds_of_next_dead_points, tops_from_early_points
 from probewise.nested.result import NestedResult
 
 DISAGREE = 2.5
@@ -34,7 +40,7 @@ _MISSING = 1.0  # errors by which a part that has no live points raises log Z, a
 
 
 @dataclass(frozen=True, eq=False)
-class Missing:
+class MissedHills:
     """Hills that a run has missed: parts `lost` by its live points, and narrow peaks `above` its end.
 
     `n_calls`: evaluations that were used to look for them.
@@ -46,14 +52,14 @@ class Missing:
 
     def doubts(self, run: Posterior) -> tuple[str, ...]:
         """Return a doubt in words for each kind of hill that would change log Z and that `run` has not met."""
-        lost, above = (evidence_not_met(hills, run) for hills in (self.lost, self.above))
+        lost, above = (log_evidence_of_unmet_hills(hills, run) for hills in (self.lost, self.above))
         mine, notes = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}", list[str]()
-        if raised_by(run, lost) > _MISSING:
+        if rise_in_errors(run, lost) > _MISSING:
             notes.append(
                 f"a part of the posterior that the live points have lost has a log Z of about {lost:.2f}, {mine}; "
                 "use more n_live or a greater max_cost"
             )
-        if raised_by(run, above) > DISAGREE:
+        if rise_in_errors(run, above) > DISAGREE:
             notes.append(
                 f"a narrow peak that no live point met lies above the run's end: its log Z is about {above:.1f}, "
                 f"{mine}; use more n_live or a prior about the peak"
@@ -61,19 +67,19 @@ class Missing:
         return tuple(notes)
 
 
-def raised_by(run: Posterior, log_z: float) -> float:
-    """Return by how many of its errors a part of evidence `log_z` that a run has not met raises its log Z."""
+def rise_in_errors(run: Posterior, log_z: float) -> float:
+    """Return by how many of its errors a run's log Z would rise with a part of log evidence `log_z` that it missed."""
     return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / max(run.log_z_error, 1e-12)
 
 
-def look_for_missing(
+def find_missed_hills(
     run: NestedResult,
     problem: Samplable,
     *,
     max_calls: float,
     rng: np.random.Generator,
     lost: tuple[Hill, ...] | None = None,
-) -> Missing:
+) -> MissedHills:
     """Look for parts of the posterior that a run has missed; nothing is found for a prior without an inverse.
 
     Parameters
@@ -93,7 +99,7 @@ def look_for_missing(
         If the likelihood fails.
     """
     if not run.names or not (hasattr(problem.prior, "to_unit_cube") or hasattr(problem.prior, "coordinates")):
-        return Missing()
+        return MissedHills()
     evaluate = Evaluator(problem)
 
     def calls_left(share: float = math.inf) -> int:
@@ -105,9 +111,9 @@ def look_for_missing(
         if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
             tops.append(top)
         lost = _hills_not_met(tops, run, evaluate, max_calls=calls_left(_WEIGHING_SHARE), rng=rng)
-    peaks = higher_peaks(run, top, evaluate, max_calls=calls_left(), rng=rng)
+    peaks = find_higher_peaks(run, top, evaluate, max_calls=calls_left(), rng=rng)
     above = _hills_not_met(peaks, run, evaluate, max_calls=calls_left(), rng=rng)
-    return Missing(lost, above, evaluate.n_calls)
+    return MissedHills(lost, above, evaluate.n_calls)
 
 
 def _hills_not_met(
@@ -116,13 +122,13 @@ def _hills_not_met(
     """Weigh the hills below these tops, each once and the highest first; return those that a run has not met."""
     hills, most = list[Hill](), evaluate.n_calls + max_calls
     rest = sorted(tops, key=lambda top: top.height)
-    scale = scale_of_bulk(run, evaluate.space)
-    while rest and evaluate.n_calls + calls_to_weigh_hill(len(run.names)) < most:
-        settled = drawn_from_hill(rest.pop(), evaluate, rng)
+    scale = sds_of_next_dead_points(run, evaluate.space)
+    while rest and evaluate.n_calls + calls_for_hill_evidence(len(run.names)) < most:
+        settled = draw_from_hill(rest.pop(), evaluate, rng)
         if rest:
             points = Points.join(*(top.highest for top in rest))
-            apart = lie_apart(points, settled, scale, 1, evaluate, rng)
+            apart = are_beyond_dip(points, settled, scale, 1, evaluate, rng)
             rest = [top for top, is_apart in zip(rest, apart, strict=True) if is_apart]
-        hill = weigh_hill(settled, evaluate, rng)
+        hill = estimate_hill(settled, evaluate, rng)
         hills += [] if hill is None or hill.is_met_by(run) else [hill]
     return tuple(hills)

@@ -49,7 +49,7 @@ def _fit_components(
     # A component borrows one sample's worth of the whole's covariance, scaled to a component's volume.
     borrowed = whole * n_components ** (-2.0 / n_params)
     for _ in range(n_iterations):
-        log_part, square = _component_densities(x, share, mean, root)
+        log_part, square = _log_densities_and_square_distances(x, share, mean, root)
         part = np.exp(log_part - log_part.max(axis=0))
         part *= weight / part.sum(axis=0)
         mass = part.sum(axis=1)
@@ -64,15 +64,15 @@ def _fit_components(
         lent = 1.0 if len(mass) > 1 else 0.0
         root = _cholesky_factors((covariance + lent * borrowed) / (mass + lent)[:, None, None])
         share = mass / mass.sum()
-    return _as_proposal(mean, root, share)
+    return _mixture_as_proposal(mean, root, share)
 
 
 def single_student_t(mean: FloatArray, covariance: FloatArray) -> Proposal:
     """Return one Student t distribution of this mean (n_params,) and covariance (n_params, n_params) of its kernel."""
-    return _as_proposal(mean[None], _cholesky_factors(covariance[None]), np.ones(1))
+    return _mixture_as_proposal(mean[None], _cholesky_factors(covariance[None]), np.ones(1))
 
 
-def _as_proposal(mean: FloatArray, root: FloatArray, share: FloatArray) -> Proposal:
+def _mixture_as_proposal(mean: FloatArray, root: FloatArray, share: FloatArray) -> Proposal:
     """Return a mixture as a proposal: means (k, n_params), Cholesky factors (k, n_params, n_params), shares (k,)."""
     log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
     clusters = Clusters(mean, root, np.asarray(np.linalg.inv(root)), log_det, np.ones(len(share), dtype=np.int64))
@@ -115,7 +115,7 @@ def _kmeans_start(
     return mass / mass.sum(), middle + centre @ whole_root.T, spread[:, None, None] * whole_root
 
 
-def _component_densities(
+def _log_densities_and_square_distances(
     x: FloatArray, share: FloatArray, mean: FloatArray, root: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Log of share times density up to a constant, and squared distance, of every component, both (k, n)."""

@@ -79,7 +79,7 @@ class PriorRejection:
         wanted, found, parts, n_evaluated = len(start), 0, [], 0
         while found < wanted:
             batch = int(1.1 * (wanted - found) / self.volume) + 1
-            tried = evaluate.from_prior(batch, rng)
+            tried = evaluate.draw_from_prior(batch, rng)
             kept = tried.take(bound.admits(tried.log_likelihood, tried.label))
             parts.append(kept)
             found += len(kept)
@@ -162,18 +162,18 @@ class SliceMove:
         walls = _bounds_of_coordinates(space)
         periodic = _PeriodicAxes.cut_where_empty(space.periodic, live)
         if periodic is not None:
-            live = periodic.wrapped(live)
-            start = replace(start, u=periodic.wrapped(start.u))
+            live = periodic.wrapped_at_cut(live)
+            start = replace(start, u=periodic.wrapped_at_cut(start.u))
         clusters = find_clusters(live)
         n_lines = max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
         kind = self._kinds_of_steps(n_chains, n_steps, n_hops, rng)
-        frames = _random_directions(kind == _FRAME, n_params, rng)
+        frames = _random_orthonormal_directions(kind == _FRAME, n_params, rng)
         axis = _axes_in_random_order(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
-        metrics = _Metrics.of(clusters, start.u, home, live)
+        metrics = _ClusterMetrics.from_clusters(clusters, start.u, home, live)
         line = np.empty((n_chains, n_params))
         low, high, level = np.empty(n_chains), np.empty(n_chains), np.empty(n_chains)
         step = np.zeros(n_chains, dtype=np.int64)
@@ -183,7 +183,7 @@ class SliceMove:
         def begin_step(rows: IntArray) -> None:
             """Set up the next step's line, bracket and level."""
             at = step[rows]
-            kinds, measure = kind[rows, at], metrics.row_of(rows, home[rows])
+            kinds, measure = kind[rows, at], metrics.rows_of_metrics(rows, home[rows])
             toward = np.zeros((rows.size, n_params))
             turned, along, follow = ((kinds == one).nonzero()[0] for one in (_FRAME, _AXIS, _DIFFERENCE))
             if turned.size:
@@ -208,13 +208,13 @@ class SliceMove:
         begin_step(active)
         while active.size:
             rows, n_ahead = active, min(_MOST_AHEAD, max(1, n_chains // (2 * active.size)))
-            t, below, above = _candidates_ahead(low[rows], high[rows], n_ahead, rng)
+            t, below, above = _draw_candidates_ahead(low[rows], high[rows], n_ahead, rng)
             low[rows], high[rows] = below, above
             chain = rows.repeat(n_ahead)
             ahead = now.u.take(rows, axis=0)[:, None, :] + t[:, :, None] * line.take(rows, axis=0)[:, None, :]
             candidate = ahead.reshape(-1, n_params)
             if periodic is not None:
-                candidate = periodic.wrapped(candidate)
+                candidate = periodic.wrapped_at_cut(candidate)
             if walls is not None:
                 np.clip(candidate, *walls, out=candidate)
             least = level[chain]
@@ -232,10 +232,10 @@ class SliceMove:
                     first = (hopping & ok).nonzero()[0]
                     who = chain[first]
                     goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
-                    candidate[first], log_growth = metrics.hop(who, now.u[who], home[who], goal[first])
+                    candidate[first], log_growth = metrics.map_between(who, now.u[who], home[who], goal[first])
                     if periodic is not None:
                         # Across the cut of a circle the reverse hop would differ.
-                        ok[first] &= (periodic.wrapped(candidate[first]) == candidate[first]).all(axis=1)
+                        ok[first] &= (periodic.wrapped_at_cut(candidate[first]) == candidate[first]).all(axis=1)
                     least[first] -= log_growth
                     if walls is not None:
                         ok[first] &= ((candidate[first] >= walls[0]) & (candidate[first] <= walls[1])).all(axis=1)
@@ -252,7 +252,7 @@ class SliceMove:
                 tried = evaluate.evaluate_mapped(candidate.take(pending, axis=0), theta, log_density, rng)
                 ok[pending] = bound.admits(tried.log_likelihood, tried.label)
                 n_evaluated += pending.size
-            n_needed, delivered = _candidates_used(ok.reshape(-1, n_ahead))
+            n_needed, delivered = _count_candidates_used(ok.reshape(-1, n_ahead))
             won = delivered.nonzero()[0]
             if won.size:
                 # A chain takes the first of its candidates above the bound.
@@ -271,7 +271,7 @@ class SliceMove:
             if more.size:
                 begin_step(more)
         if periodic is not None:
-            now = replace(now, u=periodic.home(now.u))
+            now = replace(now, u=periodic.wrapped_to_unit(now.u))
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
     def _kinds_of_steps(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
@@ -281,9 +281,11 @@ class SliceMove:
         kind[:, np.linspace(0, n_steps - 1, n_hops).astype(int)] = _HOP
         return kind
 
-    def longer(self) -> SliceMove:
+    def with_twice_the_steps(self) -> SliceMove:
         """Return the move with twice as many steps per chain."""
         return replace(self, steps_per_param=2.0 * self.steps_per_param, fewest_steps=2 * self.fewest_steps)
+
+    longer = with_twice_the_steps  # its earlier name
 
     def adapted(self, tally: Tally) -> SliceMove:
         """Adapt the bracket width towards `target` candidates per step."""
@@ -291,7 +293,7 @@ class SliceMove:
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
 
 
-def _candidates_ahead(
+def _draw_candidates_ahead(
     low: FloatArray, high: FloatArray, n_ahead: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Draw the next candidates on each line as if all before were rejected, (n, n_ahead), and the bracket if all are.
@@ -307,13 +309,13 @@ def _candidates_ahead(
     return t, low, high
 
 
-def _candidates_used(ok: BoolArray) -> tuple[IntArray, BoolArray]:
+def _count_candidates_used(ok: BoolArray) -> tuple[IntArray, BoolArray]:
     """Count the candidates, of (n, n_ahead), that each step used; also whether one was accepted, both (n,)."""
     delivered = np.asarray(ok.any(axis=1))
     return np.where(delivered, np.argmax(ok, axis=1) + 1, ok.shape[1]), delivered
 
 
-def _random_directions(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
+def _random_orthonormal_directions(needed: BoolArray, n_params: int, rng: np.random.Generator) -> FloatArray:
     """Draw rows of random orthogonal matrices where `needed`, (n_chains, n_steps), is true.
 
     Returns (n_chains, n_steps rounded up to whole matrices, n_params). Matrices of which no row is needed are not
@@ -334,7 +336,7 @@ def _axes_in_random_order(n_chains: int, n_steps: int, n_params: int, rng: np.ra
 
 
 @dataclass(frozen=True, eq=False)
-class _Metrics:
+class _ClusterMetrics:
     """The clusters' metrics for each chain: its own cluster is computed without the chain's starting point.
 
     A metric that includes the start stretches the lines through it and shrinks the others; with
@@ -352,13 +354,14 @@ class _Metrics:
     own_row: IntArray  # row of the start among the live points
 
     @classmethod
-    def of(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _Metrics:
+    def from_clusters(cls, clusters: Clusters, u: FloatArray, home: IntArray, live: FloatArray) -> _ClusterMetrics:
+        """Compute the metrics for chains that start at `u`, (n_chains, n_params), in clusters `home`, (n_chains,)."""
         same = np.logical_and.reduce(
             [of_live == of_start[:, None] for of_live, of_start in zip(live.T, u.T, strict=True)]
         )
         # A start that is not a live point is in no cluster.
         own_home = np.where(same.any(axis=1), home, -1)
-        each = clusters.joined(clusters.without_point_itself(u, home))
+        each = clusters.followed_by(clusters.leave_one_out(u, home))
         conditional = 1.0 / np.sqrt((each.inverse_root**2).sum(axis=1))
         return cls(
             each,
@@ -369,18 +372,20 @@ class _Metrics:
             np.argmax(same, axis=1),
         )
 
-    def row_of(self, rows: IntArray, home: IntArray) -> IntArray:
-        """Return the row of cluster `home`'s metric for chains `rows`; a start's own cluster is taken without it."""
+    def rows_of_metrics(self, rows: IntArray, home: IntArray) -> IntArray:
+        """Return for chains `rows` the row of the metric of cluster `home`, their own cluster without their start."""
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
-    def hop(self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
+    def map_between(
+        self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray
+    ) -> tuple[FloatArray, FloatArray]:
         """Map points to their counterparts in other clusters; also return the log of the volume ratio."""
-        return self.each.counterparts(u, self.row_of(rows, home), self.row_of(rows, goal))
+        return self.each.map_between(u, self.rows_of_metrics(rows, home), self.rows_of_metrics(rows, goal))
 
 
 @dataclass(frozen=True, eq=False)
 class _PeriodicAxes:
-    """Periodic coordinates, each cut where no live points are, so that no peak is split at the ends.
+    """Periodic coordinates, each cut in the widest gap between live points, so that no peak is split at the ends.
 
     A candidate is wrapped before it is evaluated, so that a step and its reverse use the same metric and clusters.
     """
@@ -400,13 +405,13 @@ class _PeriodicAxes:
         each = np.arange(len(columns))
         return cls(columns, (place[widest, each] + 0.5 * gap[widest, each]) % 1.0)
 
-    def wrapped(self, u: FloatArray) -> FloatArray:
+    def wrapped_at_cut(self, u: FloatArray) -> FloatArray:
         """Wrap coordinates into the period that begins at the cut."""
         u = u.copy()
         u[:, self.columns] = self.cut + (u[:, self.columns] - self.cut) % 1.0
         return u
 
-    def home(self, u: FloatArray) -> FloatArray:
+    def wrapped_to_unit(self, u: FloatArray) -> FloatArray:
         """Wrap coordinates into 0 to 1."""
         u = u.copy()
         u[:, self.columns] %= 1.0

@@ -165,7 +165,7 @@ def _named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool)
     elif isinstance(prior, Prior) or (hasattr(prior, "names") and hasattr(prior, "from_unit_cube")):
         made = prior  # type: ignore[assignment]
     elif isinstance(prior, Sequence) and not isinstance(prior, str | bytes):
-        made = _product_of(prior, given, names)
+        made = _product_of_list(prior, given, names)
     elif callable(prior) and not hasattr(prior, "logpdf"):
         if given is None:
             allowed = "the names of the parameters, since the prior is a function: names=['x', 'y']"
@@ -178,7 +178,7 @@ def _named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool)
     return made
 
 
-def _product_of(prior: Sequence[Any], given: tuple[str, ...] | None, names: Sequence[str] | None) -> Product:
+def _product_of_list(prior: Sequence[Any], given: tuple[str, ...] | None, names: Sequence[str] | None) -> Product:
     """Make a prior of a list of distributions; without names they are p0, p1, ..."""
     own = given if given is not None else tuple(f"p{i}" for i in range(len(prior)))
     if len(own) != len(prior):
@@ -195,7 +195,7 @@ def _as_marginal(name: str, one: Any) -> Marginal:
         return Uniform(float(one[0]), float(one[1]))
     if isinstance(one, Marginal):
         return one
-    if _is_scipy(one):
+    if _is_scipy_distribution(one):
         if hasattr(one, "freeze"):
             raise ParameterError(name, one, "a frozen distribution, with its parameters: scipy.stats.norm(0, 1)")
         return _ScipyMarginal(one)
@@ -207,7 +207,7 @@ def _as_marginal(name: str, one: Any) -> Marginal:
     )
 
 
-def _is_scipy(one: Any) -> bool:
+def _is_scipy_distribution(one: Any) -> bool:
     """Whether a value has the methods of a continuous distribution of scipy.stats."""
     quantile = hasattr(one, "ppf") or hasattr(one, "icdf")
     return quantile and hasattr(one, "cdf") and hasattr(one, "logpdf") and not isinstance(one, type)

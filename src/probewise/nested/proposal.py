@@ -80,7 +80,7 @@ def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) 
     )
 
 
-def find_parts(x: FloatArray) -> Clusters:
+def find_disconnected_clusters(x: FloatArray) -> Clusters:
     """Find the parts of a set of samples, (n_samples, n_params): its disconnected pieces, and their clusters.
 
     Pieces are the connected components of the nearest-neighbour graph, so they are found at any scale and in any number
@@ -93,15 +93,15 @@ def find_parts(x: FloatArray) -> Clusters:
 
     n_samples, n_params = x.shape
     if n_samples <= _LINKS:
-        return Clusters.of([x])
-    white = (x - x.mean(axis=0)) @ Clusters.of([x]).inverse_root[0].T
+        return Clusters.from_groups([x])
+    white = (x - x.mean(axis=0)) @ Clusters.from_groups([x]).inverse_root[0].T
     near = np.asarray(cKDTree(white).query(white, k=_LINKS + 1)[1])[:, 1:].ravel()
     links = coo_array((np.ones(near.size), (np.repeat(np.arange(n_samples), _LINKS), near)), 2 * (n_samples,))
     n_pieces, piece = connected_components(links, directed=False)
     large = [k for k in range(n_pieces) if (piece == k).sum() > 2 * n_params + 1]
     if len(large) < 2:
         return find_clusters(x)
-    home = Clusters.of([x[piece == k] for k in large]).assign(x)
+    home = Clusters.from_groups([x[piece == k] for k in large]).assign(x)
     return _joined_clusters([find_clusters(x[home == k]) for k in range(len(large))])
 
 
@@ -115,7 +115,7 @@ def _joined_clusters(parts: Sequence[Clusters]) -> Clusters:
     )
 
 
-def fit_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal, ...]:
+def fit_wide_and_narrow_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal, ...]:
     """Fit two proposals to samples, (n_samples, n_params): the best wide form and the best narrow form.
 
     Wide: one kernel per cluster, as wide as the cluster. Narrow: kernels at the samples, of Silverman's
@@ -138,7 +138,7 @@ def fit_proposals(x: FloatArray, *, rng: np.random.Generator) -> tuple[Proposal,
 
 def _fit_kernels(x: FloatArray, split: bool, scale: float | None) -> Proposal:
     """Fit one form of proposal: by cluster if `split`; one kernel each if `scale` is None, else at samples."""
-    clusters = find_parts(x) if split else Clusters.of([x])
+    clusters = find_disconnected_clusters(x) if split else Clusters.from_groups([x])
     home = clusters.assign(x)
     n_params = x.shape[1]
     centres, width = [], []

@@ -9,18 +9,18 @@ import numpy as np
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.importance import (
-    HeldOut,
+    HeldOutSamples,
     Posterior,
     Weighted,
+    draw_and_weigh,
     effective_lineages,
     inherited_doubts,
     resampled_for_fit,
-    split_samples,
-    weigh_draws,
-    with_loss_in_error,
+    split_off_held_out,
+    with_error_of_lost_parts,
 )
-from probewise.nested.missing import look_for_missing
-from probewise.nested.proposal import fit_proposals, mixture_of_proposals
+from probewise.nested.missing import find_missed_hills
+from probewise.nested.proposal import fit_wide_and_narrow_proposals, mixture_of_proposals
 from probewise.nested.result import NestedResult
 from probewise.nested.space import unbounded_space_of
 
@@ -85,12 +85,12 @@ def refine(
         raise ParameterError("n_pilots", n_pilots, "1 or more")
     space = unbounded_space_of(problem.prior)
     n_lineages = effective_lineages(result)
-    fitted, held = split_samples(result, n_lineages, space, rng)
+    fitted, held = split_off_held_out(result, n_lineages, space, rng)
     known = [fitted]
     for _ in range(n_pilots):
-        proposals = fit_proposals(np.concatenate(known), rng=rng)
+        proposals = fit_wide_and_narrow_proposals(np.concatenate(known), rng=rng)
         pilots = [
-            weigh_draws(p, 0.0, HeldOut.empty(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
+            draw_and_weigh(p, 0.0, HeldOutSamples.empty(), space, evaluate, n_draws=max(n_draws // 8, 50), rng=rng)
             for p in proposals
         ]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
@@ -100,13 +100,13 @@ def refine(
         best = mixture_of_proposals(proposals, [_FIRST if k == first else others for k in range(len(proposals))])
         if better.n_eff > 2 * len(evaluate.names):
             known.append(resampled_for_fit(better.theta, better.log_weight, space, rng))
-    found = with_loss_in_error(
-        weigh_draws(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng
+    found = with_error_of_lost_parts(
+        draw_and_weigh(best, 0.0, held, space, evaluate, n_draws=n_draws, rng=rng), n_lineages, space, rng
     )
     doubts = inherited_doubts(found, result)
     if look and isinstance(result, NestedResult) and result.check is None:
         # A generator of its own: the refined evidence is the same with and without the look.
-        missing = look_for_missing(result, problem, max_calls=result.n_calls, rng=rng.spawn(1)[0])
+        missing = find_missed_hills(result, problem, max_calls=result.n_calls, rng=rng.spawn(1)[0])
         found = replace(found, n_calls=found.n_calls + missing.n_calls)
         doubts = (*doubts, *missing.doubts(found))
     return replace(found, inherited=doubts)

@@ -65,7 +65,7 @@ class _StudentMixture:
 
     def log_densities(self, x: FloatArray) -> FloatArray:
         """Return each part's log density times its share, (n, n_params) -> (n_parts, n)."""
-        own = [_log_student(self.to_axes(x, part)) for part in range(len(self))]
+        own = [_student_t_log_density(self.to_axes(x, part)) for part in range(len(self))]
         return np.asarray(np.stack(own) + (np.log(self.share) - self.log_volume)[:, None])
 
     def log_density(self, x: FloatArray) -> FloatArray:
@@ -77,7 +77,7 @@ class _StudentMixture:
         return np.asarray(self.center[part] + np.einsum("nij,nj->ni", self.root[part], e))
 
     @staticmethod
-    def of(groups: Sequence[FloatArray], widening: float) -> _StudentMixture:
+    def from_groups(groups: Sequence[FloatArray], widening: float) -> _StudentMixture:
         """Compute mean and principal axes of groups of points, each (n, n_params)."""
         n = np.array([len(group) for group in groups])
         root = np.stack([principal_root(group, widening) for group in groups])
@@ -85,29 +85,30 @@ class _StudentMixture:
 
 
 @dataclass(frozen=True, eq=False)
-class _NearPrior:
-    """A prior near the posterior: the mixture `parts`; `plain` is the original one.
+class _PriorNearPosterior:
+    """A prior near the posterior: the mixture `parts` in unbounded coordinates; `original` is the problem's prior.
 
-    Chains move in coordinates along the principal axes of `whole`, the one part that all samples give.
+    Chains move in coordinates along the principal axes of `whole`, the mixture with one part for all samples.
     """
 
-    plain: Prior
+    original: Prior
     space: Space
     whole: _StudentMixture
     parts: _StudentMixture
 
     @property
     def names(self) -> tuple[str, ...]:
-        return self.plain.names
+        return self.original.names
 
     @property
-    def invertible(self) -> bool:
-        """Whether the axes have finite inverses: they have none where samples hardly vary."""
+    def has_invertible_axes(self) -> bool:
+        """Whether the matrices of the axes have finite inverses: they have none where samples hardly vary."""
         matrices = (m for each in (self.whole, self.parts) for m in (each.root, each.inverse_root))
         return all(bool(np.isfinite(matrix).all()) for matrix in matrices)
 
     @property
-    def coordinates(self) -> _NearPrior:
+    def coordinates(self) -> _PriorNearPosterior:
+        """Itself: it maps parameters to the coordinates of chains."""
         return self
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
@@ -134,7 +135,7 @@ class _NearPrior:
         return u
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        log_plain = self.plain.log_prob(theta)
+        log_plain = self.original.log_prob(theta)
         out = np.full(len(theta), -np.inf)
         possible = np.isfinite(log_plain)
         if possible.any():
@@ -147,9 +148,11 @@ class _NearPrior:
         return np.asarray(self.space.leave(x)[1] - self.parts.log_density(x))
 
     def enter(self, theta: FloatArray) -> FloatArray:
+        """Map parameters to coordinates along the axes of `whole`, both (n, n_params)."""
         return self.whole.to_axes(self.space.enter(theta), 0)
 
     def leave(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Map coordinates to parameters, (n, n_params); also return this prior's log density in them, (n,)."""
         x = self.whole.center[0] + e @ self.whole.root[0].T
         theta, log_plain = self.space.leave(x)
         log_density = self.parts.log_density(x) + self.whole.log_volume[0]
@@ -161,7 +164,7 @@ class Repartitioned:
     """A problem with the same evidence and posterior, but a prior near that posterior."""
 
     problem: Samplable
-    prior: _NearPrior
+    prior: _PriorNearPosterior
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
         """Log likelihood plus the log ratio of the priors, (n, n_params) -> (n,)."""
@@ -211,12 +214,12 @@ def repartitioned(
         raise ParameterError("theta", f"{n_different} different samples", f"{least} or more; run with more live points")
     space = unbounded_space_of(problem.prior)
     x = space.enter(theta)
-    whole = _StudentMixture.of([x], widening)
-    parts = _StudentMixture.of(groups_of(x), widening) if clustered else whole
-    return Repartitioned(problem, _NearPrior(problem.prior, space, whole, parts))
+    whole = _StudentMixture.from_groups([x], widening)
+    parts = _StudentMixture.from_groups(split_into_clusters(x), widening) if clustered else whole
+    return Repartitioned(problem, _PriorNearPosterior(problem.prior, space, whole, parts))
 
 
-def groups_of(x: FloatArray) -> list[FloatArray]:
+def split_into_clusters(x: FloatArray) -> list[FloatArray]:
     """Divide samples (n, n_params) into clusters, each with enough samples for its axes."""
     least = _SAMPLES_IN_CLUSTER * x.shape[1]
     clusters = find_clusters(x, least=least)
@@ -241,7 +244,7 @@ def root_of_covariance(covariance: FloatArray, scale: float = 1.0) -> FloatArray
     return np.asarray(scale * axes * sd)
 
 
-def _log_student(x: FloatArray) -> FloatArray:
+def _student_t_log_density(x: FloatArray) -> FloatArray:
     """Log density of independent Student t, (n, n_params) -> (n,)."""
     nu = _DEGREES_OF_FREEDOM
     each = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * math.log(nu * math.pi)

@@ -30,7 +30,7 @@ _PER_INSERTION = ("insertion_rank", "insertion_n_ranked")
 _ARRAYS = ("theta", *PER_POINT, *COUNTS, *_PER_INSERTION)
 
 
-def versions() -> dict[str, str]:
+def software_versions() -> dict[str, str]:
     """Return the versions of the software on which a run's numbers depend, by name."""
     return {
         "probewise": __version__,
@@ -93,7 +93,7 @@ class Check:
     n_calls: int
 
 
-def warning_of_few_possible(log_start: float, log_start_error: float, n_live: int) -> str | None:
+def warning_of_few_possible_draws(log_start: float, log_start_error: float, n_live: int) -> str | None:
     """Return a warning if fewer possible hypotheses than live points were drawn from the prior, else None.
 
     A share s of the prior, estimated from m possible hypotheses, has the relative error sqrt((1 - s) / m).
@@ -200,7 +200,8 @@ class NestedResult(DeadPoints):
             f"log Z        {self.log_z:.2f} ± {self.log_z_error:.2f}",
             f"information  {self.information:.2f} nats",
             f"samples      {self.n_dead}, effective sample size {self.n_eff:.0f}",
-            f"cost         {self.n_calls} likelihood evaluations, {self.n_live} live points{self._efficiency()}",
+            f"cost         {self.n_calls} likelihood evaluations, {self.n_live} live points"
+            f"{self._efficiency_in_words()}",
             f"memory       {self.memory:.2f} times the variance of independent points",
             f"stopped      {self.stop_reason}",
             f"insertion    p = {self.insertion_p_value:.2g}",
@@ -227,7 +228,7 @@ class NestedResult(DeadPoints):
             ]
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.warnings)])
 
-    def _efficiency(self) -> str:
+    def _efficiency_in_words(self) -> str:
         each = self.calls_per_live_point_and_nat
         return f", {each:.3g} for each live point and nat" if math.isfinite(each) else ""
 

@@ -27,14 +27,14 @@ from probewise._kinds import require_finite_number, require_rng, require_whole
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.importance import (
-    HeldOut,
+    HeldOutSamples,
     Weighted,
+    draw_and_weigh,
     effective_lineages,
     inherited_doubts,
     resampled_for_fit,
-    split_samples,
-    weigh_draws,
-    with_loss_in_error,
+    split_off_held_out,
+    with_error_of_lost_parts,
 )
 from probewise.nested.mixture import fit_mixture, single_student_t
 from probewise.nested.pose import AnyPrior, as_problem
@@ -43,11 +43,11 @@ from probewise.nested.repartition import repartitioned
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import least_live, run_once
 from probewise.nested.space import Space, unbounded_space_of
-from probewise.nested.weights import n_effective, power_bracket, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 
 _LEAST_CALLS = 5000
-# In more dimensions draws fill the space too thinly. On a curved ridge in five (Rosenbrock's) they missed up to a fifth
-# of the posterior without a sign, so no smaller error is claimed; and narrow parts are lost.
+# In more dimensions draws fill the space too thinly. On a curved ridge in five (Rosenbrock's) they missed up to 16 % of
+# the posterior without a sign, so the draws claim no smaller error; and narrow parts are lost.
 _DENSE, _LEAST_ERROR = 3, 0.1
 _THIN = (
     "in more than three dimensions the draws may have missed a narrow part of the posterior; "
@@ -65,7 +65,7 @@ _WIDENING = 1.5
 _WIDER, _DEFENSIVE, _FROM_POWER = 1.6, 0.25, 0.1
 _FIRST = 0.75
 _N_SAMPLES = 2000
-# Draws of two densities have two groups of weights, which a longer tail would mix: only its end tells of the variance.
+# Draws of two densities have two groups of weights, which a longer tail would mix: only its end shows the variance.
 _TAIL = 1.0
 # Where the error is this many times too large, or doubtful, the draws go into another fit, up to a number of them.
 _MUCH, _MOST_FITS = 1.3, 3
@@ -75,8 +75,8 @@ _MUCH, _MOST_FITS = 1.3, 3
 class _WeightedDraws:
     """Draws about the posterior.
 
-    In unbounded coordinates, (n, n_params), with log weights that sum to one, (n,); the least effective sample size of
-    all powers; the densities of the higher powers.
+    `x`, (n, n_params), in unbounded coordinates; `log_weight`, (n,), of weights that sum to one. `least`: the least
+    effective sample size at any power; `defensive`: the mixture of the densities fitted at the higher powers.
     """
 
     x: FloatArray
@@ -102,7 +102,7 @@ def run_slow(
     """Compute evidence and posterior of a problem in few evaluations, for likelihoods that take seconds.
 
     In up to ten dimensions it takes about as many evaluations for its error as the best peers, or fewer (measured on
-    six problems). In more than three the draws may miss a narrow part of the posterior, which is among their doubts:
+    six problems). In more than three the draws may miss a narrow part of the posterior, and carry a doubt that says so:
     use `run` where there may be one, and for fast likelihoods.
 
     Parameters
@@ -113,11 +113,11 @@ def run_slow(
     rng
         Source of randomness.
     error
-        Standard error of log Z at which the draws end; in more than three dimensions at least 0.1. No smaller error is
-        claimed.
+        Standard error of log Z at which the draws end; in more than three dimensions at least 0.1. The draws claim no
+        smaller error.
     max_calls
-        Limit of likelihood evaluations, 5000 or more; the error may end larger for it. Where draws do not reach the
-        posterior for half of it, an ordinary run with 100 live points follows.
+        Limit of likelihood evaluations, 5000 or more; at the limit the error may be larger than `error`. If half of it
+        does not suffice for draws to reach the posterior, an ordinary run with 100 live points or more follows.
     progress
         Called with the number of evaluations after every batch of draws.
     executor, n_workers
@@ -153,7 +153,7 @@ def run_slow(
         n_live = max(least_live(n_params), _N_LIVE_ALONE)
         alone = again(posed, n_live=n_live, max_calls=max_calls - evaluate.n_calls)
         return _weighted_from_run(alone, alone.log_likelihood, evaluate.n_calls + alone.n_calls)
-    rows = resampled(np.exp(explored.log_weight), _N_SAMPLES, rng)
+    rows = resampled_rows(np.exp(explored.log_weight), _N_SAMPLES, rng)
     near = repartitioned(posed, space.leave(explored.x[rows])[0])
     n_live = max(least_live(n_params), _N_LIVE)
     second = again(near, n_live=n_live, max_calls=max_calls - evaluate.n_calls)
@@ -175,7 +175,7 @@ def run_slow(
 
 
 def _weighted_from_run(run: NestedResult, log_likelihood: FloatArray, n_calls: int, k: float = math.inf) -> Weighted:
-    """Return a nested run's samples and evidence, in place of those of draws with Pareto k `k`."""
+    """Return a nested run's samples and evidence, in place of those of draws whose Pareto k is `k`."""
     return Weighted(
         run.names,
         run.theta,
@@ -202,14 +202,14 @@ def _draw_until_error(
 ) -> Weighted:
     """Draw from a density fitted to the explored draws and the second run's samples, until the error is as wanted."""
     n_params = len(evaluate.names)
-    fitted, held = split_samples(second, effective_lineages(second), space, rng)
+    fitted, held = split_off_held_out(second, effective_lineages(second), space, rng)
     n_known = int(n_effective(explored.log_weight))
-    known = [fitted, explored.x[np.unique(resampled(np.exp(explored.log_weight), n_known, rng))]]
-    draw = partial(weigh_draws, prior_share=0.0, space=space, evaluate=evaluate, rng=rng)
+    known = [fitted, explored.x[np.unique(resampled_rows(np.exp(explored.log_weight), n_known, rng))]]
+    draw = partial(draw_and_weigh, prior_share=0.0, space=space, evaluate=evaluate, rng=rng)
     for _ in range(_MOST_FITS):
         mixture = fit_mixture(np.concatenate(known), rng=rng)
         forms = [mixture, mixture.widened(_WIDER)]
-        pilots = [draw(form, held=HeldOut.empty(), n_draws=250 + 75 * n_params) for form in forms]
+        pilots = [draw(form, held=HeldOutSamples.empty(), n_draws=250 + 75 * n_params) for form in forms]
         first = int(np.argmax([pilot.n_eff for pilot in pilots]))
         share = np.full(2, 1.0 - _FIRST)
         share[first] = _FIRST
@@ -218,7 +218,7 @@ def _draw_until_error(
         left = max_calls - evaluate.n_calls
         n_draws = int(min(max(1.3 * variance / wanted**2, 500 * n_params), max(left, 100)))
         found = draw(best, held=held, n_draws=n_draws, tail=_TAIL)
-        found = with_loss_in_error(found, _LIKE_INDEPENDENT * explored.least, space, rng)
+        found = with_error_of_lost_parts(found, _LIKE_INDEPENDENT * explored.least, space, rng)
         if (not found.doubts and found.log_z_error < _MUCH * wanted) or left < 2 * n_draws or not found.n_eff > 1:
             break
         known.append(resampled_for_fit(found.theta, found.log_weight, space, rng))
@@ -226,7 +226,7 @@ def _draw_until_error(
 
 
 def _variance_of_weights(pilot: Weighted, drawn: Proposal, best: Proposal, space: Space) -> float:
-    """Estimate the variance of weights of mean one of draws from `best`, from weighted draws from another density."""
+    """Estimate the variance of the weights, of mean one, of draws from `best`; `pilot` are draws from `drawn`."""
     if not len(pilot.theta):
         return math.inf
     x = space.enter(pilot.theta)
@@ -237,16 +237,16 @@ def _variance_of_weights(pilot: Weighted, drawn: Proposal, best: Proposal, space
 def _draw_at_rising_powers(
     evaluate: Evaluator, space: Space, *, max_calls: int, report: Callable[[int], None], rng: np.random.Generator
 ) -> _WeightedDraws | None:
-    """Draw at rising powers of the likelihood until the draws weigh the posterior; None where the limit ends it."""
+    """Draw at rising powers of the likelihood until enough draws represent the posterior; None if the limit ends it."""
     n_params = len(evaluate.names)
     n_draws, wanted = 300 + 60 * n_params, 150 + 25 * n_params
-    draws = _Draws(evaluate, space)
-    draws.add(space.draw(2 * n_draws, rng=rng), None)
+    draws = _DrawsOfAllSources(evaluate, space)
+    draws.evaluate_and_add(space.draw(2 * n_draws, rng=rng), None)
     power, least, n_last, kept = 0.0, math.inf, 0, list[Proposal]()
     while True:
         report(evaluate.n_calls)
         last = power
-        power, log_weight = draws.tempered(wanted)
+        power, log_weight = draws.weigh_at_greatest_power(wanted)
         n_eff = n_effective(log_weight)
         n_last += power >= 1.0
         if n_last and (n_eff >= _ENOUGH * wanted or n_last > _MOST_LAST):
@@ -257,18 +257,18 @@ def _draw_at_rising_powers(
             return None
         if n_eff < _DENSE * n_params:
             # Too few possible hypotheses among the prior's draws.
-            draws.add(space.draw(n_draws, rng=rng), None)
+            draws.evaluate_and_add(space.draw(n_draws, rng=rng), None)
             continue
         least = min(least, n_eff)
         proposal = _fit_defensive_mixture(draws.x, log_weight, rng)
         if _FROM_POWER <= power < 1.0:
             kept.append(proposal)
-        draws.add(proposal.draw(n_draws, rng=rng), proposal)
+        draws.evaluate_and_add(proposal.draw(n_draws, rng=rng), proposal)
         if power < 2 * last:
             n_draws = int(min(_GROWTH * n_draws, _MOST_DRAWS))
 
 
-class _Draws:
+class _DrawsOfAllSources:
     """All draws so far, with the log density of every source at each of them, (n, n_sources)."""
 
     def __init__(self, evaluate: Evaluator, space: Space) -> None:
@@ -279,8 +279,8 @@ class _Draws:
         self._log_density, self._log_likelihood = np.empty(0), np.empty(0)
         self._log_q = np.empty((0, 0))
 
-    def add(self, x: FloatArray, source: Proposal | None) -> None:
-        """Evaluate draws, (n, n_params), from a density; None is the prior."""
+    def evaluate_and_add(self, x: FloatArray, source: Proposal | None) -> None:
+        """Evaluate draws `x`, (n, n_params), from the density `source` (None: the prior) and add them to the others."""
         theta, log_density = self._space.leave(x)
         log_likelihood = np.full(len(x), -np.inf)
         possible = np.isfinite(log_density)
@@ -295,8 +295,11 @@ class _Draws:
         self._sources.append(source)
         self._size.append(len(x))
 
-    def tempered(self, wanted: float) -> tuple[float, FloatArray]:
-        """Return the greatest power, 1 at most, at which the effective sample size is `wanted`, and the log weights."""
+    def weigh_at_greatest_power(self, wanted: float) -> tuple[float, FloatArray]:
+        """Weigh all draws by a power of the likelihood; return the power and the log weights, (n,).
+
+        It is the greatest power, 1 at most, at which the effective sample size is at least `wanted`.
+        """
         log_share = np.log(np.array(self._size) / sum(self._size))
         alive = np.flatnonzero(np.isfinite(self._log_likelihood))
         base = self._log_density[alive] - logsumexp(self._log_q[alive] + log_share, axis=1)
@@ -324,7 +327,7 @@ def _fit_defensive_mixture(x: FloatArray, log_weight: FloatArray, rng: np.random
     cut = np.minimum(log_weight[alive], float(logsumexp(log_weight)) - 0.5 * math.log(alive.size))
     weight = np.exp(cut - float(logsumexp(cut)))
     # Draws of little weight are thinned, and stand for the others.
-    rows = np.unique(resampled(weight, _MOST_FITTED, rng))
+    rows = np.unique(resampled_rows(weight, _MOST_FITTED, rng))
     x, weight = x[alive[rows]], np.maximum(weight[rows], 1.0 / _MOST_FITTED)
     weight = weight / weight.sum()
     off = x - weight @ x

@@ -24,12 +24,17 @@ from probewise._kinds import (
     require_whole,
 )
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested.checkpoint import CheckpointFile, Dead, Live, Origin, Run, settings_of
+from probewise.nested.checkpoint import BirthRecords, CheckpointFile, DeadOfRound, LivePoints, RunState, settings_of_run
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import chain_memory
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.result import NestedResult, versions, warning_of_few_lineages, warning_of_few_possible
+from probewise.nested.result import (
+    NestedResult,
+    software_versions,
+    warning_of_few_lineages,
+    warning_of_few_possible_draws,
+)
 from probewise.nested.stop import RemainingEvidence, RoundSummary, StopRule
 
 LIVE_PER_PARAM = 2
@@ -56,8 +61,8 @@ def move_at_volume(move: Move, log_volume: float) -> Move:
 
 
 def step(
-    live: Live, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
-) -> tuple[Live, Dead, Tally]:
+    live: LivePoints, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
+) -> tuple[LivePoints, DeadOfRound, Tally]:
     """Replace the `n_replaced` worst points by new ones above the best of them.
 
     The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is
@@ -79,16 +84,16 @@ def step(
     n_ranked = len(spared) + np.arange(n_replaced)
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
     n_at_death = n_live - np.arange(n_replaced)
-    dead = Dead(live.points.take(doomed), live.origin.take(doomed), n_at_death, rank, n_ranked)
-    known = live.origin.take(spared)
-    fresh = Origin(
+    dead = DeadOfRound(live.points.take(doomed), live.births.take(doomed), n_at_death, rank, n_ranked)
+    known = live.births.take(spared)
+    fresh = BirthRecords(
         np.full(n_replaced, bound.log_likelihood),
         np.full(n_replaced, bound.label),
-        live.origin.ident.max() + 1 + np.arange(n_replaced),
+        live.births.ident.max() + 1 + np.arange(n_replaced),
         known.ident[begin],
     )
     log_volume = float(log_volumes(n_at_death, live.log_volume)[-1])
-    return Live(points, Origin.join(known, fresh), log_volume), dead, tally
+    return LivePoints(points, BirthRecords.join(known, fresh), log_volume), dead, tally
 
 
 def run_once(
@@ -127,13 +132,13 @@ def run_once(
     n_params = len(evaluate.names)
     n_live, n_replaced = _require_counts(n_live, n_replaced, max_calls, n_params)
     rule = RemainingEvidence() if stop is None else stop
-    seed_state = json.dumps(plain_state(rng.bit_generator.state))
+    seed_state = json.dumps(generator_state_as_json(rng.bit_generator.state))
     if n_params == 0:
         return _result_without_parameters(evaluate, n_live, seed_state)
     moving: Move = SliceMove() if move is None else move
     keeper = None
     if checkpoint is not None:
-        settings = settings_of(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
+        settings = settings_of_run(evaluate.names, n_live, n_replaced, moving, rule, seed_state)
         with contextlib.suppress(OSError):  # `CheckpointFile` reports a folder that cannot be created
             Path(checkpoint).parent.mkdir(parents=True, exist_ok=True)
         keeper = CheckpointFile(Path(checkpoint), checkpoint_every_s, settings)
@@ -174,7 +179,7 @@ class _RunUnderWay:
     rule: StopRule
     seed_state: str
     keeper: CheckpointFile | None
-    now: Run
+    now: RunState
 
     def save(self) -> None:
         if self.keeper is not None:
@@ -251,7 +256,9 @@ def _require_options(
     require_flag("return_interrupted", return_interrupted)
 
 
-def _do_round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator) -> tuple[Run, RoundSummary]:
+def _do_round(
+    now: RunState, evaluate: Evaluator, n_replaced: int, rng: np.random.Generator
+) -> tuple[RunState, RoundSummary]:
     """Replace the worst points once and add the dead ones to the evidence; return the new state and its summary."""
     live, moving = now.live, now.moving
     move = move_at_volume(moving, live.log_volume)
@@ -292,7 +299,7 @@ def _do_round(now: Run, evaluate: Evaluator, n_replaced: int, rng: np.random.Gen
 
 def _first_live_points(
     evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator
-) -> Run:
+) -> RunState:
     """Draw the first live points from the part of the prior with nonzero likelihood.
 
     Impossible hypotheses (zero likelihood) are counted and discarded; the initial volume is the share
@@ -306,7 +313,7 @@ def _first_live_points(
     while found < n_live and drawn < most:
         share = max(found, 0.5) / drawn if drawn else 1.0
         batch = min(int(1.1 * (n_live - found) / share) + 1 if drawn else n_live, 4 * n_live, most - drawn)
-        tried = evaluate.from_prior(batch, rng)
+        tried = evaluate.draw_from_prior(batch, rng)
         possible = np.flatnonzero(np.isfinite(tried.log_likelihood))
         if found + possible.size > n_live:
             possible = possible[: n_live - found]
@@ -332,17 +339,17 @@ def _first_live_points(
         for _ in range(_MIXING):
             points, tally = move.draw(points, bound, points.u, evaluate, rng)
             move = move.adapted(tally)
-    live = Live(points, Origin.of_prior(n_live), log_volume)
-    return Run(live, (), move, log_volume, error, (), n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
+    live = LivePoints(points, BirthRecords.of_prior_draws(n_live), log_volume)
+    return RunState(live, (), move, log_volume, error, (), n_calls=evaluate.n_calls, rng_state=rng.bit_generator.state)
 
 
 def _final_result(
-    evaluate: Evaluator, now: Run, n_live: int, reason: str, seed_state: str, rng: np.random.Generator
+    evaluate: Evaluator, now: RunState, n_live: int, reason: str, seed_state: str, rng: np.random.Generator
 ) -> NestedResult:
     """Let the remaining live points die and compute the result."""
     live, dead, notes = now.live, now.dead, now.notes
     n_dead = sum(len(d.points) for d in dead)
-    few = warning_of_few_possible(now.log_start, now.log_start_error, n_live)
+    few = warning_of_few_possible_draws(now.log_start, now.log_start_error, n_live)
     if few is not None:
         notes = (*notes, few)
     if now.n_stuck > _STUCK_SHARE * n_dead:
@@ -355,9 +362,9 @@ def _final_result(
     evidence = integrate(
         log_likelihood, n_at_death, rng=rng, log_start=now.log_start, log_start_error=now.log_start_error
     )
-    origin = Origin.join(*(d.origin for d in dead), live.origin.take(order))
-    parent = np.where(origin.parent >= 0, np.argsort(origin.ident)[origin.parent], -1)
-    born = birth_rows(log_likelihood, label, origin.log_birth, origin.birth_label)
+    births = BirthRecords.join(*(d.births for d in dead), live.births.take(order))
+    parent = np.where(births.parent >= 0, np.argsort(births.ident)[births.parent], -1)
+    born = birth_rows(log_likelihood, label, births.log_birth, births.birth_label)
     remembered = chain_memory(parent, born, n_at_death, evidence.log_weight)
     empty = np.empty(0, dtype=np.int64)
     rank = np.concatenate([empty, *(d.rank for d in dead)])
@@ -379,8 +386,8 @@ def _final_result(
         log_likelihood=log_likelihood,
         log_weight=evidence.log_weight,
         label=label,
-        log_birth=origin.log_birth,
-        birth_label=origin.birth_label,
+        log_birth=births.log_birth,
+        birth_label=births.birth_label,
         parent=parent,
         n_at_death=n_at_death,
         log_start=now.log_start,
@@ -398,7 +405,7 @@ def _final_result(
         insertion_n_ranked=n_ranked,
         insertion_p_value=p_value,
         seed_state=seed_state,
-        versions=versions(),
+        versions=software_versions(),
         warnings=notes,
     )
 
@@ -434,13 +441,13 @@ def _result_without_parameters(evaluate: Evaluator, n_live: int, seed_state: str
         insertion_n_ranked=np.empty(0, dtype=np.int64),
         insertion_p_value=1.0,
         seed_state=seed_state,
-        versions=versions(),
+        versions=software_versions(),
         warnings=(),
     )
 
 
-def plain_state(value: object) -> object:
+def generator_state_as_json(value: object) -> object:
     """Convert a generator's state to JSON types."""
     if isinstance(value, dict):
-        return {str(key): plain_state(item) for key, item in value.items()}
+        return {str(key): generator_state_as_json(item) for key, item in value.items()}
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -123,7 +123,7 @@ class _Unbounded:
         return self.coordinates.leave(u)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        if isinstance(self.coordinates, _OwnPriorDraws):
+        if isinstance(self.coordinates, _DrawsFromPrior):
             return self.coordinates.draw(n, rng=rng)
         return self.enter(self.prior.from_unit_cube(rng.random((n, len(self.prior.names)))))
 
@@ -135,7 +135,7 @@ class _HasCoordinates(Protocol):
 
 
 @runtime_checkable
-class _OwnPriorDraws(Protocol):
+class _DrawsFromPrior(Protocol):
     """Coordinates that draw from the prior themselves, because some of them match no parameters."""
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...

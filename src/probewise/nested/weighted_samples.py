@@ -10,7 +10,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_number, require_rng, require_whole
 from probewise.errors import ParameterError
-from probewise.nested.weights import resampled, weighted_quantiles
+from probewise.nested.weights import resampled_rows, weighted_quantiles
 
 
 class WeightedSamples(ShowsItself):
@@ -33,7 +33,7 @@ class WeightedSamples(ShowsItself):
         """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
         require_rng(rng)
         n = require_whole("n", n)
-        return np.asarray(rng.permutation(resampled(self.weight, n, rng)))
+        return np.asarray(rng.permutation(resampled_rows(self.weight, n, rng)))
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order.

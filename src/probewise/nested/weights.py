@@ -33,7 +33,7 @@ def power_bracket(
     return low, high
 
 
-def resampled(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
+def resampled_rows(weight: FloatArray, n: int, rng: np.random.Generator) -> IntArray:
     """Draw rows by weight with systematic resampling, (n_weights,) -> (n,): counts are n w rounded up or down."""
     ladder = np.cumsum(weight)
     rows = np.searchsorted(ladder / ladder[-1], (np.arange(n) + rng.random()) / n, side="right")

@@ -9,7 +9,7 @@ from probewise.recordings.files import (
     write_recording,
 )
 from probewise.recordings.fingerprint import fingerprint
-from probewise.recordings.locking import locked
+from probewise.recordings.locking import hold_lock, locked
 from probewise.recordings.patterns import (
     Disc,
     HalfPlane,
@@ -25,7 +25,7 @@ from probewise.recordings.plan import Instrumentation, Plan, Recording
 from probewise.recordings.plans import paper_plan, two_way_plan
 from probewise.recordings.prediction import Prediction, read_prediction, write_prediction
 from probewise.recordings.shipping import shipped
-from probewise.recordings.strict_json import json_of, strict_json
+from probewise.recordings.strict_json import json_of, parse_json_file_text, parse_strict_json, strict_json
 from probewise.recordings.text import read_bytes, read_text
 
 __all__ = [
@@ -43,9 +43,12 @@ __all__ = [
     "Stripes",
     "Uniform",
     "fingerprint",
+    "hold_lock",
     "json_of",
     "locked",
     "paper_plan",
+    "parse_json_file_text",
+    "parse_strict_json",
     "read_bytes",
     "read_plan",
     "read_plan_and_readings",

@@ -9,7 +9,7 @@ import tempfile
 from io import FileIO
 from pathlib import Path
 
-from probewise._signals import deferred
+from probewise._signals import defer_signals
 from probewise.errors import FileError
 from probewise.recordings.locking import remove_unless_locked, try_lock
 
@@ -32,7 +32,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
     prefix = f".{path.name}."
     for left in path.parent.glob(f"{glob.escape(prefix)}*{_SUFFIX}"):
         remove_unless_locked(left)
-    with deferred():
+    with defer_signals():
         try:
             handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=prefix, suffix=_SUFFIX)
         except OSError as error:

@@ -21,7 +21,7 @@ _THE_ONLY = "pattern"  # name of a single pattern that was given without one
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "orientation_rad", "scan", "pattern", "time_s")
 
 
-class Table(Protocol):
+class TableLike(Protocol):
     """Columns by name: a dict of lists or arrays, or a data frame."""
 
     def keys(self) -> Iterable[Any]:
@@ -33,7 +33,7 @@ class Table(Protocol):
         ...
 
 
-def columns_of(table: Table) -> dict[str, Any]:
+def columns_by_name(table: TableLike) -> dict[str, Any]:
     """Return a table's columns by name.
 
     Raises ParameterError if it has no columns by name.
@@ -95,7 +95,7 @@ def dates_to_seconds(values: ArrayLike) -> ArrayLike:
     return values
 
 
-def own_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
+def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
     """Check a user's covariates: columns of one number per reading, by name.
 
     Raises ParameterError if they have no names, or if a name is that of a recording's own column, such as "x_mm".
@@ -129,7 +129,7 @@ def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
     return np.asarray(asked, dtype=np.int64)
 
 
-def covariates_of(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+def numeric_covariates(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
     """Return the numeric columns that are not a plan's own fields, and notes on the columns that are ignored."""
     out, notes = {}, []
     for name, values in columns.items():
@@ -158,7 +158,7 @@ def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[Int
     return np.cumsum(begins), tuple(cells[k] for k in starts)
 
 
-def named_patterns(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:
+def patterns_by_name(patterns: Mapping[str, Pattern] | Pattern) -> dict[str, Pattern]:
     """Return patterns by name; a single pattern lies under every reading.
 
     Raises ParameterError if there is none, or one is not a pattern.
@@ -196,11 +196,11 @@ def pattern_codes(names: str | Iterable[object] | None, patterns: Mapping[str, P
     code = {name: k for k, name in enumerate(known)}
     for cell in cells:
         if cell not in code:
-            raise ParameterError("pattern", cell, how_to_describe(cell, known))
+            raise ParameterError("pattern", cell, how_to_describe_pattern(cell, known))
     return np.array([code[cell] for cell in cells], dtype=np.int64)
 
 
-def how_to_describe(name: str, known: Sequence[str]) -> str:
+def how_to_describe_pattern(name: str, known: Sequence[str]) -> str:
     """Return, for an error message, what is allowed where a pattern is named but not described."""
     listed = ", ".join(map(repr, known)) or "none"
     return f"one that is described ({listed}); {name!r} is named but not described: pass patterns={{{name!r}: ...}}"

@@ -25,7 +25,7 @@ from probewise.recordings.patterns import (
     Uniform,
 )
 from probewise.recordings.plan import Instrumentation
-from probewise.recordings.strict_json import json_of
+from probewise.recordings.strict_json import parse_json_file_text
 from probewise.recordings.table import LARGEST
 from probewise.recordings.text import read_text
 
@@ -42,7 +42,7 @@ class Description:
     notes: tuple[str, ...] = ()
 
 
-def degrees_of(angle_rad: float) -> float:
+def shortest_degrees(angle_rad: float) -> float:
     """Convert to the degrees of fewest digits that convert back to exactly the same radians.
 
     The package works in radians and its files hold degrees; a plain conversion there and back
@@ -66,7 +66,7 @@ class _CheckedFields:
     def error_at(self, name: str, value: object, allowed: str) -> FileError:
         return FileError(self.path, f"{self.where}.{name} is {_shortened_json(value)}".lstrip("."), allowed)
 
-    def get(self, name: str, allowed: str) -> Any:
+    def required(self, name: str, allowed: str) -> Any:
         self.used.add(name)
         if name not in self.content:
             raise FileError(self.path, f"{self.where}.{name} is missing".lstrip("."), allowed)
@@ -77,7 +77,7 @@ class _CheckedFields:
         return self.content.get(name) is not None
 
     def number(self, name: str, allowed: str = "a finite number", ok: Callable[[float], bool] | None = None) -> float:
-        value = self.get(name, allowed)
+        value = self.required(name, allowed)
         if not _is_number(value) or (ok is not None and not ok(float(value))):
             raise self.error_at(name, value, allowed)
         return float(value)
@@ -87,18 +87,18 @@ class _CheckedFields:
 
     def pair(self, name: str) -> tuple[float, float]:
         allowed = "two finite numbers [x, y]"
-        value = self.get(name, allowed)
+        value = self.required(name, allowed)
         if not _is_pair(value):
             raise self.error_at(name, value, allowed)
         return float(value[0]), float(value[1])
 
     def text(self, name: str, allowed: str = "a text") -> str:
-        value = self.get(name, allowed)
+        value = self.required(name, allowed)
         if not isinstance(value, str):
             raise self.error_at(name, value, allowed)
         return value
 
-    def shades(self) -> tuple[float, float]:
+    def inside_and_outside_albedo(self) -> tuple[float, float]:
         inside = self.number("inside") if "inside" in self.content else 1.0
         outside = self.number("outside") if "outside" in self.content else 0.0
         return inside, outside
@@ -121,32 +121,36 @@ def _parse_uniform(f: _CheckedFields) -> Pattern:
 
 
 def _parse_half_plane(f: _CheckedFields) -> Pattern:
-    return HalfPlane(math.radians(f.number("normal_deg")), f.number("offset_mm"), *f.shades())
+    return HalfPlane(math.radians(f.number("normal_deg")), f.number("offset_mm"), *f.inside_and_outside_albedo())
 
 
 def _parse_quadrant(f: _CheckedFields) -> Pattern:
     direction = f.pair("direction")
     if any(abs(d) != 1 for d in direction):
         raise f.error_at("direction", f.content["direction"], "[1, 1], [1, -1], [-1, 1] or [-1, -1]")
-    return Quadrant(f.pair("corner_mm"), (int(direction[0]), int(direction[1])), *f.shades())
+    return Quadrant(f.pair("corner_mm"), (int(direction[0]), int(direction[1])), *f.inside_and_outside_albedo())
 
 
 def _parse_disc(f: _CheckedFields) -> Pattern:
-    return Disc(f.pair("center_mm"), f.positive("radius_mm"), *f.shades())
+    return Disc(f.pair("center_mm"), f.positive("radius_mm"), *f.inside_and_outside_albedo())
 
 
 def _parse_polygon(f: _CheckedFields) -> Pattern:
     allowed = "a list of at least three corners [x, y]"
-    vertices = f.get("vertices_mm", allowed)
+    vertices = f.required("vertices_mm", allowed)
     if not isinstance(vertices, list) or len(vertices) < 3 or not all(_is_pair(v) for v in vertices):
         raise f.error_at("vertices_mm", vertices, allowed)
-    return Polygon(tuple((float(x), float(y)) for x, y in vertices), *f.shades())
+    return Polygon(tuple((float(x), float(y)) for x, y in vertices), *f.inside_and_outside_albedo())
 
 
 def _parse_stripes(f: _CheckedFields) -> Pattern:
     duty = f.number("duty", "a number from 0 to 1", lambda v: 0 <= v <= 1)
     return Stripes(
-        math.radians(f.number("normal_deg")), f.positive("period_mm"), duty, f.number("phase_mm"), *f.shades()
+        math.radians(f.number("normal_deg")),
+        f.positive("period_mm"),
+        duty,
+        f.number("phase_mm"),
+        *f.inside_and_outside_albedo(),
     )
 
 
@@ -193,13 +197,13 @@ def read_description(path: Path) -> Description:
     Raises FileError if it is missing, does not parse, or a field is missing or invalid.
     """
     text = read_text(path, f"a description ({FORMAT}) beside the CSV, of the same name with the ending .json")
-    content = json_of(path, text, "strict JSON, each name once")
+    content = parse_json_file_text(path, text, "strict JSON, each name once")
     top = _CheckedFields(path, "", content)
     if top.text("format", f'"{FORMAT}"') != FORMAT:
         raise top.error_at("format", content["format"], f'"{FORMAT}"')
     patterns: dict[str, Pattern] = {}
     notes: list[str] = []
-    listed = top.get("patterns", "at least one pattern by name")
+    listed = top.required("patterns", "at least one pattern by name")
     for name, fields_of_it in _CheckedFields(path, "patterns", listed).content.items():
         if name != name.strip() or not name.isprintable():
             raise FileError(
@@ -276,7 +280,7 @@ def _pattern_fields(pattern: Pattern) -> dict[str, object]:
         if isinstance(value, np.ndarray):
             continue  # an image's pixels are in their own file
         if field.name.endswith("_rad"):
-            out[field.name.removesuffix("_rad") + "_deg"] = degrees_of(value)
+            out[field.name.removesuffix("_rad") + "_deg"] = shortest_degrees(value)
         elif field.name not in ("inside", "outside") or value != field.default:
             out[field.name] = value
     return out

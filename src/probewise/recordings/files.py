@@ -16,11 +16,11 @@ from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
-from probewise.recordings.description import Description, degrees_of, description_text, read_description
+from probewise.recordings.description import Description, description_text, read_description, shortest_degrees
 from probewise.recordings.images import image_bytes
 from probewise.recordings.patterns import Image
-from probewise.recordings.plan import Plan, Recording, range_text, require_plan, require_recording
-from probewise.recordings.table import LARGEST, MISSING, Table, count_numbers, csv_text, number_text, read_table
+from probewise.recordings.plan import Plan, Recording, range_in_words, require_plan, require_recording
+from probewise.recordings.table import LARGEST, MISSING, CSVTable, count_numbers, csv_text, number_text, read_table
 
 _KNOWN = ("reading", "x_mm", "y_mm", "orientation_deg", "scan", "pattern", "time_s")
 _LARGEST_PLACE_MM = 1e9
@@ -40,7 +40,7 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, notes = _read_with_json(_table_path(path), progress)
+    plan, readings, notes = _read_with_json(_require_csv_path(path), progress)
     if readings is None:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
@@ -49,7 +49,7 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
         inst = plan.instrumentation
         nothing = np.isnan(readings).all()
         found = "there is no reading at all" if nothing else "no reading is within the declared range"
-        raise FileError(path, found, f"at least one number in {range_text(inst.min, inst.max)}", column="reading")
+        raise FileError(path, found, f"at least one number in {range_in_words(inst.min, inst.max)}", column="reading")
     return replace(recording, notes=(*notes, *recording.notes_on_unusable_readings()))
 
 
@@ -61,7 +61,7 @@ def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    return _read_with_json(_table_path(path), progress)[0]
+    return _read_with_json(_require_csv_path(path), progress)[0]
 
 
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
@@ -72,7 +72,7 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, _ = _read_with_json(_table_path(path), progress)
+    plan, readings, _ = _read_with_json(_require_csv_path(path), progress)
     return plan, readings
 
 
@@ -134,7 +134,7 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     return columns | {name: _number_cells(name, values) for name, values in plan.covariates.items()}
 
 
-def _table_path(path: object) -> Path:
+def _require_csv_path(path: object) -> Path:
     """Return a file name as a Path; a table in memory is the usual mistake."""
     allowed = (
         "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), Recording.from_arrays(...)"
@@ -144,7 +144,7 @@ def _table_path(path: object) -> Path:
 
 def _degree_cells(angles_rad: FloatArray) -> list[str]:
     distinct, which = np.unique(angles_rad, return_inverse=True)  # few: each conversion is a search
-    cells = [number_text(degrees_of(angle)) for angle in distinct.tolist()]
+    cells = [number_text(shortest_degrees(angle)) for angle in distinct.tolist()]
     return [cells[k] for k in which.reshape(-1).tolist()]
 
 
@@ -190,7 +190,7 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     if path.suffix.lower() == ".json":
         raise FileError(path, "this is a description", "the name of the CSV beside it")
     table = read_table(path, progress=progress)
-    table.require("x_mm", "y_mm")
+    table.require_columns("x_mm", "y_mm")
     if not len(table):
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
     description = read_description(path.with_suffix(".json"))
@@ -199,11 +199,11 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     time_s = table.numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     for k, name in enumerate(scan_names):
         if not name.isprintable():
-            row = table.row(int(np.argmax(scan == k)))
+            row = table.row_number(int(np.argmax(scan == k)))
             raise FileError(path, shown(name), _A_NAME, row=row, column="scan")
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
-        notes.append(f"time_s runs backwards at row {table.row(int(back[0]) + 1)}")
+        notes.append(f"time_s runs backwards at row {table.row_number(int(back[0]) + 1)}")
     orientation_deg = table.numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
     plan = Plan(
         x_mm=table.numbers("x_mm", largest=_LARGEST_PLACE_MM),
@@ -223,23 +223,26 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     return plan, readings, notes
 
 
-def _note_on_far_place(table: Table, name: str, places_mm: FloatArray) -> list[str]:
+def _note_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> list[str]:
     """Return a note on a place so far from all others that it looks mistyped."""
     low, middle, high = np.quantile(places_mm, [0.05, 0.5, 0.95])
     k = int(np.argmax(np.abs(places_mm - middle)))
     if abs(places_mm[k] - middle) <= _FAR_AWAY * max(high - low, 1.0):
         return []
-    return [f"row {table.row(k)}: {name} is {places_mm[k]:g}, nine in ten of the others {low:g} to {high:g}: mistyped?"]
+    return [
+        f"row {table.row_number(k)}: {name} is {places_mm[k]:g}, "
+        f"nine in ten of the others {low:g} to {high:g}: mistyped?"
+    ]
 
 
-def _readings_column(table: Table, description: Description) -> FloatArray:
+def _readings_column(table: CSVTable, description: Description) -> FloatArray:
     inst = description.instrumentation
     # With a declared range a huge number is only unusable; without one it would spoil every sum.
     bounded = inst.min is not None and inst.max is not None
     return table.numbers("reading", missing=True, largest=None if bounded else LARGEST)
 
 
-def _scan_codes_in_file(table: Table) -> tuple[IntArray, tuple[str, ...]]:
+def _scan_codes_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
     """Assign scan numbers: every change of name begins a new scan, even if the name occurred before."""
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)
@@ -249,7 +252,7 @@ def _scan_codes_in_file(table: Table) -> tuple[IntArray, tuple[str, ...]]:
     return scan, tuple(cells[k] for k in (0, *(np.flatnonzero(changes) + 1)))
 
 
-def _pattern_codes_in_file(table: Table, description: Description) -> IntArray:
+def _pattern_codes_in_file(table: CSVTable, description: Description) -> IntArray:
     names = list(description.patterns)
     known = ", ".join(repr(name) for name in names)
     json_name = table.path.with_suffix(".json").name
@@ -267,12 +270,12 @@ def _pattern_codes_in_file(table: Table, description: Description) -> IntArray:
         k = next(k for k, cell in enumerate(cells) if cell in unknown)
         raise FileError(
             table.path, f"the pattern {shown(cells[k])} is not in {json_name}", f"one of {known}",
-            row=table.row(k), column="pattern",
+            row=table.row_number(k), column="pattern",
         )  # fmt: skip
     return np.fromiter(map(code.__getitem__, cells), dtype=np.int64, count=len(cells))
 
 
-def _covariate_columns(table: Table, notes: list[str]) -> dict[str, FloatArray]:
+def _covariate_columns(table: CSVTable, notes: list[str]) -> dict[str, FloatArray]:
     """Return every other numeric column; a column is numeric if most of its cells hold numbers."""
     out: dict[str, FloatArray] = {}
     for name in table.columns:

@@ -18,7 +18,7 @@ _RETRY_S = 0.05
 
 
 @contextlib.contextmanager
-def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator[None]:
+def hold_lock(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator[None]:
     """Hold an exclusive lock on a file or folder, by way of a lock file .NAME.lock beside it.
 
     The lock belongs to the open file and so ends with the process, however that ends. A killed process
@@ -39,7 +39,7 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
     path = Path(path)
     lock = path.with_name(f".{path.name}.lock")
     deadline_s = time.monotonic() + patience_s
-    while (handle := _locked_file(lock, path)) is None:
+    while (handle := _open_and_lock(lock, path)) is None:
         if time.monotonic() >= deadline_s:
             raise FileError(path, f"{_holder_in_words(lock)} is writing to it", "one process at a time")
         time.sleep(_RETRY_S)
@@ -52,7 +52,10 @@ def locked(path: str | os.PathLike[str], *, patience_s: float = 0.0) -> Iterator
         _release(handle, lock)
 
 
-def _locked_file(lock: Path, path: Path) -> int | None:
+locked = hold_lock  # its earlier name
+
+
+def _open_and_lock(lock: Path, path: Path) -> int | None:
     """Open and lock the lock file, and return its handle; None if another process holds the lock."""
     while True:
         try:

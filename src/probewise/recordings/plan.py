@@ -12,19 +12,19 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen, frozen_int, require_finite
 from probewise._display import ShowsItself
-from probewise._kinds import radians_meant, require_finite_number, require_kind
+from probewise._kinds import require_finite_number, require_kind, warn_of_likely_degrees
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
-    Table,
-    columns_of,
-    covariates_of,
+    TableLike,
+    checked_covariates,
+    columns_by_name,
     dates_to_seconds,
-    how_to_describe,
-    named_patterns,
+    how_to_describe_pattern,
     numbers_per_reading,
-    own_covariates,
+    numeric_covariates,
     parse_texts,
     pattern_codes,
+    patterns_by_name,
     require_patterns,
     row_numbers,
     scan_codes,
@@ -66,9 +66,11 @@ class Instrumentation:
         return "LEGO units" if self.unit == "LEGO" else self.unit
 
     @property
-    def ends(self) -> tuple[float, ...]:
-        """The ends of the range that are declared: two, one or none."""
+    def declared_ends(self) -> tuple[float, ...]:
+        """Least and greatest reading of the declared range, as far as they are declared: two, one or none."""
         return tuple(end for end in (self.min, self.max) if end is not None)
+
+    ends = declared_ends  # its earlier name
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,8 +187,8 @@ class Plan:
         x = numbers_per_reading("x_mm", x_mm, sizes[0] if sizes else 1)
         n_points = len(x)
         turns = numbers_per_reading("orientation_rad", orientation_rad, n_points)
-        radians_meant("orientation_rad", turns)
-        described = named_patterns(patterns)
+        warn_of_likely_degrees("orientation_rad", turns)
+        described = patterns_by_name(patterns)
         code, scan_names = scan_codes(scan, n_points)
         return cls(
             x_mm=x,
@@ -200,7 +202,7 @@ class Plan:
             pattern=pattern_codes(pattern, described, n_points),
             pattern_names=tuple(described),
             patterns=described,
-            covariates=own_covariates(covariates, n_points),
+            covariates=checked_covariates(covariates, n_points),
             instrumentation=Instrumentation(
                 unit=unit, min=min, max=max, step=step, sensor=sensor, height_mm=height_mm, controls=controls
             ),
@@ -375,7 +377,7 @@ class Recording(ShowsItself):
     @classmethod
     def from_table(
         cls,
-        table: Table,
+        table: TableLike,
         *,
         patterns: Mapping[str, Pattern] | Pattern,
         unit: str,
@@ -412,7 +414,7 @@ class Recording(ShowsItself):
         >>> list(recording.plan.covariates)
         ['battery_mv']
         """
-        columns = columns_of(table)
+        columns = columns_by_name(table)
         missing = [name for name in ("reading", "x_mm", "y_mm") if name not in columns]
         if missing:
             raise ParameterError(
@@ -423,7 +425,7 @@ class Recording(ShowsItself):
             if "orientation_rad" in columns:
                 raise ParameterError("columns", tuple(columns), "one of orientation_deg and orientation_rad")
             turn_rad = np.radians(numbers_per_reading("orientation_deg", turn_deg))
-        covariates, notes = covariates_of(columns)
+        covariates, notes = numeric_covariates(columns)
         recording = cls.from_arrays(
             x_mm=columns["x_mm"],
             y_mm=columns["y_mm"],
@@ -465,7 +467,7 @@ class Recording(ShowsItself):
         inst = self.plan.instrumentation
         n_missing = int(np.isnan(self.readings).sum())
         n_outside = len(self) - n_missing - int(self.usable.sum())
-        why = {"missing": n_missing, f"outside {range_text(inst.min, inst.max)}": n_outside}
+        why = {"missing": n_missing, f"outside {range_in_words(inst.min, inst.max)}": n_outside}
         return tuple(f"{n} reading{'s' if n > 1 else ''} {reason}, left out" for reason, n in why.items() if n)
 
     def summary(self) -> str:
@@ -480,10 +482,12 @@ class Recording(ShowsItself):
         """Return a recording of the same plan with other readings, (n_points,), NaN where one is left out."""
         return replace(self, readings=readings, notes=())
 
-    def unlimited(self) -> Self:
+    def without_declared_range(self) -> Self:
         """Return the recording without its declared range, since noise-free readings may exceed it slightly."""
         instrumentation = replace(self.plan.instrumentation, min=None, max=None)
         return replace(self, plan=replace(self.plan, instrumentation=instrumentation), notes=())
+
+    unlimited = without_declared_range  # its earlier name
 
     def take(self, rows: ArrayLike | slice) -> Self:
         """Select rows (numbers, truth values or a slice), in the given order."""
@@ -510,10 +514,10 @@ def require_described(plan: Plan) -> None:
     """Raise ParameterError where a pattern that occurs in the plan is not described."""
     for name, _ in plan.rows_by_pattern():
         if name not in plan.patterns:
-            raise ParameterError("pattern", name, how_to_describe(name, list(plan.patterns)))
+            raise ParameterError("pattern", name, how_to_describe_pattern(name, list(plan.patterns)))
 
 
-def range_text(low: float | None, high: float | None) -> str:
+def range_in_words(low: float | None, high: float | None) -> str:
     """Write a declared range in words; None where an end is not declared."""
     if low is None and high is None:
         return "any range"

@@ -97,9 +97,9 @@ def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArra
         If the file is missing, or a cell is not a valid number.
     """
     table = read_table(require_path("path", path))
-    table.require("mean", "sd", "log_density")
+    table.require_columns("mean", "sd", "log_density")
     mean, sd = table.numbers("mean"), table.numbers("sd")
     if np.any(sd <= 0):
         k = int(np.argmax(sd <= 0))
-        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.row(k), column="sd")
+        raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.row_number(k), column="sd")
     return mean, sd, table.numbers("log_density", missing=True)

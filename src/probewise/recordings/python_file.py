@@ -43,7 +43,7 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
     try:
         code = compile(text, str(path), "exec")
     except (SyntaxError, ValueError) as error:
-        found = f"is no Python: {error_text(error)}"
+        found = f"is no Python: {error_on_one_line(error)}"
         raise FileError(path, found, "a file that Python can run", row=getattr(error, "lineno", None)) from error
     module = ModuleType(f"probewise_file_{path.stem}")  # a prefix, so that serial.py cannot hide the package serial
     module.__file__ = str(path)
@@ -55,11 +55,11 @@ def run_python_text(text: str, path: Path) -> Mapping[str, Any]:
         exec(code, module.__dict__)
     except (Exception, SystemExit) as error:
         lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
-        found = f"stops with {type(error).__name__}: {error_text(error)}"
+        found = f"stops with {type(error).__name__}: {error_on_one_line(error)}"
         raise FileError(path, found, "a file that Python can run", row=lines[-1] if lines else None) from error
     return module.__dict__
 
 
-def error_text(error: BaseException) -> str:
+def error_on_one_line(error: BaseException) -> str:
     """Return an error's message on one line, cut where it is long."""
     return shortened(" ".join(str(error).split()), _LONGEST)

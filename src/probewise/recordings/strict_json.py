@@ -12,7 +12,9 @@ from probewise.errors import FileError, shown
 _MOST_DIGITS = 400  # more digits than any finite float has before the point
 
 
-def json_of(path: str | os.PathLike[str], text: str | bytes, allowed: str, *, row: int | None = None) -> Any:
+def parse_json_file_text(
+    path: str | os.PathLike[str], text: str | bytes, allowed: str, *, row: int | None = None
+) -> Any:
     """Parse a JSON text, or UTF-8 bytes, from a file.
 
     Parameters
@@ -30,7 +32,7 @@ def json_of(path: str | os.PathLike[str], text: str | bytes, allowed: str, *, ro
         If it is not strict JSON; see `strict_json`.
     """
     try:
-        return strict_json(text)
+        return parse_strict_json(text)
     except json.JSONDecodeError as error:
         found = f"does not parse as JSON: {error.msg} at character {error.colno}"
         raise FileError(path, found, allowed, row=error.lineno if row is None else row) from error
@@ -38,7 +40,7 @@ def json_of(path: str | os.PathLike[str], text: str | bytes, allowed: str, *, ro
         raise FileError(path, f"does not parse as JSON: {error}", allowed, row=row) from error
 
 
-def strict_json(text: str | bytes) -> Any:
+def parse_strict_json(text: str | bytes) -> Any:
     """Parse a JSON text, or UTF-8 bytes; a byte-order mark is skipped.
 
     Raises
@@ -92,3 +94,6 @@ def _parse_finite_number(digits: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"the number {shown(digits)} is beyond every float")
     return value
+
+
+json_of, strict_json = parse_json_file_text, parse_strict_json  # their earlier names

@@ -34,7 +34,7 @@ _CHUNK = 2_000  # rows read at a time: few enough for the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class CSVTable:
     """Cells by column, stripped of blanks; `rows` holds the row number of each record (header = 1), (n_rows,).
 
     Each column is one text, its cells joined by a character that does not occur in the file: a million separate texts
@@ -53,11 +53,11 @@ class Table:
         """Return the cells of a column."""
         return self.columns[name].split(self.separator) if len(self) else []
 
-    def row(self, k: int) -> int:
+    def row_number(self, k: int) -> int:
         """Return the row number of a record, the header being row 1."""
         return int(self.rows[k])
 
-    def require(self, *names: str) -> None:
+    def require_columns(self, *names: str) -> None:
         """Raise FileError if one of these columns is missing."""
         for name in names:
             if name not in self.columns:
@@ -98,7 +98,7 @@ class Table:
                 for k, cell in enumerate(cells)
                 if there[k] and not (_is_number(cell) and abs(float(cell)) <= most)
             )
-            raise FileError(self.path, _cell_words(cell), allowed, row=self.row(k), column=name)
+            raise FileError(self.path, _cell_in_words(cell), allowed, row=self.row_number(k), column=name)
         out = np.full(len(cells), math.nan)
         out[there] = values
         return out
@@ -125,11 +125,11 @@ def count_numbers(cells: Sequence[str]) -> int:
     return sum(n for cell, n in Counter(cells).items() if _is_number(cell))
 
 
-def _cell_words(cell: str) -> str:
+def _cell_in_words(cell: str) -> str:
     return shown(cell) if cell else "the cell is empty"
 
 
-def read_table(path: Path, *, progress: Progress = silent) -> Table:
+def read_table(path: Path, *, progress: Progress = silent) -> CSVTable:
     """Read a CSV file with one header row; blank lines are skipped.
 
     Raises FileError if there is no header, a column is repeated, a row is too short or too long, or quotes do not
@@ -148,7 +148,7 @@ def read_table(path: Path, *, progress: Progress = silent) -> Table:
         kept = np.delete(np.arange(len(records)), blank)
         if header is None and len(kept):
             header = [cell.strip() for cell in records[kept[0]]]
-            _check_header(path, header, n_read + int(kept[0]) + 1)
+            _require_distinct_columns(path, header, n_read + int(kept[0]) + 1)
             columns = [[] for _ in header]
             kept = kept[1:]
         wrong = kept[lengths[kept] != len(columns)]
@@ -167,7 +167,7 @@ def read_table(path: Path, *, progress: Progress = silent) -> Table:
     if header is None:
         raise FileError(path, "the file is empty", "a header row and one row per reading")
     joined = {name: separator.join(column) for name, column in zip(header, columns, strict=True)}
-    return Table(path, joined, separator, np.concatenate(rows))
+    return CSVTable(path, joined, separator, np.concatenate(rows))
 
 
 def _read_in_chunks(text: str) -> Iterator[tuple[list[list[str]], csv.Error | None]]:
@@ -187,7 +187,7 @@ def _read_in_chunks(text: str) -> Iterator[tuple[list[list[str]], csv.Error | No
         yield records, failed
 
 
-def _check_header(path: Path, header: Sequence[str], row: int) -> None:
+def _require_distinct_columns(path: Path, header: Sequence[str], row: int) -> None:
     seen: set[str] = set()
     for name in header:
         if name in seen:

@@ -15,13 +15,13 @@ _SIDES = {
 _EVEN = 1e-9
 
 
-def where_white(pattern: Pattern) -> str:
+def where_white_in_words(pattern: Pattern) -> str:
     """Say where a pattern is white, seen from above with x to the right and y up, in its own frame.
 
     Examples
     --------
     >>> from probewise.recordings import HalfPlane
-    >>> where_white(HalfPlane(0.0, 0.0))
+    >>> where_white_in_words(HalfPlane(0.0, 0.0))
     'white on the right, x > 0 mm, black elsewhere'
     """
     match pattern:

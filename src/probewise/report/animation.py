@@ -11,7 +11,7 @@ from PIL import Image
 from probewise.errors import ParameterError
 
 
-def gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -> bytes:
+def animated_gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -> bytes:
     """Join PNGs into a GIF that loops for ever.
 
     Parameters

@@ -16,7 +16,7 @@ from probewise.report.words import count, number, typeset
 _CURED_BY = "The fewest extra readings that would help"
 
 
-def answer(audit: PlanAudit) -> str:
+def summary_sentence(audit: PlanAudit) -> str:
     """Summarise in at most twenty words: how many effects are fine, aliased or invisible, and what would help."""
     n_fine, n_aliased = len(audit.seen_as("fine")), len(audit.seen_as("aliased"))
     n_invisible = len(audit.seen_as("invisible"))
@@ -57,7 +57,7 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
     sections = [
         Section("Effects that cannot be told apart", _alias_classes(audit))
         if audit.classes is not None
-        else Section(_CURED_BY, _cures(audit)),
+        else Section(_CURED_BY, _advice(audit)),
         Section("Every effect", (audit_table(audit.effects, audit.words.null),)),
         Section(
             "What was assumed",
@@ -76,8 +76,8 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
     known: set[str] = set()
     return page(
         f"Audit of {source}",
-        answer=answer(audit),
-        key_figure=fragment(shown, *explain_new_terms(f"{answer(audit)} {shown}", known)),
+        answer=summary_sentence(audit),
+        key_figure=fragment(shown, *explain_new_terms(f"{summary_sentence(audit)} {shown}", known)),
         sections=with_explanations(sections, known),
     )
 
@@ -90,7 +90,7 @@ def _alias_classes(audit: PlanAudit) -> tuple[Markup, ...]:
     return (paragraph(opening), table(("class", "effects"), rows))
 
 
-def _cures(audit: PlanAudit) -> tuple[Markup, ...]:
+def _advice(audit: PlanAudit) -> tuple[Markup, ...]:
     plan = audit.cure_plan
     if plan is None:
         if all(effect.detectability == "fine" for effect in audit.effects):

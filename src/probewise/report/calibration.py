@@ -32,7 +32,7 @@ from probewise.report.words import (
 )
 
 
-def answer(sensor: FittedSensor) -> str:
+def summary_sentence(sensor: FittedSensor) -> str:
     """Say in one sentence what the calibration found."""
     n = sensor.n_gaussians
     said = f"The evidence favours {count(n, 'Gaussian')}"
@@ -195,7 +195,7 @@ def write_page(
     """Write the whole page."""
     return page(
         f"Calibration of {PurePath(calibration.sensor.source).name or 'a sensor'}",
-        answer=answer(calibration.sensor),
+        answer=summary_sentence(calibration.sensor),
         key_figure=figure(
             drawn["ssf.png"],
             "Spatial sensitivity function (SSF): how much each point below the sensor counts in a reading. White "

@@ -6,10 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from probewise.challenge import Estimate, Row, by_effect, confusion, reliability
-from probewise.challenge.scoring import effects_to_name, leading, leading_name_right, names_match
-from probewise.challenge.systems import family_of
-from probewise.challenge.systems.table import gains_of
+from probewise.challenge import Estimate, Row, confusion_counts, detected_and_named_by_effect, reliability_bins
+from probewise.challenge.scoring import effects_to_name, leading_hypothesis, leading_name_right, names_match
+from probewise.challenge.systems import name_without_target
+from probewise.challenge.systems.table import gains_on_held_out_runs
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
 from probewise.report.plots import confusion_matrix, png, reliability_diagram
@@ -21,7 +21,7 @@ Results = Sequence[Mapping[str, Any]]
 _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: ""}
 
 
-def answer(rows: Sequence[Row], n_cases: int) -> str:
+def summary_sentence(rows: Sequence[Row], n_cases: int) -> str:
     """Summarise in one sentence how many targets are met."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
@@ -72,7 +72,7 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
     sections = [Section("The table", (table_of_rows(rows), _legend()))]
     if done:
         drawn = figure(
-            png(confusion_matrix(*confusion(done, label=family_of if systems else str))),
+            png(confusion_matrix(*confusion_counts(done, label=name_without_target if systems else str))),
             "Rows: what was concealed. Columns: the most probable hypothesis. An alias of the truth counts as the "
             "truth." + (" Targets are left out." if systems else ""),
         )
@@ -87,13 +87,13 @@ def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: 
         sections.append(Section("Cases that failed", (definition_list(failures),)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
     honest = figure(
-        png(reliability_diagram(reliability(done))),
+        png(reliability_diagram(reliability_bins(done))),
         "How often the most probable hypothesis was right, against the probability stated for it, with 95 % intervals.",
     )
     known: set[str] = set()
     return page(
         "How good a diagnosis is",
-        answer=answer(rows, len(results)),
+        answer=summary_sentence(rows, len(results)),
         key_figure=fragment(honest, *explain_new_terms(honest, known)),
         sections=with_explanations(sections, known),
     )
@@ -104,7 +104,7 @@ def _effect_table(done: Results) -> Markup:
         ("effect", "cases", "detected at alpha .01", "named first"),
         (
             (name, str(detected.n), *(f"{_value_text(e)} ({_interval_text(e)})" for e in (detected, named)))
-            for name, (detected, named) in by_effect(done).items()
+            for name, (detected, named) in detected_and_named_by_effect(done).items()
         ),
     )
 
@@ -130,9 +130,9 @@ def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
     begun = (str(number), result.get("system", ""), concealed, f"{result['size']:g}" if result["size"] else "")
     if "failed" in result:
         return (*begun, f"failed: {result['failed']}", "", "no", "")
-    names, probability = leading(result, clean=True)
+    names, probability = leading_hypothesis(result, clean=True)
     right = leading_name_right(result) if result["hidden"] else names_match(names, effects_to_name(result, merged=True))
-    gains = gains_of(result, "right")
+    gains = gains_on_held_out_runs(result, "right")
     said = " and ".join(names) or "clean"
     return (
         *begun,

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import doubt_beside_trust, png
+from probewise.report.plots import doubt_against_trust, png
 from probewise.report.plots.concealed import row_name
 from probewise.report.words import count
 from probewise.study import ConcealedRow
 
 
-def answer(rows: Sequence[ConcealedRow]) -> str:
+def summary_sentence(rows: Sequence[ConcealedRow]) -> str:
     """Summarise in one sentence how many runs ended sure and wrong, with full trust in the sensor and with less."""
     wrong = {doubts: _wrong_count([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)}
     return (
@@ -23,7 +23,7 @@ def answer(rows: Sequence[ConcealedRow]) -> str:
 def write_page(rows: Sequence[ConcealedRow], *, command: str) -> str:
     """Write the whole page; `command` is what made it."""
     drawn = figure(
-        png(doubt_beside_trust(rows)),
+        png(doubt_against_trust(rows)),
         "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
         "the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals promise.",
     )
@@ -31,7 +31,7 @@ def write_page(rows: Sequence[ConcealedRow], *, command: str) -> str:
         Section("The table", (_comparison_table(rows), _legend())),
         Section("How it was made", (definition_list([("command", command)]),)),
     ]
-    return page("A robot with a concealed fault", answer=answer(rows), key_figure=drawn, sections=sections)
+    return page("A robot with a concealed fault", answer=summary_sentence(rows), key_figure=drawn, sections=sections)
 
 
 def _wrong_count(rows: Sequence[ConcealedRow]) -> str:

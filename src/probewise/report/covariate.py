@@ -42,7 +42,7 @@ def covariate_unit(name: str, unit: str) -> str:
     return known.get(name, SUFFIXES.get(name.rpartition("_")[2], ""))
 
 
-def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
+def covariate_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
     """Return the name of a covariate in words and its unit, "" if none is known."""
     unit, apparatus = diagnosis.recording.plan.instrumentation.unit, diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
@@ -51,9 +51,9 @@ def words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]:
     return apparatus.words.covariate(name), units.get(name, "")
 
 
-def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
+def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
     """Return an axis label: the covariate and its unit."""
-    said, unit = words_and_unit(diagnosis, name)
+    said, unit = covariate_words_and_unit(diagnosis, name)
     run = diagnosis.apparatus.words.run
     said += f", {run} {scan}" if scan is not None and name != run else ""
     return said + (f" ({unit_name(unit)})" if unit else "")
@@ -62,8 +62,8 @@ def label_of(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
 def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
     """Return the covariate of each place in `diagnosis.where`, (n_points,), by the name of the place's figure.
 
-    Rows that a place does not cover are NaN. The values are those by which the diagnosis found the place. Computed
-    from another estimate of the sensor, a slope, for instance, could lie on the other side of an interval's end.
+    Rows that a place does not cover are NaN. The values are those by which the diagnosis found the place. If they
+    were recomputed from another estimate of the sensor, a slope near an interval's end could fall on its other side.
     """
     usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:

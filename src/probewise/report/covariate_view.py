@@ -11,8 +11,8 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import ALARM, Diagnosis, Place
 from probewise.effects import UNNAMED, public_name
 from probewise.recordings import Plan
-from probewise.report.covariate import category_names, covariate_values, label_of, words_and_unit
-from probewise.report.residual_means import Means, mean_residuals
+from probewise.report.covariate import axis_label, category_names, covariate_values, covariate_words_and_unit
+from probewise.report.residual_means import ResidualMeans, mean_residuals
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
 
@@ -69,7 +69,7 @@ class ResidualNoise:
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
         return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, diagnosis.recording.plan))
 
-    def means(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> Means:
+    def means(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
         """Average the residuals of a diagnosis along a covariate."""
         return mean_residuals(
             view.at,
@@ -101,7 +101,7 @@ def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateV
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_view_by_change(diagnosis))
     if not found:
-        return CovariateView(np.array(diagnosis.repair.before.readings), label_of(diagnosis, "level"))
+        return CovariateView(np.array(diagnosis.repair.before.readings), axis_label(diagnosis, "level"))
     sizes = [chance.means(diagnosis, view, after=False).largest_in_sds for view in found]
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
 
@@ -141,7 +141,7 @@ def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[
 def view_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
     """Build the view of a place along its covariate, (n_points,)."""
     unit = diagnosis.recording.plan.instrumentation.unit
-    label = label_of(diagnosis, place.covariate, place.scan)
+    label = axis_label(diagnosis, place.covariate, place.scan)
     if place.without_effect:
         label = f"reading to be expected without it ({unit_name(unit)})"
     names = category_names(diagnosis, place)
@@ -159,17 +159,17 @@ def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None)
         at = np.full(len(plan), np.nan)
         at[rows] = plan.time_s[rows]
         whole = scan if plan.run is not None else None
-        return CovariateView(at, label_of(diagnosis, "time" if plan.has_time else "row", whole), place=place)
+        return CovariateView(at, axis_label(diagnosis, "time" if plan.has_time else "row", whole), place=place)
     x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
     along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
-    if not is_line(plan, rows):
+    if not is_along_line(plan, rows):
         along, label = plan.time_s[rows], "time (s)"
     at = np.full(len(plan), np.nan)
     at[rows] = along
     return CovariateView(at, f"{label}, scan {scan}", place=place)
 
 
-def is_line(plan: Plan | RunTable, rows: IntArray) -> bool:
+def is_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
     """Return whether the rows of one scan lie on a line, at three or more places; True for the rows of a table."""
     if isinstance(plan, RunTable):
         return True
@@ -220,7 +220,7 @@ def _waves_of_table(
     A wave in time folds the time; a column's periodic error folds that column.
     """
     if found.get("hz", 0.0) > 0:
-        return [(table.time_s, 1 / found["hz"], *words_and_unit(diagnosis, "time"))]
+        return [(table.time_s, 1 / found["hz"], *covariate_words_and_unit(diagnosis, "time"))]
     column = public_name(effect).partition(":")[2]
     return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
 

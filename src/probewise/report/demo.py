@@ -63,7 +63,7 @@ _SENSOR = (
 )
 
 
-def answer(searches: Sequence[RobotSearch]) -> str:
+def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     """Summarise in one sentence how many readings the SSF model saves, after the same first reading."""
     naive, ssf = (len(s.run.steps) - 1 for s in searches)
     how = "" if all(s.run.reached for s in searches) else " (not every run reached that)"
@@ -95,14 +95,14 @@ def main_findings(
     """Return the page's main findings, for other pages to quote."""
     return {
         "seed": seed,
-        "search": answer(started_alike),
+        "search": summary_sentence(started_alike),
         "equal_readings": equal_readings_text(started_alike),
         "verdict": diagnosis.verdict,
         "combination": "+".join(diagnosis.combination),
         "concealed": concealed,
-        "diagnosis": diagnosis_report.answer(diagnosis),
+        "diagnosis": diagnosis_report.summary_sentence(diagnosis),
         "reason": typeset(diagnosis.reason),
-        "doubt": doubt_report.answer(doubt),
+        "doubt": doubt_report.summary_sentence(doubt),
     }
 
 
@@ -287,7 +287,7 @@ def write_page(
     )
     return page(
         "Modeling a sensor to improve its efficacy",
-        answer=answer(started_alike),
+        answer=summary_sentence(started_alike),
         key_figure=figure(drawn["equal_readings.png"], caption),
         sections=sections,
     )
@@ -323,7 +323,7 @@ def _sensor_section(
             ),
         ),
     )
-    said = calibration_report.answer(calibration.sensor)
+    said = calibration_report.summary_sentence(calibration.sensor)
     return Section("The sensor", (paragraph(_SENSOR), paragraph(said)), (apparatus, taken, *shown[:-1]))
 
 
@@ -391,7 +391,7 @@ def _search_section(
 
 def _diagnosis_section(diagnosis: Diagnosis, drawn: Mapping[str, bytes], concealed: str) -> Section:
     said = (
-        paragraph(diagnosis_report.answer(diagnosis)),
+        paragraph(diagnosis_report.summary_sentence(diagnosis)),
         paragraph(
             f"The simulated world that made this recording concealed: {concealed.replace('_', ' ')}. The diagnosis did "
             "not know that."

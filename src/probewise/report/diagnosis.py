@@ -21,9 +21,9 @@ from probewise.diagnosis import (
     p_in_words,
 )
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
-from probewise.effects.vocabulary import give_or_take
+from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
-from probewise.report.covariate import family_words, words_and_unit
+from probewise.report.covariate import covariate_words_and_unit, family_words
 from probewise.report.covariate_view import ResidualNoise, places_in_order
 from probewise.report.diagnosis_figures import figures, first_figure_content
 from probewise.report.effect_words import (
@@ -38,7 +38,7 @@ from probewise.report.html import Markup, Section, definition_list, element, fig
 from probewise.report.terms import explain_new_terms, with_explanations
 from probewise.report.words import count, number, probability, typeset, unit_name
 
-__all__ = ["answer", "figures", "sections", "write_page"]
+__all__ = ["figures", "sections", "summary_sentence", "write_page"]
 
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
@@ -57,7 +57,7 @@ _NOISE_CAPTIONS = {
 }
 
 
-def answer(diagnosis: Diagnosis) -> str:
+def summary_sentence(diagnosis: Diagnosis) -> str:
     """Return the verdict in twenty words at most."""
     return headline(diagnosis)
 
@@ -100,7 +100,7 @@ def write_page(
     first = fragment(figure(drawn["first.svg"], _first_caption(diagnosis)), definition_list(_facts(diagnosis)))
     return page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
-        answer=answer(diagnosis),
+        answer=summary_sentence(diagnosis),
         key_figure=fragment(first, *explain_new_terms(f"{diagnosis.verdict} {first}", known)),
         sections=with_explanations([*sections(diagnosis, drawn), *design, run], known),
     )
@@ -163,7 +163,7 @@ def _simulator_facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 def _formula_in_words(formula: Formula) -> str:
     """Write a formula with its estimated parameters."""
-    numbers = ", ".join(f"{p.name} = {give_or_take(p.mean, p.sd)}" for p in formula.parameters)
+    numbers = ", ".join(f"{p.name} = {value_with_sd(p.mean, p.sd)}" for p in formula.parameters)
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
     held_out = f"{formula.heldout_log_density_per_reading:+.3f} nats per held-out reading"
     gained = f"log evidence {formula.log_evidence:+.1f} nats, {held_out}"
@@ -185,7 +185,7 @@ def _prediction_in_words(nats: float, sd: float) -> str:
 
 
 def _signed_nats(nats: float, sd: float) -> str:
-    written = give_or_take(nats, sd)
+    written = value_with_sd(nats, sd)
     return f"{typeset(written if written.startswith('-') else f'+{written}')} nats"
 
 
@@ -313,7 +313,7 @@ def _evidence_comparison(diagnosis: Diagnosis) -> tuple[Markup, ...]:
                     hypothesis_in_words(w.effects),
                     str(w.n_gaussians or "–"),
                     number(w.laplace, 2),
-                    typeset(give_or_take(w.nested, w.error)),
+                    typeset(value_with_sd(w.nested, w.error)),
                     ("yes" if w.agree else "no") + (f" ({'; '.join(w.doubts)})" if w.doubts else ""),
                 )
                 for w in diagnosis.report.weighings
@@ -399,7 +399,8 @@ def _noise_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[M
     names = () if noise.model == "white" else tuple(noise.model.split("+"))
     model = join_names(map(effect_in_words, names)) if names else "white: independent, with one sd"
     rows = (
-        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value(p)) for p in noise.parameters
+        (p.name.replace("_", " "), "" if p.unit == "1" else unit_name(p.unit), *_value_and_interval(p))
+        for p in noise.parameters
     )
     return (
         paragraph(typeset(f"Noise model: {model}. Test of the residuals against it: {p_in_words(noise.p_value)}.")),
@@ -428,7 +429,7 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
             probability(effect.probability) if k == 0 else "",
             number(effect.size_lambda, 1) if k == 0 else "",
             p.name.removesuffix(f"_{p.unit}").replace("_", " "),
-            *(_value(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
+            *(_value_and_interval(p, unit=True) if p.name != "scans" else (", ".join(effect.scans), "")),
         )
         for effect in effects
         for k, p in enumerate(effect.parameters)
@@ -442,11 +443,11 @@ def _words_and_name(name: str) -> str:
     return f"{said} ({name})" if said != name else name
 
 
-def _value(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
+def _value_and_interval(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
     """Write a parameter with its sd (and unit, if asked), and its interval."""
     low, high = found.interval95
     own = _unit_text(found) if unit else ""
-    return typeset(f"{give_or_take(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
+    return typeset(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
 
 
 def _unit_text(found: ParameterFound) -> str:
@@ -515,7 +516,7 @@ def _as_sentence(text: str) -> str:
 def _place_words(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
     """Describe where residuals are significant, and whether their means leave the band."""
     run = diagnosis.apparatus.words.run
-    covariate, unit = words_and_unit(diagnosis, place.covariate)
+    covariate, unit = covariate_words_and_unit(diagnosis, place.covariate)
     if place.covariate == run:
         what = f"{run} {place.scan}"
     elif place.start is None or place.end is None:

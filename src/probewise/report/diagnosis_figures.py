@@ -10,12 +10,12 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.recordings import Plan
-from probewise.report.covariate import covariate_values, label_of
+from probewise.report.covariate import axis_label, covariate_values
 from probewise.report.covariate_view import (
     CovariateView,
     ResidualNoise,
     choose_first_view,
-    is_line,
+    is_along_line,
     view_along_scan,
     view_of_place,
 )
@@ -27,13 +27,13 @@ from probewise.report.plots import (
     lattice_of_readings,
     lost_readings,
     mean_residuals_along,
-    one_scan,
     readings_in_order,
-    residual_clouds,
+    residual_histogram,
+    residuals_against_covariates,
+    scan_with_residuals,
     spread_by_level,
     stack_of_axes,
     svg,
-    tails,
 )
 from probewise.report.plots.residuals import AFTER, BEFORE
 from probewise.report.words import unit_name
@@ -156,7 +156,11 @@ def _draw_before_and_after(diagnosis: Diagnosis) -> bytes:
     readings = np.where(recording.usable[rows], recording.readings[rows], np.nan)
     unit = unit_name(plan.instrumentation.unit)
     models = models if diagnosis.repair.changes_predictions else models[:1]
-    return svg(one_scan(shown.at[rows], readings, models, joined=is_line(plan, rows), label=shown.label, unit=unit))
+    return svg(
+        scan_with_residuals(
+            shown.at[rows], readings, models, joined=is_along_line(plan, rows), label=shown.label, unit=unit
+        )
+    )
 
 
 def scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
@@ -165,7 +169,7 @@ def scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
     `change` is the change of each predicted reading, (n_points,).
     """
     scans = [rows for rows in plan.rows_by_scan() if rows.size]
-    lines = [rows for rows in scans if is_line(plan, rows)]
+    lines = [rows for rows in scans if is_along_line(plan, rows)]
     return max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
 
 
@@ -174,10 +178,10 @@ def _draw_residuals(diagnosis: Diagnosis) -> bytes:
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
     models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
-    time = label_of(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_time else "time")
-    covariates = ((time, plan.time_s), (label_of(diagnosis, "level"), diagnosis.repair.before.readings))
+    time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_time else "time")
+    covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.repair.before.readings))
     return svg(
-        residual_clouds(
+        residuals_against_covariates(
             covariates, models if diagnosis.repair.changes_predictions else models[:1], unit=unit_name(unit)
         )
     )
@@ -207,6 +211,6 @@ def _noise_panel(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Call
     if name in ("correlated_noise", "random_walk"):
         return lambda ax: correlation_of_neighbours(residuals, recording.plan.scan, rho=found.get("rho"), ax=ax)
     if name == "outliers":
-        return lambda ax: tails(residuals, float(chance.sd.mean()), ax=ax)
+        return lambda ax: residual_histogram(residuals, float(chance.sd.mean()), ax=ax)
     model_sd = chance.sd if "ratio" in found else None
     return lambda ax: spread_by_level(diagnosis.repair.after.readings, residuals, unit=unit, model_sd=model_sd, ax=ax)

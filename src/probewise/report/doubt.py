@@ -10,7 +10,7 @@ from probewise.experiment import left_out_of
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Section, figure, paragraph, table
 from probewise.report.paper_view import window_mm
-from probewise.report.plots import PAGE_IN, belief_in_the_sensor, explain_field, grid_of_axes, png
+from probewise.report.plots import PAGE_IN, effect_probabilities_by_reading, field_legend, grid_of_axes, png
 from probewise.report.robot_search import RobotSearch
 from probewise.report.words import count, number
 
@@ -18,7 +18,7 @@ SATURATION = 40.0
 """Reading at which the concealed effect of the demo, saturation, sets in; the model expects 60 over white."""
 
 
-def answer(searches: Sequence[RobotSearch]) -> str:
+def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     """Say in one sentence how both robots ended, the trusting one first."""
     trusting, doubting = (
         f"{count(len(s.run.steps), 'reading')}, off by {number(s.largest_error_mm, 1)} mm "
@@ -46,10 +46,10 @@ def figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
             title=title,
             ax=ax,
         ).set(xlim=(left, right), ylim=(low, high))
-    explain_field(axes)
+    field_legend(axes)
     doubting = searches[-1].run
     beliefs = [left_out_of(step, doubting.experiment.trust).probability for step in doubting.steps]
-    return {"doubt.png": png(axes), "belief.png": png(belief_in_the_sensor(beliefs))}
+    return {"doubt.png": png(axes), "belief.png": png(effect_probabilities_by_reading(beliefs))}
 
 
 def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
@@ -89,5 +89,6 @@ def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Sect
     )
     found = paragraph(f"At its end the doubting robot reports: {missing.sentence}")
     return Section(
-        "A robot that doubts its sensor", (introduction, paragraph(answer(searches)), fields, rows, belief, found)
+        "A robot that doubts its sensor",
+        (introduction, paragraph(summary_sentence(searches)), fields, rows, belief, found),
     )

@@ -9,11 +9,20 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise.effects import spoken_name
-from probewise.experiment import CLEAN, OFF_MM, Experiment, Exploration, Step, chance_off, found_shape, left_out_of
+from probewise.experiment import (
+    CLEAN,
+    OFF_MM,
+    Experiment,
+    Exploration,
+    Step,
+    found_shape,
+    left_out_of,
+    probability_of_length_off,
+)
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
-    belief_in_the_sensor,
-    explain_field,
+    effect_probabilities_by_reading,
+    field_legend,
     grid_of_axes,
     information_gained,
     playing_field,
@@ -84,11 +93,11 @@ def frame(
 ) -> bytes:
     """Draw the robot's view after one step, with its legend, as a PNG; parameters as in `view`."""
     ax = view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
-    explain_field(ax)
+    field_legend(ax)
     return png(ax, dpi=90, tight=False)
 
 
-def frame_of_both(
+def frame_of_several_models(
     views: Sequence[tuple[str, Step, Experiment]],
     readings: Sequence[tuple[float, float, float]],
     *,
@@ -103,7 +112,7 @@ def frame_of_both(
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
         known = f"{title}, {count(step.number, 'reading')}, {number(step.bits, 1)} bits"
         view(step, experiment, readings, levels=levels, truth_mm=truth_mm, title=known, ax=ax)
-    explain_field(axes)
+    field_legend(axes)
     return png(axes, dpi=75, tight=False)
 
 
@@ -132,7 +141,7 @@ def _fault_probabilities(steps: Sequence[Step], trust: float) -> Section:
         (
             paragraph(doubted.sentence),
             figure(
-                png(belief_in_the_sensor(beliefs)),
+                png(effect_probabilities_by_reading(beliefs)),
                 f"Probabilities of the sensor's possible faults after each reading.{dashed}",
             ),
             table(
@@ -153,7 +162,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
     )
 
 
-def answer(run: Exploration) -> str:
+def summary_sentence(run: Exploration) -> str:
     """Summarise the result in one sentence."""
     found = found_shape(run)
     several = f" (probability {probability(found.probability)})" if run.last.shapes else ""
@@ -197,7 +206,7 @@ def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
         (
             (
                 str(s.number),
-                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.stance}",
+                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.orientation_and_height}",
                 f"{s.reading.value:g}",
                 number(s.widest_mm, 1),
                 number(s.bits, 1),
@@ -238,10 +247,10 @@ def write_page(
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
     spent = f"{count(len(run.steps), 'reading')}, {number(run.seconds, 0)} s of arm time"
     gained = f"{number(run.last.bits, 1)} bits, {number(run.bits_per_reading, 2)} per reading"
-    off = probability(chance_off(run.experiment, run.posterior, OFF_MM))
+    off = probability(probability_of_length_off(run.experiment, run.posterior, OFF_MM))
     facts = [
         ("sensor model", MODEL_NAMES.get(model, model)),
-        ("inference", run.experiment.learning.label),
+        ("inference", run.experiment.inference_method.label),
         ("stopped because", run.stop_reason),
         ("cost", spent),
         ("information", gained),
@@ -305,7 +314,9 @@ def write_page(
             f" The {said[model]} chose the readings; the other panel shows the other model's posterior from the same "
             f"readings, and where it would read next."
         )
-    return page("The robot's search", answer=answer(run), key_figure=figure(frames[-1], caption), sections=sections)
+    return page(
+        "The robot's search", answer=summary_sentence(run), key_figure=figure(frames[-1], caption), sections=sections
+    )
 
 
 def _fit_in_words(p_value: float) -> str:

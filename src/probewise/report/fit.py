@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis import SystemFit
 from probewise.report.html import Section, definition_list, figure, page, paragraph, table
-from probewise.report.plots import predicted_and_recorded, residual_clouds, svg
+from probewise.report.plots import predicted_and_recorded, residuals_against_covariates, svg
 from probewise.report.words import number, typeset, unit_name
 from probewise.systems import RunTable
 
@@ -18,7 +18,7 @@ _MOST_COLUMNS = 6
 _LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 
 
-def answer(fit: SystemFit) -> str:
+def summary_sentence(fit: SystemFit) -> str:
     """Summarise in one sentence how well the simulator fits."""
     unit = unit_name(fit.recording.plan.instrumentation.unit)
     n = int(fit.recording.usable.sum())
@@ -30,7 +30,7 @@ def figures(fit: SystemFit) -> dict[str, bytes]:
     recording, own = fit.recording, fit.fitted.simulator
     unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
     drawn = svg(predicted_and_recorded(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
-    clouds = residual_clouds(
+    clouds = residuals_against_covariates(
         _columns_to_draw(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
     )
     return {"predicted.svg": drawn, "residuals.svg": svg(clouds)}
@@ -64,7 +64,7 @@ def write_page(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
     )
     return page(
         f"Fit of {own.source}",
-        answer=answer(fit),
+        answer=summary_sentence(fit),
         key_figure=figure(drawn["predicted.svg"], "Recorded against predicted readings; on the line they agree."),
         sections=[
             Section("Posterior", (table(("parameter", "median", "95 % interval"), rows),)),

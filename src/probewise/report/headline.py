@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise.diagnosis import ALARM, Diagnosis
 from probewise.effects import UNNAMED
-from probewise.report.covariate import words_and_unit
+from probewise.report.covariate import covariate_words_and_unit
 from probewise.report.effect_words import effect_in_words, hypothesis_in_words, join_names
 from probewise.report.words import count
 
@@ -67,7 +67,7 @@ def _left_out_versions(diagnosis: Diagnosis, opening: str) -> list[str]:
 def _unknown_versions(diagnosis: Diagnosis) -> list[str]:
     shares = diagnosis.judged.unknown_shares
     top = max(shares, key=lambda k: shares[k], default="")
-    covariate, _ = words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
+    covariate, _ = covariate_words_and_unit(diagnosis, top.partition(", ")[0].removesuffix(" within scans"))
     known = [effect_in_words(e.name) for e in diagnosis.effects if e.probability >= _SURE]
     short = "Something is missing that no known effect explains"
     plain = f"Beside {join_names(known)}, something is missing that no known effect explains" if known else short

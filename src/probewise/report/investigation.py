@@ -11,7 +11,7 @@ from probewise.report import diagnosis as of_a_diagnosis
 from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.headline import headline
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots import beliefs_by_round, png
+from probewise.report.plots import png, probabilities_by_round
 from probewise.report.terms import explain_new_terms, with_explanations
 from probewise.report.words import count, probability, typeset
 
@@ -21,7 +21,7 @@ _LEAST_TOLD = 0.005
 
 def probabilities_png(found: Investigation) -> bytes:
     """Draw the probability of each explanation after each round, as a PNG."""
-    return png(beliefs_by_round({_round_title(each): _explanation_probabilities(each) for each in found.rounds}))
+    return png(probabilities_by_round({_round_title(each): _explanation_probabilities(each) for each in found.rounds}))
 
 
 def probabilities_figure(found: Investigation) -> Markup:
@@ -31,7 +31,7 @@ def probabilities_figure(found: Investigation) -> Markup:
     )
 
 
-def answer(found: Investigation) -> str:
+def summary_sentence(found: Investigation) -> str:
     """Return the verdict in words, and how many readings beyond the first plan it took."""
     extra = found.extra_readings
     taken = f"{count(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
@@ -81,7 +81,7 @@ def write_page(
     details = Section("The diagnosis of all readings", (), tuple(of_a_diagnosis.sections(last.diagnosis, drawn)))
     return page(
         f"Investigation: {last.diagnosis.verdict.replace('_', ' ')} after {count(len(found.rounds), 'round')}",
-        answer=answer(found),
+        answer=summary_sentence(found),
         key_figure=fragment(bars, *explain_new_terms(bars, known)),
         sections=with_explanations([story, details, Section("This run", (run,))], known),
     )
@@ -103,7 +103,7 @@ def _explanation_probabilities(each: Round) -> dict[str, float]:
 def _round_section(each: Round) -> Section:
     """Describe one round: the readings and their reason, the diagnosis, the next plan."""
     diagnosis = each.diagnosis
-    why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.asked}"
+    why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.reason_for_readings}"
     likely = [(name, p) for name, p in _explanation_probabilities(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
     asked = diagnosis.next_measurement
     between = (

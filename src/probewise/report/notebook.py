@@ -77,14 +77,16 @@ def _(value: RunRecording) -> str:
 @render_html.register
 def _(value: FittedSensor) -> str:
     picture = figure(png(spatial_sensitivity(value.field), dpi=DPI), "Mean SSF field")
-    return _div(paragraph(calibration_report.answer(value)), picture, calibration_report.parameter_table(value))
+    return _div(
+        paragraph(calibration_report.summary_sentence(value)), picture, calibration_report.parameter_table(value)
+    )
 
 
 @render_html.register
 def _(value: Calibration) -> str:
     drawn = calibration_report.ssf_of_each_order(value)
     return _div(
-        paragraph(calibration_report.answer(value.sensor)),
+        paragraph(calibration_report.summary_sentence(value.sensor)),
         figure(png(drawn, dpi=DPI), "Mean SSF by number of Gaussians"),
         calibration_report.evidence_table(value.sensor),
     )
@@ -131,7 +133,7 @@ def _(value: Exploration) -> str:
         {"run": np.array([s.widest_mm for s in value.steps])}, target_mm=value.experiment.stop_sd_mm
     )
     return _div(
-        paragraph(exploration_report.answer(value)),
+        paragraph(exploration_report.summary_sentence(value)),
         figure(picture, "The robot's view at the end"),
         figure(png(widths, dpi=DPI), "Widest posterior sd after each reading"),
     )
@@ -149,7 +151,9 @@ def _(value: Prediction) -> str:
 def _(value: PlanAudit) -> str:
     drawn = png(audit_report.picture(value), dpi=DPI)
     text = _pre(value.summary())
-    return _div(paragraph(audit_report.answer(value)), figure(drawn, "Detectability of effects, and aliases"), text)
+    return _div(
+        paragraph(audit_report.summary_sentence(value)), figure(drawn, "Detectability of effects, and aliases"), text
+    )
 
 
 @render_html.register
@@ -162,7 +166,7 @@ def _(value: Diagnosis) -> str:
         (effect_in_words(e.name), f"{e.probability:.3f}", e.sentence) for e in value.effects if e.probability > 0.05
     ]
     return _div(
-        paragraph(diagnosis_report.answer(value)),
+        paragraph(diagnosis_report.summary_sentence(value)),
         figure(png(bars, dpi=DPI), "Probability of each hypothesis"),
         *((table(("effect", "probability", "what it does"), rows),) if rows else ()),
     )
@@ -175,7 +179,7 @@ def _(value: SystemFit) -> str:
     unit = unit_name(own.unit)
     drawn = predicted_and_recorded(readings, value.predicted, value.sd, label=own.reading, unit=unit)
     return _div(
-        paragraph(fit_report.answer(value)),
+        paragraph(fit_report.summary_sentence(value)),
         figure(png(drawn, dpi=DPI), "Recorded against predicted readings; on the line they agree."),
         _pre(value.summary()),
     )
@@ -194,4 +198,6 @@ def _(value: SystemPrediction) -> str:
 @render_html.register
 def _(value: Investigation) -> str:
     said = _pre(value.summary())
-    return _div(paragraph(investigation_report.answer(value)), investigation_report.probabilities_figure(value), said)
+    return _div(
+        paragraph(investigation_report.summary_sentence(value)), investigation_report.probabilities_figure(value), said
+    )

@@ -19,7 +19,7 @@ _MARGIN_MM = 30.0
 _OUTLINE = 0.45
 
 
-def fine_map(run: Exploration, number: int) -> UtilityMap:
+def fine_entropy_map(run: Exploration, number: int) -> UtilityMap:
     """Compute the entropy map of the circles sampled after a reading, on a grid twice as fine (paper, figures 2 and 8).
 
     Parameters
@@ -51,7 +51,7 @@ def paper_view(
     Parameters
     ----------
     run, number
-        See `fine_map`.
+        See `fine_entropy_map`.
     levels
         Readings over black and white.
     truth_mm
@@ -63,7 +63,7 @@ def paper_view(
     ax
         Axes to draw on; a new figure without.
     """
-    step, drawn = run.steps[number - 1], fine_map(run, number)
+    step, drawn = run.steps[number - 1], fine_entropy_map(run, number)
     seen = np.array([(r.pose.x_mm, r.pose.y_mm, r.value) for r in run.readings[:number]])
     pose = step.next_pose
     ax = playing_field(

@@ -18,7 +18,7 @@ _NEVER_LESS = 0.05  # of the variance of a mean: the least width of the band, ho
 
 
 @dataclass(frozen=True, eq=False)
-class Means:
+class ResidualMeans:
     """Mean residuals per bin; all arrays have shape (n_bins,).
 
     `at` is the covariate's mean in the bin, or 0, 1, 2 ... for a categorical covariate. `before` and `after` are the
@@ -34,7 +34,7 @@ class Means:
 
     @property
     def largest_in_sds(self) -> float:
-        """Largest absolute mean of the calibrated model's residuals, in sds of that mean by chance."""
+        """Largest absolute mean of the calibrated model's residuals, in sds of that mean under chance."""
         return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
 
 
@@ -49,7 +49,7 @@ def mean_residuals(
     names: Mapping[float, str] | None = None,
     window: tuple[float, float] | None = None,
     absorbed: FloatArray | None = None,
-) -> Means:
+) -> ResidualMeans:
     """Average residuals in bins of a covariate.
 
     Parameters
@@ -79,7 +79,7 @@ def mean_residuals(
     if absorbed is not None:
         taken = np.array([np.var(absorbed[:, r].mean(axis=1)) for r in rows])
         variance = np.maximum(variance - taken, _NEVER_LESS * variance)
-    return Means(
+    return ResidualMeans(
         at,
         np.array([before[r].mean() for r in rows]),
         None if after is None else np.array([after[r].mean() for r in rows]),

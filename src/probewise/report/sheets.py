@@ -11,11 +11,11 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.arm import Geometry
-from probewise.arm.marks import marks_of
+from probewise.arm.marks import places_of_marks
 from probewise.errors import ParameterError
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Pattern, Polygon, Quadrant, Ramp, Stripes, Uniform
 from probewise.recordings.plan import Plan
-from probewise.recordings.where_white import where_white
+from probewise.recordings.where_white import where_white_in_words
 
 PAPERS_MM: Mapping[str, tuple[float, float]] = {"a4": (210.0, 297.0), "letter": (215.9, 279.4)}
 """Width and height of the papers, upright."""
@@ -173,7 +173,7 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
             places = np.concatenate([places, _places_to_show(pattern)])
         low = np.floor((places.min(axis=0) - AROUND_MM) / _ROUND_MM) * _ROUND_MM
         high = np.ceil((places.max(axis=0) + AROUND_MM) / _ROUND_MM) * _ROUND_MM
-        lines = (where_white(pattern),)
+        lines = (where_white_in_words(pattern),)
         sheets.append(Sheet(name, pattern, _two_floats(low), _two_floats(high), lines, orientations_rad=turns))
     return tuple(sheets)
 
@@ -203,7 +203,7 @@ def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
 
 def marks_sheet(geometry: Geometry) -> Sheet:
     """Make the sheet of crosses that `arm fit-geometry` uses."""
-    marks = marks_of(geometry)
+    marks = places_of_marks(geometry)
     lines = (
         f"{len(marks)} crosses for `probewise arm fit-geometry`, numbered",
         "its lower left corner is the field's; its long sides run along the field's x axis",

@@ -10,7 +10,7 @@ import numpy as np
 from probewise.experiment import least_readings
 from probewise.recordings.table import csv_text_of_rows
 from probewise.report.html import Markup, Section, definition_list, figure, fragment, page, paragraph, table
-from probewise.report.plots import png, readings_needed, widths_of_runs
+from probewise.report.plots import png, posterior_widths_of_runs, readings_needed
 from probewise.report.words import count, number, with_error
 from probewise.study import LEAST_FOR_MEDIAN, REFERENCE, Estimate, Row, Study, Summary, experiment_of
 
@@ -30,7 +30,7 @@ _INTERVALS = (
 )
 
 
-def answer(study: Study) -> str:
+def summary_sentence(study: Study) -> str:
     """Summarise in one sentence how many readings the study's first row needs."""
     row, found = next(iter(study.table().items()))
     share = "All" if found.reached.value == 1 else f"{number(100 * found.reached.value, 1)} % of the"
@@ -121,7 +121,7 @@ def write_page(study: Study, *, command: str) -> str:
     sections = [Section("The table", (table_of_rows(study), _legend()))]
     if curves:
         drawn = figure(
-            png(widths_of_runs(curves)),
+            png(posterior_widths_of_runs(curves)),
             "Widest posterior sd of a length against the number of readings; a run that has ended keeps its last "
             "width.",
         )
@@ -135,7 +135,7 @@ def write_page(study: Study, *, command: str) -> str:
         )
         sections.append(Section("Lower bound for any strategy", (least, bounds)))
     sections.append(Section("How it was made", (definition_list([("command", command)]),)))
-    return page("How many measurements?", answer=answer(study), key_figure=needed, sections=sections)
+    return page("How many measurements?", answer=summary_sentence(study), key_figure=needed, sections=sections)
 
 
 def _legend() -> Markup:

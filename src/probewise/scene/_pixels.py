@@ -37,7 +37,9 @@ def share_behind_edge(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: 
     return np.where(distance_mm >= 0, 1 - outside, outside)
 
 
-def share_in_edges(edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
+def share_inside_polygon(
+    edges_mm: FloatArray, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray
+) -> FloatArray:
     """Return the share of each square inside a polygon, exactly.
 
     Green's theorem on the polygon clipped to the square: the sum over directed edges (inside

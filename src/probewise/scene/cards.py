@@ -14,7 +14,7 @@ from probewise._kinds import require_number
 from probewise.errors import ParameterError
 from probewise.scene.albedo import Region
 from probewise.scene.regions import PolygonRegion, edge_distance, outlines
-from probewise.scene.scenes import HypothesisScene, SameForAll
+from probewise.scene.scenes import HypothesisScene, OneRegionForAllNames
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,13 @@ class Card:
         return PolygonRegion.simple(self.corners_mm[None])
 
     @property
-    def informative_mm(self) -> FloatArray:
+    def informative_places_mm(self) -> FloatArray:
         """Places where readings of the card are most informative: its middle and the middles of its sides, (5, 2)."""
         half_x, half_y = self.width_mm / 2, self.height_mm / 2
         away = np.array([[0.0, 0.0], [-half_x, 0.0], [half_x, 0.0], [0.0, -half_y], [0.0, half_y]])
         return np.asarray(np.array([self.x_mm, self.y_mm]) + away)
+
+    informative_mm = informative_places_mm  # its earlier name
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,15 +76,15 @@ class CardedRegion:
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Return the albedo at points, (n_points, 2) -> (n_regions, n_points)."""
         covered = [card.region.albedo(points_mm) for card in self.cards]
-        return seen_with_cards(self.region.albedo(points_mm), self.cards, covered)
+        return mean_albedo_with_cards(self.region.albedo(points_mm), self.cards, covered)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, (n_regions, n_points)."""
         covered = [card.region.coverage(centers_mm, pixel_mm, turn_rad) for card in self.cards]
-        return seen_with_cards(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
+        return mean_albedo_with_cards(self.region.coverage(centers_mm, pixel_mm, turn_rad), self.cards, covered)
 
 
-def seen_with_cards(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
+def mean_albedo_with_cards(seen: FloatArray, cards: Sequence[Card], covered: Sequence[FloatArray]) -> FloatArray:
     """Return the white fraction seen with cards: `seen` is that without, `covered` the share of the view on each card.
 
     Exact unless a view contains both an edge of a card and an edge of what lies below the cards. There, the albedo
@@ -94,12 +96,12 @@ def seen_with_cards(seen: FloatArray, cards: Sequence[Card], covered: Sequence[F
 
 
 @outlines.register
-def _(region: CardedRegion, *, n_vertices: int = 96) -> list[FloatArray]:
+def _outlines_of_carded_region(region: CardedRegion, *, n_vertices: int = 96) -> list[FloatArray]:
     return outlines(region.region, n_vertices=n_vertices)
 
 
 @edge_distance.register
-def _(region: CardedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_carded_region(region: CardedRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return edge_distance(region.region, x_mm, y_mm)
 
 
@@ -109,6 +111,6 @@ class CardedScene(HypothesisScene):
 
     cards: tuple[Card, ...] = field(default=())
 
-    def regions(self, theta: FloatArray) -> SameForAll:
+    def regions(self, theta: FloatArray) -> OneRegionForAllNames:
         """Return the shape's region with the cards on it, theta (n_samples, n_params), under any pattern name."""
-        return SameForAll(CardedRegion(self.shape.region(theta), self.cards))
+        return OneRegionForAllNames(CardedRegion(self.shape.region(theta), self.cards))

@@ -66,11 +66,11 @@ class HypothesisScene:
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Return the shape's region, theta (n_samples, n_params), under any pattern name."""
-        return SameForAll(self.shape.region(theta))
+        return OneRegionForAllNames(self.shape.region(theta))
 
 
 @dataclass(frozen=True, eq=False)
-class SameForAll(Mapping[str, Region]):
+class OneRegionForAllNames(Mapping[str, Region]):
     """A mapping from every name to one region; it lists the name "hypothesis"."""
 
     region: Region

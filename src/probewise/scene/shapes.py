@@ -82,7 +82,7 @@ class PlacedPrior:
         return margin, size - margin
 
 
-def _require_fit(shape: str, name: str, bounds: Bounds, field: Field, *, reach: float | None) -> None:
+def _require_bounds_fit_field(shape: str, name: str, bounds: Bounds, field: Field, *, reach: float | None) -> None:
     """Raise ParameterError unless 0 < low < high and, with `reach`, a half width of `reach` x high fits the field."""
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
     low, high = require_pair(name, bounds, "(low, high): its prior is even between them")
@@ -96,7 +96,7 @@ def _require_fit(shape: str, name: str, bounds: Bounds, field: Field, *, reach: 
         )
 
 
-def _circle_extent(own: FloatArray) -> FloatArray:
+def _half_extent_of_circle(own: FloatArray) -> FloatArray:
     """Return half width and half height of circles, (n_samples, 2), from their radii, (n_samples, 1)."""
     return np.repeat(own[:, :1], 2, axis=1)
 
@@ -114,13 +114,15 @@ class Circle:
 
     def __post_init__(self) -> None:
         reach = 1.0 if self.inside else None
-        _require_fit("Circle", "radius_mm", self.radius_mm, self.field, reach=reach)
+        _require_bounds_fit_field("Circle", "radius_mm", self.radius_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> PlacedPrior:
         """Uniform over centre and radius."""
         return PlacedPrior(
-            self.field, Product({"radius_mm": Uniform(*self.radius_mm)}), _circle_extent if self.inside else None
+            self.field,
+            Product({"radius_mm": Uniform(*self.radius_mm)}),
+            _half_extent_of_circle if self.inside else None,
         )
 
     def region(self, theta: FloatArray) -> EllipseRegion:
@@ -157,7 +159,7 @@ class _EllipseOwnPrior:
         return np.where(inside, -np.log(room), -np.inf)
 
 
-def _ellipse_extent(own: FloatArray) -> FloatArray:
+def _half_extent_of_ellipse(own: FloatArray) -> FloatArray:
     major, minor, angle = own.T
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.stack([np.hypot(major * cosine, minor * sine), np.hypot(major * sine, minor * cosine)], axis=1)
@@ -173,7 +175,7 @@ class Ellipse:
 
     def __post_init__(self) -> None:
         reach = 1.0 if self.inside else None
-        _require_fit("Ellipse", "semi_axes_mm", self.semi_axes_mm, self.field, reach=reach)
+        _require_bounds_fit_field("Ellipse", "semi_axes_mm", self.semi_axes_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> PlacedPrior:
@@ -181,14 +183,16 @@ class Ellipse:
 
         With `inside`, the centre is uniform over the places that keep the ellipse on the field.
         """
-        return PlacedPrior(self.field, _EllipseOwnPrior(self.semi_axes_mm), _ellipse_extent if self.inside else None)
+        return PlacedPrior(
+            self.field, _EllipseOwnPrior(self.semi_axes_mm), _half_extent_of_ellipse if self.inside else None
+        )
 
     def region(self, theta: FloatArray) -> EllipseRegion:
         """Build an ellipse for each hypothesis, theta (n_samples, 5)."""
         return EllipseRegion(theta[:, :2], theta[:, 2:4], theta[:, 4])
 
 
-def _rectangle_extent(own: FloatArray) -> FloatArray:
+def _half_extent_of_rectangle(own: FloatArray) -> FloatArray:
     width, height, angle = own.T
     cosine, sine = np.abs(np.cos(angle)), np.abs(np.sin(angle))
     return 0.5 * np.stack([width * cosine + height * sine, width * sine + height * cosine], axis=1)
@@ -207,14 +211,14 @@ class Rectangle:
 
     def __post_init__(self) -> None:
         reach = 1 / math.sqrt(2) if self.inside else None
-        _require_fit("Rectangle", "sides_mm", self.sides_mm, self.field, reach=reach)
+        _require_bounds_fit_field("Rectangle", "sides_mm", self.sides_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> PlacedPrior:
         """Uniform over all five parameters."""
         side = Uniform(*self.sides_mm)
         own = Product({"width_mm": side, "height_mm": side, "angle_rad": Uniform(0.0, np.pi / 2)})
-        return PlacedPrior(self.field, own, _rectangle_extent if self.inside else None)
+        return PlacedPrior(self.field, own, _half_extent_of_rectangle if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a rectangle for each hypothesis, theta (n_samples, 5)."""
@@ -234,14 +238,14 @@ class RegularPolygon:
     def __post_init__(self) -> None:
         require_whole("n_sides", self.n_sides, least=3)
         reach = 1.0 if self.inside else None
-        _require_fit("RegularPolygon", "radius_mm", self.radius_mm, self.field, reach=reach)
+        _require_bounds_fit_field("RegularPolygon", "radius_mm", self.radius_mm, self.field, reach=reach)
 
     @cached_property
     def prior(self) -> PlacedPrior:
         """Uniform over centre, radius, and angle within the polygon's symmetry."""
         own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
         # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
-        return PlacedPrior(self.field, own, _circle_extent if self.inside else None)
+        return PlacedPrior(self.field, own, _half_extent_of_circle if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a polygon for each hypothesis, theta (n_samples, 4)."""
@@ -301,7 +305,7 @@ class _AnyOfPrior:
         ends = np.concatenate([[0.0], np.cumsum(self.weights)])
         theta = np.empty_like(u)
         theta[:, 0] = np.interp(u[:, 0], ends, np.arange(len(ends)))
-        which = self.which(theta)
+        which = self.shape_index(theta)
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
             values = shape.prior.from_unit_cube(u[:, columns])
             # Every shape fills its own columns; the selected shape fills the shared ones.
@@ -315,7 +319,7 @@ class _AnyOfPrior:
         ends = np.concatenate([[0.0], np.cumsum(self.weights)])
         u = np.empty_like(theta)
         u[:, 0] = np.interp(theta[:, 0], np.arange(len(ends)), ends)
-        which = self.which(theta)
+        which = self.shape_index(theta)
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
             values = shape.prior.to_unit_cube(theta[:, columns])
             own = columns > len(self.shared)
@@ -325,7 +329,7 @@ class _AnyOfPrior:
         return u
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        which = self.which(theta)
+        which = self.shape_index(theta)
         inside = (theta[:, 0] >= 0) & (theta[:, 0] <= len(self.shapes))
         total = np.where(inside, np.log(np.asarray(self.weights))[which], -np.inf)
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.columns, strict=True)):
@@ -336,7 +340,7 @@ class _AnyOfPrior:
             total = total + np.where(which == k, taken, idle)
         return total
 
-    def which(self, theta: FloatArray) -> IntArray:
+    def shape_index(self, theta: FloatArray) -> IntArray:
         """Return the index of each hypothesis' shape, (n_samples,)."""
         return np.clip(np.floor(theta[:, 0]), 0, len(self.shapes) - 1).astype(np.int64)
 
@@ -376,13 +380,15 @@ class AnyOf:
         """Names of the shapes, by index."""
         return tuple(self.shapes)
 
-    def which(self, theta: FloatArray) -> IntArray:
+    def shape_index(self, theta: FloatArray) -> IntArray:
         """Return the index of each hypothesis' shape, (n_samples,)."""
-        return self.prior.which(theta)
+        return self.prior.shape_index(theta)
+
+    which = shape_index  # its earlier name
 
     def region(self, theta: FloatArray) -> MixtureOfRegions:
         """Build the region of each hypothesis' shape."""
-        which = self.which(theta)
+        which = self.shape_index(theta)
         parts: list[Region] = []
         for k, (shape, columns) in enumerate(zip(self.shapes.values(), self.prior.columns, strict=True)):
             rows = np.flatnonzero(which == k)

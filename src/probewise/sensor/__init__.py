@@ -5,10 +5,10 @@ Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_m
 """
 
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
-from probewise.sensor.commanded import COMMANDED, raised
-from probewise.sensor.discrete import seen_discrete
+from probewise.sensor.commanded import COMMANDED, footprint_at_height, raised
+from probewise.sensor.discrete import mean_albedo_by_pixels, seen_discrete
 from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bends_of, free_form, is_free_form
-from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, seen
+from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians, seen
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
     DiscreteSSF,
@@ -62,9 +62,12 @@ __all__ = [
     "View",
     "bends_of",
     "field_of",
+    "footprint_at_height",
     "footprint_of",
     "free_form",
     "is_free_form",
+    "mean_albedo_by_pixels",
+    "mean_albedo_under_gaussians",
     "mean_mixture",
     "mixture_names",
     "mixture_of_field",

@@ -12,13 +12,18 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise._kinds import require_like, require_number
 from probewise.errors import ParameterError
-from probewise.recordings.columns import how_to_describe
+from probewise.recordings.columns import how_to_describe_pattern
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region, Scene
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion, UniformRegion
-from probewise.sensor.commanded import height_ratio, is_commanded, led_state, raised_as_commanded
-from probewise.sensor.discrete import seen_discrete
-from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, seen_by_one, turned
+from probewise.sensor.commanded import (
+    footprint_at_commanded_height,
+    has_commanded_height_or_led,
+    height_ratio,
+    led_state,
+)
+from probewise.sensor.discrete import mean_albedo_by_pixels
+from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, seen_by_one, turn_into_lab_frame
 from probewise.sensor.ssf import DiscreteSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
@@ -32,7 +37,7 @@ from probewise.sensor.stages import (
     names_of_effects,
     require_columns,
 )
-from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of
+from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of_readings
 
 _MANY = 8  # Gaussians, from which on it pays to look for hypotheses that share their geometry
 _MOST_NUMBERS = 2_000_000  # held in memory at once of footprints that differ between readings
@@ -164,72 +169,74 @@ class Chain:
             If the plan has a pattern that the scene lacks, theta holds no valid SSF, or a height is commanded of a
         `DiscreteSSF`.
         """
-        at_once = self._n_at_once(theta, plan)
+        at_once = self._hypotheses_at_once(theta, plan)
         if at_once < len(theta):
             blocks = (theta[first : first + at_once] for first in range(0, len(theta), at_once))
             return np.concatenate([self.predict(block, plan) for block in blocks])
-        view = self.look(theta, plan)
-        plain = not self.effects and not is_commanded(plan)
-        return self._plain_readings(view.seen, theta) if plain else self.read(view, theta, plan)
+        view = self.simulated_view(theta, plan)
+        plain = not self.effects and not has_commanded_height_or_led(plan)
+        return self._plain_readings(view.seen, theta) if plain else self.readings_of_view(view, theta, plan)
 
-    def _n_at_once(self, theta: FloatArray, plan: Plan) -> int:
+    def _hypotheses_at_once(self, theta: FloatArray, plan: Plan) -> int:
         """Return how many hypotheses to predict at once; memory limits it where footprints differ between readings."""
         if not any(effect.stage == Stage.FOOTPRINT for effect in self.effects):
             return len(theta)
         return max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
 
-    def read(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Turn a view into readings, (n_samples, n_points): the stages of `predict` from SEEN on.
+    def readings_of_view(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Compute readings from a view, (n_samples, n_points): the stages of `predict` from SEEN on.
 
         `view` may hold one hypothesis where those of theta differ only in these stages.
         """
-        apply = self._applier(theta, plan)
+        apply = self._stage_applier(theta, plan)
         seen = apply(Stage.RESPONSE, apply(Stage.SEEN, view).seen)
-        i_min, i_max = self._levels(theta)
+        i_min, i_max = self._levels_of(theta)
         reading: FloatArray = i_min + apply(Stage.GAIN, (i_max - i_min) * led_state(plan) * view.brightness * seen)
         for stage in (Stage.OFFSET, Stage.LAG, Stage.SATURATION):
             reading = apply(stage, reading)
         shape = (len(theta), len(plan))
         return reading if reading.shape == shape else np.array(np.broadcast_to(reading, shape))
 
-    def _levels(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _levels_of(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         n_ssf = len(self.ssf.names)
         return self.levels.values(theta[:, n_ssf : n_ssf + len(self.levels.names)])
 
     def _plain_readings(self, seen: FloatArray, theta: FloatArray) -> FloatArray:
-        """Turn R into readings where no effect acts; overwrites `seen`."""
-        i_min, i_max = self._levels(theta)
+        """Compute readings from R where no effect acts; overwrites `seen`."""
+        i_min, i_max = self._levels_of(theta)
         reading = seen if len(seen) == len(theta) else np.repeat(seen, len(theta), axis=0)
         reading *= i_max - i_min
         reading += i_min
         return reading
 
-    def seen(self, theta: FloatArray, plan: Plan) -> FloatArray:
+    def white_fraction(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Return the white fraction R that the sensor sees, before any effect on it, (n_samples or 1, n_points)."""
-        return self.look(theta, plan).seen
+        return self.simulated_view(theta, plan).seen
 
-    def look(self, theta: FloatArray, plan: Plan) -> View:
+    def simulated_view(self, theta: FloatArray, plan: Plan) -> View:
         """Compute the sensor's view of the scene: the stages of `predict` before SEEN."""
         require_columns(theta, self.names)
-        layout = self._layout_of(theta, plan)
+        layout = self._layout_under_poses(theta, plan)
         if isinstance(self.ssf, DiscreteSSF):
             if height_ratio(plan) is not None:
                 raise ParameterError("plan", "a commanded height_mm", "none with a DiscreteSSF; use mixture_of_field")
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
-        plain = raised_as_commanded(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
-        footprint: Footprint = self._applier(theta, plan)(Stage.FOOTPRINT, plain)
+        plain = footprint_at_commanded_height(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
+        footprint: Footprint = self._stage_applier(theta, plan)(Stage.FOOTPRINT, plain)
         geometries = self._grouped_by_geometry(theta, footprint)
         if geometries is None:
             seen = response(layout, footprint, n_nodes=self.n_nodes)
         else:
-            alone = self._layout_of(theta[geometries.first].repeat(footprint.weight.shape[2], axis=0), plan)
+            alone = self._layout_under_poses(theta[geometries.first].repeat(footprint.weight.shape[2], axis=0), plan)
             seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
+
+    look, read, seen = simulated_view, readings_of_view, white_fraction  # their earlier names
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
         """Return the sensor's true poses under each hypothesis: the chain up to stage POSE."""
         told = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
-        found: Poses = self._applier(theta, plan)(Stage.POSE, told)
+        found: Poses = self._stage_applier(theta, plan)(Stage.POSE, told)
         return found
 
     def _grouped_by_geometry(self, theta: FloatArray, footprint: Footprint) -> _HypothesesByGeometry | None:
@@ -241,7 +248,7 @@ class Chain:
         n_ssf = len(self.ssf.names)
         own[:n_ssf:6] = False
         own[n_ssf : n_ssf + len(self.levels.names)] = False
-        for effect, columns in self._columns:
+        for effect, columns in self._effects_and_columns:
             own[columns] = effect.stage <= Stage.FOOTPRINT
         numbers: dict[bytes, int] = {}  # of the geometries, in order of their first hypothesis
         which = np.array([numbers.setdefault(row.tobytes(), len(numbers)) for row in theta[:, own]])
@@ -252,13 +259,13 @@ class Chain:
         moved = (np.abs(a - a[first][which]).max() > _SAME for a in footprint.moments if len(a) == len(theta))
         return None if len(first) < len(theta) and any(moved) else _HypothesesByGeometry(first, which)
 
-    def _layout_of(self, theta: FloatArray, plan: Plan) -> Layout:
-        """Place the scene under the poses; cached for the last plan where no hypothesis changes either."""
+    def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> Layout:
+        """Lay out the scene under the poses; cached for the last plan if no parameter moves scene or poses."""
         fixed = not self.scene.names and all(effect.stage > Stage.SCENE for effect in self.effects)
         known = self._last_layout.get(plan) if fixed else None
         if known is not None:
             return known
-        apply = self._applier(theta, plan)
+        apply = self._stage_applier(theta, plan)
         start = len(self.ssf.names) + len(self.levels.names)
         regions = self.scene.regions(theta[:, start : start + len(self.scene.names)])
         poses = self.poses(theta, plan)
@@ -281,15 +288,15 @@ class Chain:
         start = NoiseLevel(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
             return start
-        start = replace(start, seen=self.seen(theta, plan))
-        level: NoiseLevel = self._applier(theta, plan)(Stage.NOISE, start)
+        start = replace(start, seen=self.white_fraction(theta, plan))
+        level: NoiseLevel = self._stage_applier(theta, plan)(Stage.NOISE, start)
         return level
 
-    def _applier(self, theta: FloatArray, plan: Plan) -> Callable[[Stage, Any], Any]:
+    def _stage_applier(self, theta: FloatArray, plan: Plan) -> Callable[[Stage, Any], Any]:
         """Return a function that applies the effects of one stage to that stage's value."""
 
         def apply(stage: Stage, value: Any) -> Any:
-            for effect, columns in self._columns:
+            for effect, columns in self._effects_and_columns:
                 if effect.stage == stage:
                     value = effect.apply(value, theta[:, columns], plan)
             return value
@@ -297,7 +304,7 @@ class Chain:
         return apply
 
     @cached_property
-    def _columns(self) -> list[tuple[AnyEffect, slice]]:
+    def _effects_and_columns(self) -> list[tuple[AnyEffect, slice]]:
         """Columns of theta that belong to each effect."""
         first = len(self.ssf.names) + len(self.levels.names) + len(self.scene.names)
         return columns_of_effects(self.effects, first)
@@ -305,7 +312,7 @@ class Chain:
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """Which region lies under which reading, and the sensor's pose relative to it: all that does not depend on the SSF.
+    """The region under each reading and the sensor's pose relative to it: all that does not depend on the SSF.
 
     Its use raises ParameterError if the plan has a pattern that the regions lack.
 
@@ -327,10 +334,10 @@ class Layout:
     def n_samples(self) -> int:
         """Number of hypotheses over which the poses or regions vary, or 1."""
         place = (self.poses.x_mm, self.poses.y_mm, self.poses.orientation_rad)
-        return max([1, *(len(a) for a in place), *(region.n_regions for _, region in self.parts)])
+        return max([1, *(len(a) for a in place), *(region.n_regions for _, region in self.rows_and_regions)])
 
     @cached_property
-    def parts(self) -> list[tuple[IntArray, Region]]:
+    def rows_and_regions(self) -> list[tuple[IntArray, Region]]:
         """Rows of the readings over each region, and the region."""
         return [(rows, region_named(self.regions, name)) for name, rows in self.plan.rows_by_pattern()]
 
@@ -339,17 +346,17 @@ class Layout:
         """Known straight edges and corners of all patterns, batched: the common case of calibration."""
         if self.poses.orientation_rad.shape[0] > 1:
             return ()
-        known = [(rows, region) for rows, region in self.parts if region.n_regions == 1]
+        known = [(rows, region) for rows, region in self.rows_and_regions if region.n_regions == 1]
         edges = [(rows, region) for rows, region in known if isinstance(region, HalfPlaneRegion)]
         corners = [(rows, region) for rows, region in known if isinstance(region, QuadrantRegion)]
         return (
-            *((StraightEdges.of(edges, self.poses),) if edges else ()),
-            *((StraightCorners.of(corners, self.poses),) if corners else ()),
+            *((StraightEdges.from_regions(edges, self.poses),) if edges else ()),
+            *((StraightCorners.from_regions(corners, self.poses),) if corners else ()),
         )
 
     @cached_property
-    def other_groups(self) -> list[tuple[IntArray, Region]]:
-        """Readings over all other regions, in groups that share an orientation."""
+    def unbatched_rows_and_regions(self) -> list[tuple[IntArray, Region]]:
+        """Rows of readings over the regions not in `straight_batches`, and the region, split by orientation."""
         taken = (
             np.concatenate([part.rows for part in self.straight_batches])
             if self.straight_batches
@@ -357,9 +364,9 @@ class Layout:
         )
         return [
             (group, region)
-            for rows, region in self.parts
+            for rows, region in self.rows_and_regions
             if not np.isin(rows, taken).any()
-            for group in _by_orientation(rows, self.poses.orientation_rad)
+            for group in _split_by_orientation(rows, self.poses.orientation_rad)
         ]
 
 
@@ -385,19 +392,19 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
     poses = layout.poses
     for part in layout.straight_batches:
         part.write_response(footprint, out)
-    for rows, region in layout.other_groups:
+    for rows, region in layout.unbatched_rows_and_regions:
         if isinstance(region, UniformRegion):  # whatever the footprint
             level = region.level[:, None]
             for g in range(footprint.weight.shape[2]):
-                out[:, rows] += columns_of(footprint.weight[:, :, g], rows) * level
+                out[:, rows] += columns_of_readings(footprint.weight[:, :, g], rows) * level
             continue
-        x, y, turn = (columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
+        x, y, turn = (columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
         if turn.shape[0] == 1 and (turn == turn[:, :1]).all():
             turn = turn[:, :1]
         for g in range(footprint.weight.shape[2]):
-            one = (columns_of(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in footprint.moments)
-            seen = seen_by_one(region, LabGaussian(x, y, *turned(turn, *one)), n_nodes)
-            out[:, rows] += columns_of(footprint.weight[:, :, g], rows) * seen
+            one = (columns_of_readings(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in footprint.moments)
+            seen = seen_by_one(region, LabGaussian(x, y, *turn_into_lab_frame(turn, *one)), n_nodes)
+            out[:, rows] += columns_of_readings(footprint.weight[:, :, g], rows) * seen
     return out
 
 
@@ -438,9 +445,9 @@ class _HypothesesByGeometry:
 
 def _discrete_response(layout: Layout, ssf: DiscreteSSF) -> FloatArray:
     poses, found = layout.poses, []
-    for rows, region in layout.parts:
-        there = Poses(*(columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
-        found.append((rows, seen_discrete(region, ssf.field, there)))
+    for rows, region in layout.rows_and_regions:
+        there = Poses(*(columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+        found.append((rows, mean_albedo_by_pixels(region, ssf.field, there)))
     out = np.zeros((max((len(part) for _, part in found), default=1), len(layout.plan)))
     for rows, part in found:
         out[:, rows] = part
@@ -455,10 +462,10 @@ def region_named(regions: Mapping[str, Region], name: str) -> Region:
     try:
         return regions[name]
     except KeyError:
-        raise ParameterError("pattern", name, how_to_describe(name, list(regions))) from None
+        raise ParameterError("pattern", name, how_to_describe_pattern(name, list(regions))) from None
 
 
-def _by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:
+def _split_by_orientation(rows: IntArray, orientation_rad: FloatArray) -> list[IntArray]:
     """Split rows into groups that share an orientation, where that does not depend on the sample.
 
     Moments of the footprint in the lab frame are then computed once per group instead of once per reading.

@@ -17,7 +17,7 @@ from probewise.sensor.stages import Footprint
 COMMANDED = ("height_mm", "led")
 
 
-def is_commanded(plan: Plan) -> bool:
+def has_commanded_height_or_led(plan: Plan) -> bool:
     """Return whether a plan commands the LED, or a height other than the description's."""
     return "led" in plan.covariates or height_ratio(plan) is not None
 
@@ -37,13 +37,13 @@ def height_ratio(plan: Plan) -> FloatArray | None:
     return None if (ratio == 1.0).all() else ratio
 
 
-def raised_as_commanded(footprint: Footprint, plan: Plan) -> Footprint:
-    """Scale the footprint by the commanded height over the description's."""
+def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint:
+    """Scale the footprint by the commanded height over the description's; see `footprint_at_height`."""
     ratio = height_ratio(plan)
-    return footprint if ratio is None else raised(footprint, ratio[None, :])
+    return footprint if ratio is None else footprint_at_height(footprint, ratio[None, :])
 
 
-def raised(footprint: Footprint, ratio: FloatArray) -> Footprint:
+def footprint_at_height(footprint: Footprint, ratio: FloatArray) -> Footprint:
     """Scale the footprint by h/h0, (n_samples, n_points), and divide its brightness by the square."""
     # A fit may try heights that no arm can take: the result only has to stay finite.
     ratio = np.clip(ratio, 0.1, 10.0)
@@ -57,3 +57,6 @@ def raised(footprint: Footprint, ratio: FloatArray) -> Footprint:
         cov_uv=footprint.cov_uv * k**2,
         brightness=footprint.brightness / ratio**2,
     )
+
+
+raised = footprint_at_height  # its earlier name

@@ -18,8 +18,8 @@ from probewise.sensor.stages import Poses
 _PIXELS_AT_ONCE = 2**16
 
 
-def seen_discrete(region: Region, field: SSFField, poses: Poses) -> FloatArray:
-    """Sum the SSF field over the covered share of every pixel.
+def mean_albedo_by_pixels(region: Region, field: SSFField, poses: Poses) -> FloatArray:
+    """Compute the response of a discrete SSF: the sum of its pixels' values times the mean albedo of each pixel.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def seen_discrete(region: Region, field: SSFField, poses: Poses) -> FloatArray:
         out = np.empty((n_poses, n_points))
         for i in range(n_poses):
             one = Poses(x[i : i + 1], y[i : i + 1], turn[i : i + 1])
-            found = seen_discrete(region, field, one)
+            found = mean_albedo_by_pixels(region, field, one)
             out[i] = found[i if len(found) > 1 else 0]
         return out
     values = field.values.ravel()
@@ -66,3 +66,6 @@ def seen_discrete(region: Region, field: SSFField, poses: Poses) -> FloatArray:
         covered = region.coverage(centers, field.pixel_mm, turns)
         out[:, rows] = covered.reshape(len(covered), -1, len(weights)) @ weights
     return out
+
+
+seen_discrete = mean_albedo_by_pixels  # its earlier name

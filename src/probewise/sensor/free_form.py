@@ -14,7 +14,7 @@ from probewise._arrays import FloatArray
 from probewise.sensor.ssf import footprint_of
 
 
-def _rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
+def _places_and_widths_on_rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatArray]:
     """Return places (n, 2) and widths (n,); each ring is (radius, number, width, rotation in steps)."""
     places = [
         (radius * np.cos(turn), radius * np.sin(turn))
@@ -25,17 +25,19 @@ def _rings(*rings: tuple[float, int, float, float]) -> tuple[FloatArray, FloatAr
 
 
 # In sds of the one Gaussian: spaced by about their widths, out to where a long tail still shows.
-_PLACES, _WIDTHS = _rings((0.0, 1, 0.45, 0.0), (0.8, 6, 0.5, 0.0), (1.6, 8, 0.6, 0.0), (2.7, 4, 0.9, 0.5))
+_PLACES, _WIDTHS = _places_and_widths_on_rings(
+    (0.0, 1, 0.45, 0.0), (0.8, 6, 0.5, 0.0), (1.6, 8, 0.6, 0.0), (2.7, 4, 0.9, 0.5)
+)
 
 
-def _directions() -> FloatArray:
+def _moment_preserving_basis() -> FloatArray:
     """Find an orthonormal basis of the shares that change neither mean nor covariance, (n_rings, n_bends)."""
     x, y = _PLACES.T
     moments = np.stack([x, y, x * x + _WIDTHS**2 - 1, y * y + _WIDTHS**2 - 1, x * y])
     return np.ascontiguousarray(np.linalg.svd(moments)[2][len(moments) :].T)
 
 
-_DIRECTIONS = _directions()
+_DIRECTIONS = _moment_preserving_basis()
 
 N_BENDS: int = _DIRECTIONS.shape[1]
 """Number of free-form coefficients (bends)."""

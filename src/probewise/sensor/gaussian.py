@@ -19,7 +19,7 @@ from scipy.special import ndtr, owens_t
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, SlowWarning
 from probewise.scene.albedo import Region
-from probewise.scene.cards import CardedRegion, seen_with_cards
+from probewise.scene.cards import CardedRegion, mean_albedo_with_cards
 from probewise.scene.regions import (
     EllipseRegion,
     HalfPlaneRegion,
@@ -74,7 +74,7 @@ Spot = LabGaussian
 """The old name of `LabGaussian`."""
 
 
-def turned(
+def turn_into_lab_frame(
     turn_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """Turn mean and covariance anticlockwise into the lab frame: dx, dy, var_x, var_y, cov_xy; all broadcast."""
@@ -89,7 +89,7 @@ def turned(
     )
 
 
-def seen(
+def mean_albedo_under_gaussians(
     region: Region,
     x_mm: FloatArray,
     y_mm: FloatArray,
@@ -127,6 +127,9 @@ def seen(
     return np.stack(layers, axis=-1)
 
 
+seen = mean_albedo_under_gaussians  # its earlier name
+
+
 @singledispatch
 def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
@@ -151,8 +154,8 @@ def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArr
     for i, j in np.ndindex(*shape):
         cov = np.array(
             [
-                [_entry(gaussian.var_x, i, j), _entry(gaussian.cov_xy, i, j)],
-                [_entry(gaussian.cov_xy, i, j), _entry(gaussian.var_y, i, j)],
+                [_broadcast_entry(gaussian.var_x, i, j), _broadcast_entry(gaussian.cov_xy, i, j)],
+                [_broadcast_entry(gaussian.cov_xy, i, j), _broadcast_entry(gaussian.var_y, i, j)],
             ]
         )
         variance, axes = np.linalg.eigh(cov)
@@ -170,34 +173,34 @@ def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArr
     return out
 
 
-def _entry(array: FloatArray, i: int, j: int) -> float:
+def _broadcast_entry(array: FloatArray, i: int, j: int) -> float:
     return float(array[i if array.shape[0] > 1 else 0, j if array.shape[1] > 1 else 0])
 
 
-def _mix_by_share(outside: float, inside: float, share: FloatArray) -> FloatArray:
+def _albedo_by_share_inside(outside: float, inside: float, share: FloatArray) -> FloatArray:
     if (outside, inside) == (0.0, 1.0):
         return share
     return outside + (inside - outside) * share
 
 
 @seen_by_one.register
-def _(region: UniformRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_uniform(region: UniformRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     return region.level[:, None]
 
 
 @seen_by_one.register
-def _(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the cumulative of the Gaussian's projection on the normal."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     place = cosine * gaussian.x_mm + sine * gaussian.y_mm - region.offset_mm[:, None]
     shift = cosine * gaussian.dx_mm + sine * gaussian.dy_mm
     variance = cosine**2 * gaussian.var_x + sine**2 * gaussian.var_y + 2 * cosine * sine * gaussian.cov_xy
     per_sd = 1 / np.sqrt(variance)
-    return _mix_by_share(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
+    return _albedo_by_share_inside(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
 
 
 @seen_by_one.register
-def _(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the field at the Gaussian's mean, which is exact for a linear field."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     return region.per_mm[:, None] * (
@@ -206,7 +209,7 @@ def _(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
 
 
 @seen_by_one.register
-def _(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_stripes(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum cumulatives or, for stripes finer than the footprint, their Fourier series."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
     period, duty = region.period_mm[:, None], region.duty[:, None]
@@ -232,14 +235,16 @@ def _(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         for k in range(-4, 6):  # 8 sd are at most 3.2 periods
             total += normal_cdf((a - k) / s) - normal_cdf((a - k - d) / s)
         share[coarse] = total
-    return _mix_by_share(region.outside, region.inside, share)
+    return _albedo_by_share_inside(region.outside, region.inside, share)
 
 
 _FAR = 26.0  # sds: the mass beyond is 0, and exp is ten times slower where it underflows
 _TRIANGLE_NODES = 8  # positive half of a 16-node rule: accurate to 1e-12
 
 
-def beyond_corner(z1: FloatArray, z2: FloatArray, rho: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def probabilities_beyond_corner(
+    z1: FloatArray, z2: FloatArray, rho: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the probabilities that two standard normals exceed z1 and z2, that the first exceeds z1, the second z2.
 
     `rho` is their correlation; the arrays broadcast.
@@ -258,7 +263,7 @@ def beyond_corner(z1: FloatArray, z2: FloatArray, rho: FloatArray) -> tuple[Floa
     half_height, half_reach = 0.5 - ndtr(-height), 0.5 - ndtr(-reach)
     long, short = np.maximum(height, reach), np.minimum(height, reach)
     ratio = short / np.maximum(long, np.finfo(float).tiny)
-    node, weight = _legendre(2 * _TRIANGLE_NODES)
+    node, weight = _half_legendre_rule(2 * _TRIANGLE_NODES)
     stretch = 1.0 + (ratio**2).reshape(1, -1) * node[:, None] ** 2
     mass = stretch * (-0.5 * np.minimum(long, _FAR) ** 2).reshape(1, -1)
     np.exp(mass, out=mass)
@@ -273,10 +278,10 @@ def beyond_corner(z1: FloatArray, z2: FloatArray, rho: FloatArray) -> tuple[Floa
 
 
 @seen_by_one.register
-def _(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_quadrant(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     corner, direction = region.corner_mm, region.direction
     share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], gaussian)
-    return _mix_by_share(region.outside, region.inside, share)
+    return _albedo_by_share_inside(region.outside, region.inside, share)
 
 
 def mass_in_quadrant(
@@ -289,11 +294,11 @@ def mass_in_quadrant(
     sd_x, sd_y = np.sqrt(gaussian.var_x), np.sqrt(gaussian.var_y)
     z1 = dx * (corner_x - gaussian.x_mm - gaussian.dx_mm) / sd_x
     z2 = dy * (corner_y - gaussian.y_mm - gaussian.dy_mm) / sd_y
-    return beyond_corner(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))[0]
+    return probabilities_beyond_corner(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))[0]
 
 
 @seen_by_one.register
-def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum Owen's T over the edges, in the frame in which the Gaussian is the unit one."""
     sd_x = np.sqrt(gaussian.var_x)
     slope = gaussian.cov_xy / gaussian.var_x
@@ -317,19 +322,19 @@ def _(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
             angle = np.arctan(end / height) - np.arctan(start / height)
         angle[height == 0] = 0.0
         near = (np.abs(height) < _REACH) & (start < _REACH) & (end > -_REACH) & (height != 0)
-        angle[near] -= 2 * np.pi * _mass_beyond(height[near], start[near], end[near])
+        angle[near] -= 2 * np.pi * _mass_beyond_edges(height[near], start[near], end[near])
         turning += angle
-    return _mix_by_share(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
+    return _albedo_by_share_inside(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
 
 
 @seen_by_one.register
-def _(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_carded_region(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate over the region and over each card by itself, then lay the cards over the region."""
     covered = [seen_by_one(card.region, gaussian, n_nodes) for card in region.cards]
-    return seen_with_cards(seen_by_one(region.region, gaussian, n_nodes), region.cards, covered)
+    return mean_albedo_with_cards(seen_by_one(region.region, gaussian, n_nodes), region.cards, covered)
 
 
-def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
+def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
     """Return the unit Gaussian's mass beyond edges, (n_edges,), in the angle each spans: Owen's T from start to end.
 
     An end out of reach counts as infinitely far, where T is half the mass beyond the edge's line.
@@ -345,7 +350,7 @@ def _mass_beyond(height: FloatArray, start: FloatArray, end: FloatArray) -> Floa
 
 
 @cache
-def _legendre(n_nodes: int) -> tuple[FloatArray, FloatArray]:
+def _half_legendre_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
     """Return the positive half of the Gauss-Legendre rule on (-1, 1): nodes and weights."""
     if n_nodes < 2 or n_nodes % 2:
         raise ParameterError("n_nodes", n_nodes, "an even number, 2 or more")
@@ -354,7 +359,7 @@ def _legendre(n_nodes: int) -> tuple[FloatArray, FloatArray]:
 
 
 @seen_by_one.register
-def _(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_ellipse(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate cumulatives along the normal by quadrature along the tangent, after a map to the unit disc."""
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
     cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
@@ -373,17 +378,19 @@ def _(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         var_q = (sine**2 * gaussian.var_x + cosine**2 * gaussian.var_y - cross) / b**2
         twist = cosine * sine * (gaussian.var_y - gaussian.var_x) + (cosine**2 - sine**2) * gaussian.cov_xy
         cov_pq = twist / (a * b)
-    return _mix_by_share(region.outside, region.inside, _seen_of_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes))
+    return _albedo_by_share_inside(
+        region.outside, region.inside, _mass_in_unit_disc(p, q, var_p, var_q, cov_pq, n_nodes)
+    )
 
 
-def _seen_of_unit_disc(
+def _mass_in_unit_disc(
     p: FloatArray, q: FloatArray, var_p: FloatArray, var_q: FloatArray, cov_pq: FloatArray, n_nodes: int
 ) -> FloatArray:
     """Return the mass of Gaussians, arrays broadcasting to (n_samples, n_points), inside the unit circle.
 
     Only the (sample, reading) pairs whose edge is within reach are integrated.
     """
-    reach = _reach_of(n_nodes)
+    reach = _reach_in_sds(n_nodes)
     largest = np.sqrt(0.5 * (var_p + var_q) + np.hypot(0.5 * (var_p - var_q), cov_pq))
     distance = np.sqrt(p * p + q * q)
     near = np.abs(distance - 1) < reach * largest
@@ -401,7 +408,7 @@ def _seen_of_unit_disc(
     cc, ss, cs = c * c, s * s, c * s
     cross = 2 * cs * cov_pq
     var_r, var_t = cc * var_p + ss * var_q + cross, ss * var_p + cc * var_q - cross
-    share[near] = _mass_in_disc(d, var_r, var_t, cs * (var_q - var_p) + (cc - ss) * cov_pq, reach, n_nodes)
+    share[near] = _mass_near_edge_in_disc(d, var_r, var_t, cs * (var_q - var_p) + (cc - ss) * cov_pq, reach, n_nodes)
     return np.clip(share, 0.0, 1.0)
 
 
@@ -409,12 +416,12 @@ _BLOCK = 2**13  # nodes at a time: they fit the cache
 _FLAT, _BENT = 0.01, 0.4  # curvature of an edge, in footprints of sd 1, up to which few and some nodes suffice
 
 
-def _reach_of(n_nodes: int) -> float:
+def _reach_in_sds(n_nodes: int) -> float:
     """Choose how many standard deviations n_nodes cover, so that truncation and quadrature errors balance."""
     return float(np.clip(4.3 + (n_nodes - 20) / 20, 4.0, 6.5))
 
 
-def _mass_in_disc(
+def _mass_near_edge_in_disc(
     d: FloatArray, var_r: FloatArray, var_t: FloatArray, cov: FloatArray, reach: float, n_nodes: int
 ) -> FloatArray:
     """Integrate Gaussians over the unit disc, mean at (d, 0), radial and tangential variances; (n_pairs,) each.
@@ -441,14 +448,14 @@ def _mass_in_disc(
     left = np.ones(len(d), dtype=np.bool_)
     tilt = slope / sd_y * per_sd
     for n, most in ((n_nodes // 4, _FLAT), (2 * n_nodes // 5, _BENT)):
-        inside = np.abs(mean_y) + _hermite(n)[0][-1] * sd_y < 1
+        inside = np.abs(mean_y) + _hermite_rule(n)[0][-1] * sd_y < 1
         rows = np.flatnonzero(left & inside & (curvature < most))
         left[rows] = False
         for r in _blocks_of_rows(rows, n):
-            found[r] = _skewed_chords(mean_x[r], mean_y[r], sd_y[r], per_sd[r], tilt[r], n)
-    rule = _legendre(n_nodes)
+            found[r] = _mass_along_skewed_chords(mean_x[r], mean_y[r], sd_y[r], per_sd[r], tilt[r], n)
+    rule = _half_legendre_rule(n_nodes)
     for r in _blocks_of_rows(np.flatnonzero(left), n_nodes):
-        found[r] = _long_chords(d[r], var_r[r], var_t[r], cov[r], reach, rule)
+        found[r] = _mass_along_long_axis(d[r], var_r[r], var_t[r], cov[r], reach, rule)
     return found
 
 
@@ -457,33 +464,35 @@ def _blocks_of_rows(rows: IntArray, n_nodes: int) -> Iterator[IntArray]:
     return (rows[start : start + step] for start in range(0, len(rows), step))
 
 
-def _cumulative(z: FloatArray) -> FloatArray:
-    """Look up the normal cumulative in the table, in place, however few values there are: none depends on others."""
+def _normal_cdf_from_table(z: FloatArray) -> FloatArray:
+    """Look up the normal cumulative in the table, in place, so that no value depends on how many there are."""
     z *= PER_SD
     z += CENTRE
     normal_cdf_in_place(z)
     return z
 
 
-def _skewed_chords(
+def _mass_along_skewed_chords(
     mean_x: FloatArray, mean_y: FloatArray, sd_y: FloatArray, per_sd: FloatArray, tilt: FloatArray, n_nodes: int
 ) -> FloatArray:
     """Integrate along x over Gaussians whose mean in x moves by `tilt` conditional sds for each sd in y."""
-    node, weight = _hermite(n_nodes)
+    node, weight = _hermite_rule(n_nodes)
     along = node[:, None] * sd_y
     along += mean_y
     along *= along
     np.subtract(1.0, along, out=along)
     np.sqrt(along, out=along)
     across = node[:, None] * tilt
-    found = weight @ _cumulative((along - mean_x) * per_sd - across)
+    found = weight @ _normal_cdf_from_table((along - mean_x) * per_sd - across)
     back = np.flatnonzero(node[-1] * np.abs(tilt) - mean_x * per_sd > -_REACH)
     if back.size:
-        found[back] -= weight @ _cumulative((-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back])
+        found[back] -= weight @ _normal_cdf_from_table(
+            (-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back]
+        )
     return np.asarray(found)
 
 
-def _long_chords(
+def _mass_along_long_axis(
     d: FloatArray,
     var_r: FloatArray,
     var_t: FloatArray,
@@ -491,14 +500,14 @@ def _long_chords(
     reach: float,
     rule: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Integrate along the long axis; the short one, y = sin(4 arctan u), removes the root at the end of the chords."""
+    """Integrate along the long axis; across it y = sin(4 arctan u), which removes the root at the end of the chords."""
     half, spread = 0.5 * (var_r + var_t), 0.5 * (var_r - var_t)
     twist = np.hypot(spread, cov)
     long = np.sqrt(half + twist)
     short = np.sqrt(var_r * var_t - cov * cov) / long
     cosine = np.sqrt(0.5 + 0.5 * spread / np.where(twist > 0, twist, 1.0))
     mean_x, mean_y = d * cosine, d * np.sqrt(1 - cosine * cosine)
-    low, high = (_quarter_tangent((mean_y + side * reach * short).clip(-1.0, 1.0)) for side in (-1, 1))
+    low, high = (_tangent_of_quarter_arcsine((mean_y + side * reach * short).clip(-1.0, 1.0)) for side in (-1, 1))
     node, weight = rule
     u = np.concatenate([-node[::-1], node])[:, None] * (0.5 * (high - low)) + 0.5 * (high + low)
     widen = 1 / (1 + u * u)
@@ -506,8 +515,8 @@ def _long_chords(
     x = 1 - 2 * sine * sine
     y = 2 * sine * (1 - u * u) * widen
     per_long = 1 / long
-    inner = _cumulative((x - mean_x) * per_long)
-    inner -= _cumulative((-x - mean_x) * per_long)
+    inner = _normal_cdf_from_table((x - mean_x) * per_long)
+    inner -= _normal_cdf_from_table((-x - mean_x) * per_long)
     y -= mean_y
     y /= short
     inner *= np.exp(-0.5 * y * y) * x * widen
@@ -516,21 +525,21 @@ def _long_chords(
     )
 
 
-def _quarter_tangent(y: FloatArray) -> FloatArray:
-    """Return the tangent of a quarter of the arc sine."""
+def _tangent_of_quarter_arcsine(y: FloatArray) -> FloatArray:
+    """Return tan(arcsin(y) / 4)."""
     half = y / (1 + np.sqrt(1 - y * y))
     return np.asarray(half / (1 + np.sqrt(1 + half * half)))
 
 
 @cache
-def _hermite(n_nodes: int) -> tuple[FloatArray, FloatArray]:
+def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
     """Return nodes and weights for the mean over a standard normal."""
     node, weight = np.polynomial.hermite_e.hermegauss(n_nodes)
     return node, weight / weight.sum()
 
 
 @seen_by_one.register
-def _(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_mixture(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate each hypothesis by the rule for its kind of region."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows_and_regions():
@@ -539,7 +548,7 @@ def _(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArr
 
 
 @seen_by_one.register
-def _(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate each row of pixels exactly along x, and by Gauss-Legendre across it, in panels within the footprint."""
     shape = gaussian.shape
     out = np.empty(shape)
@@ -548,18 +557,18 @@ def _(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
         np.broadcast_to(gaussian.y_mm + gaussian.dy_mm, shape),
     )
     for i, j in np.ndindex(*shape):
-        out[i, j] = _seen_of_image(
+        out[i, j] = _mean_albedo_of_image(
             region,
             float(x[i, j]),
             float(y[i, j]),
-            _entry(gaussian.var_x, i, j),
-            _entry(gaussian.var_y, i, j),
-            _entry(gaussian.cov_xy, i, j),
+            _broadcast_entry(gaussian.var_x, i, j),
+            _broadcast_entry(gaussian.var_y, i, j),
+            _broadcast_entry(gaussian.cov_xy, i, j),
         )
     return out
 
 
-def _seen_of_image(region: ImageRegion, x: float, y: float, var_x: float, var_y: float, cov: float) -> float:
+def _mean_albedo_of_image(region: ImageRegion, x: float, y: float, var_x: float, var_y: float, cov: float) -> float:
     n_rows, n_columns = region.values.shape
     pixel = region.pixel_mm
     sd_y = float(np.sqrt(var_y))

@@ -100,7 +100,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class NoiseLevel:
-    """Noise of the readings: `sd` broadcasts to (n_samples, n_points); unless said, the rest are (n_samples, 1).
+    """Noise of the readings: `sd` broadcasts to (n_samples, n_points); unless stated, the rest are (n_samples, 1).
 
     `rho` is the AR(1) correlation within a scan. A random walk of the offset has steps of `walk` sds from row to row
     and has taken `walked` (n_points,) steps by each row. With probability `wide_share` a reading's noise is

@@ -14,7 +14,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
 from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf_in_place
-from probewise.sensor.gaussian import LabGaussian, beyond_corner, mass_in_quadrant, turned
+from probewise.sensor.gaussian import LabGaussian, mass_in_quadrant, probabilities_beyond_corner, turn_into_lab_frame
 from probewise.sensor.stages import Footprint, Poses
 
 _BLOCK = 2**14  # elements at a time: they fit the cache
@@ -24,7 +24,7 @@ _SAME_ANGLE, _SAME_MM = 1e-12, 1e-10  # smaller differences of angles (radians) 
 
 @dataclass(frozen=True, eq=False)
 class StraightEdges:
-    """Half-planes under the readings `rows`; each field is (n_rows,) unless said.
+    """Half-planes under the readings `rows`; each field is (n_rows,) unless stated otherwise.
 
     Parameters
     ----------
@@ -45,13 +45,13 @@ class StraightEdges:
     outside: FloatArray
 
     @classmethod
-    def of(cls, parts: list[tuple[IntArray, HalfPlaneRegion]], poses: Poses) -> StraightEdges:
+    def from_regions(cls, parts: list[tuple[IntArray, HalfPlaneRegion]], poses: Poses) -> StraightEdges:
         """Batch regions of one hypothesis each, for orientations that are the same for all hypotheses."""
         rows = np.concatenate([r for r, _ in parts])
         of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
         normal = np.array([region.normal_rad[0] for _, region in parts])[of]
         offset = np.array([region.offset_mm[0] for _, region in parts])[of]
-        x, y, orientation = (columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
+        x, y, orientation = (columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
         return cls(
             rows,
             np.broadcast_to(normal - orientation[0], rows.shape),
@@ -61,8 +61,8 @@ class StraightEdges:
         )
 
     @cached_property
-    def _views(self) -> _EdgeViews:
-        return _EdgeViews.of(self)
+    def _distinct_views(self) -> _DistinctEdgeViews:
+        return _DistinctEdgeViews.from_edges(self)
 
     @cached_property
     def _contiguous_rows(self) -> slice | None:
@@ -73,45 +73,48 @@ class StraightEdges:
     def write_response(self, footprint: Footprint, out: FloatArray) -> None:
         """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
         seen = np.empty((len(out), len(self.rows))) if self._contiguous_rows is None else out[:, self._contiguous_rows]
-        if len(self.distance_mm) == 1 and not _varies(footprint):
-            self._views.write_response(footprint, seen)
+        if len(self.distance_mm) == 1 and not _varies_with_reading(footprint):
+            self._distinct_views.write_response(footprint, seen)
         else:
-            self._write_each_share(footprint, seen)
+            self._write_shares_by_hypothesis(footprint, seen)
             seen *= self.inside - self.outside
             seen += self.outside
         if self._contiguous_rows is None:
             out[:, self.rows] = seen
 
-    def _write_each_share(self, footprint: Footprint, share: FloatArray) -> None:
+    def _write_shares_by_hypothesis(self, footprint: Footprint, share: FloatArray) -> None:
         """Write the shares inside where the position varies with the hypothesis or the footprint with the reading."""
         weight, *moments = (self._own_columns(a) for a in (footprint.weight, *footprint.moments))
-        varies = _varies(footprint)
+        varies = _varies_with_reading(footprint)
         angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
-        per_sd, shift = np.broadcast_arrays(*_projected(angles[:, None], *moments))
+        per_sd, shift = np.broadcast_arrays(*_projected_on_axes(angles[:, None], *moments))
         share[:] = 0.0
         step = max(1, _BLOCK // len(self.rows))
         for start in range(0, len(share), step):
             block = slice(start, start + step)
-            distance = _rows_of(self.distance_mm, block)
+            distance = _hypotheses_in_block(self.distance_mm, block)
             for g in range(footprint.weight.shape[2]):
-                own_shift, own_per_sd = _rows_of(shift, block)[:, :, g], _rows_of(per_sd, block)[:, :, g]
+                own_shift, own_per_sd = (
+                    _hypotheses_in_block(shift, block)[:, :, g],
+                    _hypotheses_in_block(per_sd, block)[:, :, g],
+                )
                 if which is not None:
                     own_shift, own_per_sd = own_shift[:, which], own_per_sd[:, which]
                 cells = own_shift + distance
                 cells = cells * (own_per_sd * PER_SD)
                 cells += CENTRE
                 normal_cdf_in_place(cells)
-                share[block] += cells * _rows_of(weight, block)[:, :, g]
+                share[block] += cells * _hypotheses_in_block(weight, block)[:, :, g]
 
     def _own_columns(self, array: FloatArray) -> FloatArray:
         """Select the columns of these readings, as a view where they are contiguous."""
         if self._contiguous_rows is None or array.shape[1] == 1:
-            return columns_of(array, self.rows)
+            return columns_of_readings(array, self.rows)
         return array[:, self._contiguous_rows]
 
 
 @dataclass(frozen=True, eq=False)
-class _EdgeViews:
+class _DistinctEdgeViews:
     """The distinct views of straight edges: scans out and back, and from both sides, share them.
 
     An edge seen from its other side is the same view with black and white exchanged. `angle_rad` (n_angles,) runs from
@@ -127,7 +130,7 @@ class _EdgeViews:
     gain: FloatArray
 
     @classmethod
-    def of(cls, edges: StraightEdges) -> _EdgeViews:
+    def from_edges(cls, edges: StraightEdges) -> _DistinctEdgeViews:
         """Find the distinct views of edges whose distance is the same for all hypotheses."""
         n_half_turns = np.floor(edges.turn_rad / np.pi + _SAME_ANGLE)
         behind = n_half_turns % 2 == 1
@@ -139,7 +142,7 @@ class _EdgeViews:
         return cls(angles, which, views[1], view.reshape(-1), low, high - low)
 
     @cached_property
-    def _views_from_angles(self) -> FloatArray:
+    def _matrix_from_angles_to_views(self) -> FloatArray:
         """Matrix from the angles' (1/sd, mean/sd) to the views' table positions, (2 n_angles, n_views)."""
         own = np.eye(len(self.angle_rad))[:, self.which]
         return np.concatenate([own * self.distance_mm, own])
@@ -149,8 +152,8 @@ class _EdgeViews:
 
         Gaussians are projected once per angle and mapped to the views by a matrix product, block by block.
         """
-        weight, *moments = _samples_last(footprint)
-        per_sd, shift = _projected(self.angle_rad[:, None, None], *moments)
+        weight, *moments = _with_samples_last(footprint)
+        per_sd, shift = _projected_on_axes(self.angle_rad[:, None, None], *moments)
         n_angles, n_gaussians, n_samples = np.broadcast(per_sd, shift, weight).shape
         both = np.empty((2 * n_angles, n_gaussians, n_samples))
         both[:n_angles] = per_sd * PER_SD
@@ -162,7 +165,7 @@ class _EdgeViews:
         for start in range(0, n_samples, step):
             here = both[:, start : start + step]
             if n_angles <= _FEW_ANGLES:
-                cells = here @ self._views_from_angles
+                cells = here @ self._matrix_from_angles_to_views
             else:
                 cells = here[..., self.which] * self.distance_mm
                 cells += here[..., n_angles + self.which]
@@ -185,7 +188,7 @@ class StraightCorners:
     poses: Poses
 
     @classmethod
-    def of(cls, parts: list[tuple[IntArray, QuadrantRegion]], poses: Poses) -> StraightCorners:
+    def from_regions(cls, parts: list[tuple[IntArray, QuadrantRegion]], poses: Poses) -> StraightCorners:
         """Batch regions of one hypothesis each."""
         rows = np.concatenate([r for r, _ in parts])
         of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
@@ -195,32 +198,34 @@ class StraightCorners:
             np.concatenate([region.direction for _, region in parts])[of],
             np.array([region.inside for _, region in parts])[of],
             np.array([region.outside for _, region in parts])[of],
-            Poses(*(columns_of(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))),
+            Poses(*(columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))),
         )
 
     @cached_property
-    def _views(self) -> _CornerViews:
-        return _CornerViews.of(self)
+    def _distinct_views(self) -> _DistinctCornerViews:
+        return _DistinctCornerViews.from_corners(self)
 
     def write_response(self, footprint: Footprint, out: FloatArray) -> None:
         """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
         poses = self.poses
         still = len(poses.x_mm) == len(poses.y_mm) == len(poses.orientation_rad) == 1
-        if still and not _varies(footprint):
-            out[:, self.rows] = self._views.response(footprint)
+        if still and not _varies_with_reading(footprint):
+            out[:, self.rows] = self._distinct_views.response(footprint)
             return
-        moved = turned(poses.orientation_rad[..., None], *(columns_of(a, self.rows) for a in footprint.moments))
+        moved = turn_into_lab_frame(
+            poses.orientation_rad[..., None], *(columns_of_readings(a, self.rows) for a in footprint.moments)
+        )
         gaussians = LabGaussian(
             poses.x_mm[..., None], poses.y_mm[..., None], *moved
         )  # (n_samples, n_rows, n_gaussians)
         (corner_x, corner_y), (to_x, to_y) = self.corner_mm.T[..., None], self.direction.T[..., None]
         found = mass_in_quadrant(corner_x, corner_y, to_x, to_y, gaussians)
-        share = (found * columns_of(footprint.weight, self.rows)).sum(axis=2)
+        share = (found * columns_of_readings(footprint.weight, self.rows)).sum(axis=2)
         out[:, self.rows] = self.outside + (self.inside - self.outside) * share
 
 
 @dataclass(frozen=True, eq=False)
-class _CornerViews:
+class _DistinctCornerViews:
     """The distinct views of corners; one view serves all four quadrants about the corner.
 
     Three masses determine every quadrant: beyond the corner along both axes, along x, and along y. `turn_rad` is the
@@ -235,7 +240,7 @@ class _CornerViews:
     low: FloatArray
 
     @classmethod
-    def of(cls, corners: StraightCorners) -> _CornerViews:
+    def from_corners(cls, corners: StraightCorners) -> _DistinctCornerViews:
         """Find the distinct views of corners where the position is the same for all hypotheses."""
         poses = corners.poses
         x, y = corners.corner_mm[:, 0] - poses.x_mm[0], corners.corner_mm[:, 1] - poses.y_mm[0]
@@ -252,27 +257,27 @@ class _CornerViews:
 
     def response(self, footprint: Footprint) -> FloatArray:
         """Compute the responses to a footprint that is the same at all readings, (n_samples or 1, n_rows)."""
-        weight, *moments = _samples_last(footprint)
+        weight, *moments = _with_samples_last(footprint)
         turn, x, y = (a[:, None, None] for a in (self.turn_rad, self.x_mm, self.y_mm))
-        dx, dy, var_x, var_y, cov_xy = turned(turn, *moments)
+        dx, dy, var_x, var_y, cov_xy = turn_into_lab_frame(turn, *moments)
         sd_x, sd_y = np.sqrt(var_x), np.sqrt(var_y)
-        shares = beyond_corner((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
+        shares = probabilities_beyond_corner((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
         # Sum over the Gaussians: (n_views, n_gaussians, n_samples) each -> (3 n_views, n_samples).
         beyond = np.concatenate([(share * weight).sum(axis=1) for share in shares])
         return np.asarray(beyond.T @ self.readings_from_masses + self.low)
 
 
-def _varies(footprint: Footprint) -> bool:
-    """Return whether the Gaussians or their weights change with the reading."""
+def _varies_with_reading(footprint: Footprint) -> bool:
+    """Return whether the Gaussians or their weights differ between readings."""
     return any(a.shape[1] > 1 for a in (footprint.weight, *footprint.moments))
 
 
-def _samples_last(footprint: Footprint) -> tuple[FloatArray, ...]:
+def _with_samples_last(footprint: Footprint) -> tuple[FloatArray, ...]:
     """Return weight and moments of a footprint that is the same at all readings, (n_gaussians, n_samples or 1) each."""
     return tuple(a[:, 0].T for a in (footprint.weight, *footprint.moments))
 
 
-def _projected(
+def _projected_on_axes(
     angle_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Project Gaussians on axes at these angles; return 1/sd and mean; the arrays broadcast."""
@@ -281,11 +286,11 @@ def _projected(
     return np.asarray(1 / np.sqrt(variance)), c * u_mm + s * v_mm
 
 
-def _rows_of(array: FloatArray, block: slice) -> FloatArray:
+def _hypotheses_in_block(array: FloatArray, block: slice) -> FloatArray:
     """Select a block of hypotheses from an array whose sample axis may be 1."""
     return array if array.shape[0] == 1 else array[block]
 
 
-def columns_of(array: FloatArray, rows: IntArray) -> FloatArray:
+def columns_of_readings(array: FloatArray, rows: IntArray) -> FloatArray:
     """Select the columns of the readings `rows` from an array whose point axis may be 1."""
     return array if array.shape[1] == 1 else array[:, rows]

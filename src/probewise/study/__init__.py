@@ -4,7 +4,7 @@ A study is a campaign of autonomous runs: every row of its table has the same ci
 from a reference row in one factor.
 """
 
-from probewise.study.circles import POPULATIONS, Population, noise_of
+from probewise.study.circles import POPULATIONS, Population, noise_of_run
 from probewise.study.concealed import (
     CONCEALED,
     ConcealedRow,
@@ -16,7 +16,7 @@ from probewise.study.concealed import (
 )
 from probewise.study.rows import REFERENCE, Row, paper_rows, standard_rows
 from probewise.study.run import Study, read_study, run_study
-from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_within, summarise
+from probewise.study.table import LEAST_FOR_MEDIAN, Estimate, Summary, share_with_interval, summarise
 from probewise.study.trial import Trial, arm_of, experiment_of, run_trial
 
 __all__ = [
@@ -36,14 +36,20 @@ __all__ = [
     "concealed_rows",
     "concealed_table",
     "experiment_of",
-    "noise_of",
+    "noise_of_run",
     "paper_rows",
     "read_study",
     "run_concealed",
     "run_concealed_trial",
     "run_study",
     "run_trial",
-    "share_within",
+    "share_with_interval",
     "standard_rows",
     "summarise",
 ]
+
+noise_of = noise_of_run
+"""The old name of `noise_of_run`."""
+
+share_within = share_with_interval
+"""The old name of `share_with_interval`."""

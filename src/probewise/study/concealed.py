@@ -25,8 +25,17 @@ from probewise.progress import Progress, silent
 from probewise.recordings import Disc
 from probewise.study.circles import FIELD, POPULATIONS
 from probewise.study.rows import REFERENCE
-from probewise.study.table import WRONG_MM, Estimate, share_within
-from probewise.study.trial import BRIGHT, DARK, SEED, accuracy_of, experiment_of, reached, spot_of, timed_steps
+from probewise.study.table import WRONG_MM, Estimate, share_with_interval
+from probewise.study.trial import (
+    BRIGHT,
+    DARK,
+    SEED,
+    accuracy_of,
+    experiment_of,
+    footprint_pixels,
+    has_reached_target,
+    timed_steps,
+)
 from probewise.world import AmbientGradient, Backlash, Concealed, GainDrift, Nonlinearity, Saturation, World
 from probewise.world.concealed import (
     AlbedoGradient,
@@ -59,7 +68,7 @@ _SPEED = Speed(move_mm_s=500.0, read_s=_EACH_S - 0.8)
 
 
 @dataclass(frozen=True)
-class Fading:
+class FadingLamp:
     """A lamp that fades linearly: every eight seconds it loses the same share of its first signal, down to zero."""
 
     share: float
@@ -68,7 +77,7 @@ class Fading:
     stage: ClassVar[Stage] = "gain"
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        """Scale the signal by what is left at the time of each row."""
+        """Multiply the signal by the share of light that the lamp still gives at each row's time."""
         return np.asarray(values * np.maximum(1.0 - self.share * rows.time_s / _EACH_S, 0.0))
 
 
@@ -85,7 +94,7 @@ CONCEALED: Mapping[str, tuple[Callable[[float], Concealed], tuple[float, float, 
     "halo": (lambda share: Halo(share, 25.0), (0.05, 0.2, 0.4)),
     "dropouts": (lambda share: Dropouts(share, DARK), (0.03, 0.1, 0.2)),
     "outliers": (lambda share: Outliers(share, 12.0), (0.03, 0.1, 0.2)),
-    "gain_loss": (Fading, (0.001, 0.005, 0.01)),
+    "gain_loss": (FadingLamp, (0.001, 0.005, 0.01)),
     "hysteresis": (Hysteresis, (1.0, 4.0, 10.0)),
     "lag": (Lag, (2.0, 4.0, 8.0)),
     "flicker": (lambda units: Flicker(units, 0.37, 1.0), (1.5, 4.0, 8.0)),
@@ -169,7 +178,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
         cpu.append(cpu_s)
     left_out = left_out_of(last, trial.trust)
     return {
-        "known": reached(last, experiment),
+        "known": has_reached_target(last, experiment),
         "readings": last.number,
         **accuracy_of(last, experiment, trial.truth),
         "p_truth": round(left_out.probability.get(trial.name, 0.0), 4),
@@ -185,7 +194,7 @@ def _arm_in_concealed_world(trial: ConcealedTrial) -> SimulatedArm:
     if trial.effect:
         make, sizes = CONCEALED[trial.effect]
         concealed = (make(sizes[trial.size]),)
-    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=REFERENCE.noise_sd, concealed=concealed)
+    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=REFERENCE.noise_sd, concealed=concealed)
     x_mm, y_mm, radius_mm = trial.circle_mm.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
     came: list[tuple[Pose, float, tuple[float, float]]] = []
@@ -308,11 +317,11 @@ def _summary_row(key: tuple[str, int, float], runs: list[tuple[str, Mapping[str,
         runs=n,
         readings=float(np.median([run["readings"] for run in found])),
         mean_readings=round(float(np.mean([run["readings"] for run in found])), 1),
-        reached=share_within(sum(run["known"] for run in found), n),
-        intervals_hold=share_within(sum(held), len(held)),
-        sure_and_wrong=share_within(sum(run["known"] and run["error_mm"] > WRONG_MM for run in found), n),
-        noticed=share_within(sum(run["noticed"] for run in found), n),
-        in_credible_set=share_within(sum(name in run["credible"] for name, run in runs), n),
+        reached=share_with_interval(sum(run["known"] for run in found), n),
+        intervals_hold=share_with_interval(sum(held), len(held)),
+        sure_and_wrong=share_with_interval(sum(run["known"] and run["error_mm"] > WRONG_MM for run in found), n),
+        noticed=share_with_interval(sum(run["noticed"] for run in found), n),
+        in_credible_set=share_with_interval(sum(name in run["credible"] for name, run in runs), n),
         names=round(float(np.mean([len(run["credible"]) for run in found])), 1),
         cpu_s_median=round(float(np.median([run["cpu_s"][0] for run in found])), 2),
         cpu_s_95=round(float(np.median([run["cpu_s"][1] for run in found])), 2),

@@ -102,7 +102,7 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
     expected = float(sum(t["chance_wrong"] for t in sure))
     return Summary(
         n_runs=len(trials),
-        reached=share_within(len(sure), len(trials)),
+        reached=share_with_interval(len(sure), len(trials)),
         mean=_mean_with_error(needed),
         median=_median_with_interval(needed),
         to_white=_mean_with_error(met),
@@ -118,7 +118,7 @@ def summarise(trials: Sequence[Mapping[str, Any]], *, max_readings: int) -> Summ
     )
 
 
-def share_within(k: int, n: int) -> Estimate:
+def share_with_interval(k: int, n: int) -> Estimate:
     """Estimate a share from k of n, with Wilson's 95 % interval.
 
     Wilson's interval has its nominal coverage also near 0 and 1 (Wilson 1927).

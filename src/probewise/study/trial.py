@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.arm import LegoScale, Pose, Reach, SimulatedArm
+from probewise.arm import Pose, Reach, ReadingScale, SimulatedArm
 from probewise.experiment import (
     AdjustedMixture,
-    Change,
     Experiment,
     NestedSampling,
+    SensorChangeSds,
     Step,
-    chance_off,
     explore,
-    levels_in,
+    naive_levels_from_world,
+    probability_of_length_off,
     student_t_bounds,
 )
 from probewise.inference import GaussianKnown, Naive
@@ -32,7 +32,7 @@ from probewise.priors import Normal, Product
 from probewise.recordings import Disc
 from probewise.scene import HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
-from probewise.study.circles import FIELD, POPULATIONS, noise_of
+from probewise.study.circles import FIELD, POPULATIONS, noise_of_run
 from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, Spot, World, gaussian_spot
@@ -43,7 +43,7 @@ DARK, BRIGHT = 10.0, 60.0
 _CENTRE, _SD, _CORRELATION = (0.0, 1.5), (4.0, 2.5), 0.2
 _ON_WHITE = DARK + 0.1 * (BRIGHT - DARK)
 _PIXEL_MM = 0.5
-_UNROUNDED = LegoScale(-math.inf, math.inf, None)
+_UNROUNDED = ReadingScale(-math.inf, math.inf, None)
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ def experiment_of(row: Row) -> Experiment:
             return Experiment(shape, chain, student_t_bounds(levels, None), **common)
         return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
     free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
-    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_sensor_changes())
+    return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_prior_of_sensor_changes())
 
 
 def experiment_for_trial(trial: Trial) -> Experiment:
@@ -100,8 +100,8 @@ def experiment_for_trial(trial: Trial) -> Experiment:
     posed = experiment_of(trial.row)
     if (trial.row.method, trial.row.model) != ("paper", "naive"):
         return posed
-    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=trial.row.noise_sd)
-    naive = levels_in(world, _UNROUNDED, rng=np.random.default_rng([SEED, trial.circle, 1]))
+    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=trial.row.noise_sd)
+    naive = naive_levels_from_world(world, _UNROUNDED, rng=np.random.default_rng([SEED, trial.circle, 1]))
     model = NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), HypothesisScene(posed.shape))
     return replace(posed, model=model, likelihood=naive)
 
@@ -126,7 +126,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         if first_white is None and step.reading.value > _ON_WHITE:
             first_white, bits_at_white = step.number, round(step.bits, 3)
     return {
-        "reached": reached(last, experiment),
+        "reached": has_reached_target(last, experiment),
         "readings": last.number,
         "first_white": first_white,
         "bits": round(last.bits, 3),
@@ -154,9 +154,9 @@ def timed_steps(
             yield step, time.process_time() - before
 
 
-def reached(last: Step, experiment: Experiment) -> bool:
+def has_reached_target(last: Step, experiment: Experiment) -> bool:
     """Return whether a run reached the target precision with a posterior that fits its readings."""
-    known = experiment.is_known(last.sd, last.shapes, last.chance_off)
+    known = experiment.may_stop(last.sd, last.shapes, last.chance_off)
     return bool(last.p_value >= experiment.doubt_p and known)
 
 
@@ -170,17 +170,17 @@ def accuracy_of(last: Step, experiment: Experiment, truth: FloatArray) -> dict[s
         held.append(bool(0.025 <= below <= 0.975))
     return {
         "error_mm": round(float(np.abs(last.mean - truth).max()), 3),
-        "chance_wrong": chance_off(experiment, last.posterior, WRONG_MM),
+        "chance_wrong": probability_of_length_off(experiment, last.posterior, WRONG_MM),
         "held": held,
     }
 
 
 def arm_of(trial: Trial) -> SimulatedArm:
     """Return an arm that reaches the whole grid over the circle, with the noise that all rows share."""
-    world = World(spot_of(), black=DARK, white=BRIGHT, noise_sd=0.0)
+    world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
-    noise, number = noise_of(trial.circle, trial.max_readings), itertools.count()
+    noise, number = noise_of_run(trial.circle, trial.max_readings), itertools.count()
 
     def light(pose: Pose, time_s: float, height_mm: float) -> float:
         clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)
@@ -191,14 +191,14 @@ def arm_of(trial: Trial) -> SimulatedArm:
 
 
 @lru_cache(maxsize=1)
-def spot_of() -> Spot:
+def footprint_pixels() -> Spot:
     """Return the footprint of the study's sensor as pixels."""
     return gaussian_spot([Blob(1.0, _CENTRE, _SD, _CORRELATION)], pixel_mm=_PIXEL_MM)
 
 
-def _sensor_changes() -> Product:
+def _prior_of_sensor_changes() -> Product:
     """Return the prior of changes of the sensor, the default of `experiment.sensor_prior`."""
-    change = Change()
+    change = SensorChangeSds()
     level = change.level * (BRIGHT - DARK)
     size, shift = Normal(0.0, change.log_size), Normal(0.0, change.shift_mm)
     return Product(

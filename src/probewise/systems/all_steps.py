@@ -22,12 +22,13 @@ from probewise.systems.motion import (
     Given,
     Motion,
     RowsInRuns,
+    Stepper,
     gaps_of,
     integrate_states,
     starts_of,
     states_by_step,
-    stepped,
 )
+from probewise.systems.runge_kutta import Stepping
 from probewise.systems.table import RunTable
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
@@ -56,9 +57,14 @@ class Steps:
     max_step: float
 
     @cached_property
+    def stepping(self) -> Stepping:
+        """The steps from each position of the runs to the next, and their method."""
+        return self.places.stepping(self.max_step)
+
+    @property
     def in_gap(self) -> IntArray:
         """Number of steps from each position of the runs to the next, (n_places - 1,)."""
-        return self.places.n_steps(self.max_step)
+        return self.stepping.in_gap
 
     @cached_property
     def gap(self) -> IntArray:
@@ -207,7 +213,7 @@ def integrate_near(
             memory.useless = True
     if left.size:
         motion, parameters, columns = problem(left)
-        every = states_by_step(motion, steps.places, parameters, columns, steps.in_gap)
+        every = states_by_step(motion, steps.places, parameters, columns, steps.stepping)
         there = np.stack([[*s.values()] for s in every], axis=2)
         if states is None:
             states = there
@@ -351,12 +357,12 @@ def _every_step(problem: Problem, steps: Steps, samples: IntArray) -> Callable[[
     first = {state: np.zeros((len(samples), steps.n_runs)) for state in motion.law.states}
     between = Given.of(motion, steps.places, parameters, columns, first).throughout(steps.gap)
     passing = gaps_of(steps.places, columns)[:, steps.gap]
-    width = passing.reshape(len(passing), -1)
+    stepper = Stepper(motion, steps.stepping.method, between, passing.reshape(len(passing), -1))
 
     def ends(begins: FloatArray) -> FloatArray:
         shape = begins.shape
         s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
-        after = stepped(motion, s, between, width, steps.begin, steps.length)
+        after = stepper.step(s, steps.begin, steps.length)
         return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
 
     return ends

@@ -11,7 +11,7 @@ from typing import Any
 
 from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError
-from probewise.recordings.python_file import error_text, run_python_text
+from probewise.recordings.python_file import error_on_one_line, run_python_text
 from probewise.recordings.text import read_text
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_of
 
@@ -56,7 +56,9 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
         raise FileError(path, found, error.allowed + hint) from error
     except (TypeError, ValueError, AttributeError, LookupError) as error:
         raise FileError(
-            path, f"what it says does not fit together ({error_text(error)})", f"these names: {', '.join(_NAMES)}"
+            path,
+            f"what it says does not fit together ({error_on_one_line(error)})",
+            f"these names: {', '.join(_NAMES)}",
         ) from error
 
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_kind
-from probewise._posterior_samples import NamedSamples, interval_table, require_absent, require_samples
+from probewise._posterior_samples import NamedSamples, interval_table, require_masks_of_absent_effects, require_samples
 from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError
-from probewise.recordings import strict_json, write_text_atomically
+from probewise.recordings import parse_strict_json, write_text_atomically
 from probewise.recordings.table import csv_text, number_text
 from probewise.recordings.text import read_text
 from probewise.systems.forms.rebinding import Recorded
@@ -87,7 +87,7 @@ class FittedSystem(NamedSamples):
             raise ParameterError("names", self.names, f"all parameters of the simulator; {lacking[0]} is missing")
         if self.known is None and not set(self.effects) <= set(EFFECTS):
             raise ParameterError("effects", list(self.effects), "none without the recording that they were bound about")
-        require_absent(self.absent, self.effects, len(samples))
+        require_masks_of_absent_effects(self.absent, self.effects, len(samples))
         object.__setattr__(self, "samples", samples)
         object.__setattr__(self, "noise_sd", noise_sd)
 
@@ -142,7 +142,7 @@ class FittedSystem(NamedSamples):
             If the text is damaged, has another format, or belongs to another simulator.
         """
         try:
-            document = strict_json(text)
+            document = parse_strict_json(text)
         except (ValueError, RecursionError) as error:
             raise FileError(path, f"no strict JSON ({error})", _WHAT) from error
         found = document.get("format") if isinstance(document, dict) else None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
+from probewise.systems.runge_kutta import RungeKutta, Stepping, Terms
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
 
@@ -145,10 +146,10 @@ class RowsInRuns:
             place[rows] = np.arange(len(rows))
         return place, self.table.scan
 
-    def n_steps(self, max_step: float) -> IntArray:
-        """Return the number of steps from each position to the next, (n_places - 1,)."""
+    def stepping(self, max_step: float) -> Stepping:
+        """Return the steps from each position to the next: as many as `max_step` asks for at fourth order."""
         longest = self.gaps.max(axis=1, initial=0.0)
-        return np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
+        return Stepping.of(np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64))
 
 
 def integrate(
@@ -159,7 +160,7 @@ def integrate(
     *,
     max_step: float,
 ) -> FloatArray:
-    """Integrate by the classical fourth-order Runge-Kutta method; return all readings, (n_samples, n_points).
+    """Integrate by a Runge-Kutta method; return all readings, (n_samples, n_points).
 
     Parameters
     ----------
@@ -172,7 +173,7 @@ def integrate(
     columns
         (n_points,), or (n_samples, n_points) if an effect changes them.
     max_step
-        Largest step, in the unit of time.
+        Largest step at fourth order, in the unit of time; see `Stepping.of`.
     """
     states = integrate_states(motion, places, parameters, columns, max_step=max_step)
     return observed(motion.law, states, parameters, columns)
@@ -200,11 +201,11 @@ def integrate_states(
 ) -> dict[str, FloatArray]:
     """Integrate like `integrate`, but return every state at every row, (n_samples, n_points)."""
     motion = Motion(motion) if isinstance(motion, Law) else motion
-    in_gap = places.n_steps(max_step)
-    at_row = np.concatenate([[0], np.cumsum(in_gap)])
+    stepping = places.stepping(max_step)
+    at_row = np.concatenate([[0], np.cumsum(stepping.in_gap)])
     kept: dict[str, FloatArray] = {}
     k = 0
-    for number, s in enumerate(states_by_step(motion, places, parameters, columns, in_gap)):
+    for number, s in enumerate(states_by_step(motion, places, parameters, columns, stepping)):
         if number != at_row[k]:
             continue
         for state, values in s.items():
@@ -221,12 +222,9 @@ def states_by_step(
     places: RowsInRuns,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
-    in_gap: IntArray,
+    stepping: Stepping,
 ) -> Iterator[dict[str, FloatArray]]:
-    """Integrate the motion: yield all states by name, (n_samples, n_runs) each, at the start and after each step of it.
-
-    `in_gap`, (n_places - 1,), is the number of steps between one position and the next.
-    """
+    """Integrate the motion: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
     start = starts_of(motion.law, places, parameters, n_samples)
     gaps = gaps_of(places, columns)
@@ -234,10 +232,10 @@ def states_by_step(
     with np.errstate(all="ignore"):
         given_there = Given.of(motion, places, parameters, columns, start)
         yield s
-        for k, n in enumerate(in_gap.tolist()):
-            between, gap = given_there.between(k), gaps[:, k]
+        for k, n in enumerate(stepping.in_gap.tolist()):
+            stepper = Stepper(motion, stepping.method, given_there.between(k), gaps[:, k])
             for i in range(n):
-                s = stepped(motion, s, between, gap, i / n, 1 / n)
+                s = stepper.step(s, i / n, 1 / n)
                 yield s
 
 
@@ -263,71 +261,85 @@ def starts_of(
     return start
 
 
-def stepped(
-    motion: Motion, s: dict[str, Any], between: Callable[[Any], Pair], gap: FloatArray, begin: Any, length: Any
-) -> dict[str, Any]:
-    """Advance by a share `length` of a gap; split the step where friction brings a state to rest or lets it go.
+@dataclass(frozen=True, eq=False)
+class Stepper:
+    """Steps of a motion by a method, within gaps of a length in time; `between` gives what is known there.
 
-    `begin` and `length` are numbers, or arrays of as many as there are columns of states.
+    In its methods `begin` and `length` are shares of a gap: numbers, or arrays of as many as there are columns of
+    states.
     """
-    ways = motion.ways(s, *between(begin))
-    after = _runge_kutta(motion, s, between, gap, begin, length, ways)
-    for state, way in ways.items():
-        at_rest = way == 0
 
-        def margin(
-            at: Mapping[str, Any], share: Any, state: str = state, way: Any = way, at_rest: Any = at_rest
-        ) -> Any:
-            """Return how much is left until the state comes to rest or breaks loose."""
-            moving = way * at[state]
-            if not at_rest.any():
-                return moving
-            free = motion.rates(at, *between(share), {})[state]
-            return np.where(at_rest, motion.friction[state] - np.abs(free), moving)
+    motion: Motion
+    method: RungeKutta
+    between: Callable[[Any], Pair]
+    gap: FloatArray
 
-        first, last = margin(s, begin), margin(after, begin + length)
-        ends = last < 0
-        if not ends.any():
-            continue
-        until = np.where(ends, _zero_between(0.0, first, 1.0, last), 1.0)
-        there = _runge_kutta(motion, s, between, gap, begin, until * length, ways)
-        left = margin(there, begin + until * length)
-        closer = np.where(left > 0, _zero_between(until, left, 1.0, last), _zero_between(0.0, first, until, left))
-        until = np.where(ends, closer, 1.0)
-        there = _runge_kutta(motion, s, between, gap, begin, until * length, ways)
-        there[state] = np.where(ends, 0.0, there[state])
-        anew = motion.ways(there, *between(begin + until * length))
-        free = motion.rates(after, *between(begin + length), {})[state]
-        anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
-        after = _runge_kutta(motion, there, between, gap, begin + until * length, (1 - until) * length, anew)
-        ways = anew
-    return motion.at_end_of_step(ways, after) if ways or motion.limits else after
+    def step(self, s: dict[str, Any], begin: Any, length: Any) -> dict[str, Any]:
+        """Advance by a share of a gap; split the step where friction brings a state to rest or lets it go."""
+        motion, between = self.motion, self.between
+        ways = motion.ways(s, *between(begin))
+        after = self._unsplit(s, begin, length, ways)
+        for state, way in ways.items():
+            at_rest = way == 0
+
+            def margin(
+                at: Mapping[str, Any], share: Any, state: str = state, way: Any = way, at_rest: Any = at_rest
+            ) -> Any:
+                """Return how much is left until the state comes to rest or breaks loose."""
+                moving = way * at[state]
+                if not at_rest.any():
+                    return moving
+                free = motion.rates(at, *between(share), {})[state]
+                return np.where(at_rest, motion.friction[state] - np.abs(free), moving)
+
+            first, last = margin(s, begin), margin(after, begin + length)
+            ends = last < 0
+            if not ends.any():
+                continue
+            until = np.where(ends, _zero_between(0.0, first, 1.0, last), 1.0)
+            there = self._unsplit(s, begin, until * length, ways)
+            left = margin(there, begin + until * length)
+            closer = np.where(left > 0, _zero_between(until, left, 1.0, last), _zero_between(0.0, first, until, left))
+            until = np.where(ends, closer, 1.0)
+            there = self._unsplit(s, begin, until * length, ways)
+            there[state] = np.where(ends, 0.0, there[state])
+            anew = motion.ways(there, *between(begin + until * length))
+            free = motion.rates(after, *between(begin + length), {})[state]
+            anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
+            after = self._unsplit(there, begin + until * length, (1 - until) * length, anew)
+            ways = anew
+        return motion.at_end_of_step(ways, after) if ways or motion.limits else after
+
+    def _unsplit(self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]) -> dict[str, Any]:
+        """Take one step of the method, with friction against fixed directions."""
+        method, width, given = self.method, self.gap * length, self.between(begin)
+        rates = [self.motion.rates(s, *given, ways)]
+        for k, terms in enumerate(method.stages[1:], 1):
+            if method.c[k] != method.c[k - 1]:
+                given = self.between(begin + method.c[k] * length)
+            rates.append(self.motion.rates(_moved(s, width, terms, rates), *given, ways))
+        return _moved(s, width, method.weights, rates)
+
+
+def _moved(s: Mapping[str, Any], width: Any, terms: Terms, rates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Move states for a time along a weighted sum of rates."""
+    (first, weight), *others = terms
+    if not others:  # of one stage, as all of fourth order are: one product less
+        share = weight * width
+        return {state: at + share * rates[first][state] for state, at in s.items()}
+    out = {}
+    for state, at in s.items():
+        rate = weight * rates[first][state]
+        for k, w in others:
+            rate = rate + w * rates[k][state]
+        out[state] = at + width * rate
+    return out
 
 
 def _zero_between(low: Any, at_low: Any, high: Any, at_high: Any) -> Any:
     """Return where a straight line between two values of opposite sign is zero; `low` if both are equal."""
     apart = at_low - at_high
     return low + (high - low) * np.where(apart > 0, at_low / np.where(apart > 0, apart, 1.0), 0.0)
-
-
-def _runge_kutta(
-    motion: Motion,
-    s: Mapping[str, Any],
-    between: Callable[[Any], Pair],
-    gap: FloatArray,
-    begin: Any,
-    length: Any,
-    ways: Mapping[str, Any],
-) -> dict[str, Any]:
-    """Take one fourth-order Runge-Kutta step; `begin` and `length` are shares of a gap, one for all runs or each."""
-    width = gap * length
-    half, sixth = 0.5 * width, width / 6
-    middle = between(begin + 0.5 * length)
-    k1 = motion.rates(s, *between(begin), ways)
-    k2 = motion.rates({j: s[j] + half * k1[j] for j in s}, *middle, ways)
-    k3 = motion.rates({j: s[j] + half * k2[j] for j in s}, *middle, ways)
-    k4 = motion.rates({j: s[j] + width * k3[j] for j in s}, *between(begin + length), ways)
-    return {j: s[j] + sixth * (k1[j] + 2 * (k2[j] + k3[j]) + k4[j]) for j in s}
 
 
 Pair = tuple[Mapping[str, Any], Mapping[str, Any]]

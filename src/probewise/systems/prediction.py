@@ -165,7 +165,7 @@ def predict_system(
             DoubtfulResultWarning,
             stacklevel=2,
         )
-    mean, sd, scores = mixture.finished()
+    mean, sd, scores = mixture.mean_sd_and_log_density()
     if lost.any():
         mean, sd = np.where(lost, np.nan, mean), np.where(lost, np.nan, sd)
         warnings.warn(

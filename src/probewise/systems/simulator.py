@@ -98,7 +98,8 @@ class Law:
     hold
         Interpolation of columns between rows: "previous" (held) or "linear".
     max_step_s
-        Largest integration step, in the unit of time; None: chosen automatically.
+        Largest integration step at fourth order, in the unit of time; one of eighth order, taken where gaps need
+        several, may be three times as long. None: chosen automatically.
     """
 
     states: Mapping[str, str | float]

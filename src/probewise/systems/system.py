@@ -286,7 +286,7 @@ class System:
                 )
 
     def _is_within_reach(self, places: RowsInRuns) -> bool:
-        return bool(places.n_steps(self.max_step).sum() <= _MOST_STEPS + len(places.row_at_place))
+        return bool(places.stepping(self.max_step).in_gap.sum() <= _MOST_STEPS + len(places.row_at_place))
 
 
 def given_columns(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
@@ -308,9 +308,9 @@ class SystemChain:
 
     def predict(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
-        return self.read(self.look(theta, plan), theta, plan)
+        return self.readings_of_view(self.simulated_view(theta, plan), theta, plan)
 
-    def look(self, theta: FloatArray, plan: Any) -> FloatArray:
+    def simulated_view(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
         system = self.system
         columns: Mapping[str, NDArray[Any]] = given_columns(system.simulator, plan)
@@ -375,12 +375,14 @@ class SystemChain:
         ]
         return np.concatenate(each)
 
-    def read(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
+    def readings_of_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""
         for effect, columns in self._columns:
             if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
+
+    look, read = simulated_view, readings_of_view  # their earlier names
 
     def _applied(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
         for effect, columns in self._columns:

@@ -179,7 +179,7 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
     table = read_table(require_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)"))
     if not len(table):
         raise FileError(path, "there is no row below the header", "one row for each reading")
-    table.require(*(name for name in (time, run) if name is not None))
+    table.require_columns(*(name for name in (time, run) if name is not None))
     columns: dict[str, NDArray[Any]] = {}
     for name in table.columns:
         if name == time:

@@ -13,8 +13,8 @@ from probewise.world.concealed import (
     Nonlinearity,
     Saturation,
 )
-from probewise.world.painting import Covered, Oval, Surface, paint
-from probewise.world.rays import seen_white
+from probewise.world.painting import CoveredSurface, Oval, Surface, paint
+from probewise.world.rays import seen_white_fraction
 from probewise.world.rows import Rows
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
 from probewise.world.world import View, World, simulate
@@ -25,7 +25,7 @@ __all__ = [
     "Blob",
     "Concealed",
     "CorrelatedNoise",
-    "Covered",
+    "CoveredSurface",
     "GainDrift",
     "Nonlinearity",
     "Oval",
@@ -40,10 +40,16 @@ __all__ = [
     "raster_spot",
     "ridge_spot",
     "ring_spot",
-    "seen_white",
+    "seen_white_fraction",
     "simulate",
     "tailed_spot",
 ]
 
 Look = View
 """The old name of `View`."""
+
+Covered = CoveredSurface
+"""The old name of `CoveredSurface`."""
+
+seen_white = seen_white_fraction
+"""The old name of `seen_white_fraction`."""

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
-from probewise.world.painting import Covered, Oval, Surface
+from probewise.world.painting import CoveredSurface, Oval, Surface
 
 _N_RIM = 720  # points on an oval's outline among which the nearest is searched
 
@@ -19,7 +19,7 @@ def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> Float
     Images count as having no edges, since they are not described.
     """
     match surface:
-        case Covered():
+        case CoveredSurface():
             below = [edge_distance(part, x_mm, y_mm) for part in (surface.below, *surface.cards)]
             return np.asarray(np.min(below, axis=0))
         case Uniform() | Ramp() | Image():

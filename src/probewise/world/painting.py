@@ -35,14 +35,14 @@ class Oval:
 
 
 @dataclass(frozen=True)
-class Covered:
+class CoveredSurface:
     """A surface with cards on it, each a polygon with an albedo; the last is on top."""
 
     below: Pattern | Oval
     cards: tuple[Polygon, ...]
 
 
-Surface: TypeAlias = Pattern | Oval | Covered
+Surface: TypeAlias = Pattern | Oval | CoveredSurface
 
 
 def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
@@ -54,17 +54,17 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         If the type of surface is unknown.
     """
     match surface:
-        case Covered():
+        case CoveredSurface():
             seen = paint(surface.below, x_mm, y_mm)
             for card in surface.cards:
-                seen = np.where(_within_polygon(card, x_mm, y_mm), card.inside, seen)
+                seen = np.where(_is_within_polygon(card, x_mm, y_mm), card.inside, seen)
             return seen
         case Uniform():
             return np.full(x_mm.shape, surface.albedo)
         case Ramp():
             return surface.per_mm * (x_mm * math.cos(surface.normal_rad) + y_mm * math.sin(surface.normal_rad))
         case Image():
-            return _image(surface, x_mm, y_mm)
+            return _albedo_in_image(surface, x_mm, y_mm)
         case HalfPlane():
             within = x_mm * math.cos(surface.normal_rad) + y_mm * math.sin(surface.normal_rad) > surface.offset_mm
         case Quadrant():
@@ -80,7 +80,7 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
             across = (dy_mm * cos - dx_mm * sin) / surface.half_axes_mm[1]
             within = along**2 + across**2 < 1
         case Polygon():
-            within = _within_polygon(surface, x_mm, y_mm)
+            within = _is_within_polygon(surface, x_mm, y_mm)
         case Stripes():
             along = x_mm * math.cos(surface.normal_rad) + y_mm * math.sin(surface.normal_rad) - surface.phase_mm
             turns = along / surface.period_mm
@@ -90,7 +90,7 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return np.where(within, surface.inside, surface.outside)
 
 
-def _within_polygon(polygon: Polygon, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+def _is_within_polygon(polygon: Polygon, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
     """Return whether points are inside: a ray towards +x crosses an odd number of sides."""
     odd = np.zeros(x_mm.shape, dtype=np.bool_)
     corners = polygon.vertices_mm
@@ -102,7 +102,7 @@ def _within_polygon(polygon: Polygon, x_mm: FloatArray, y_mm: FloatArray) -> Boo
     return odd
 
 
-def _image(image: Image, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _albedo_in_image(image: Image, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     n_rows, n_columns = image.albedo.shape
     column = np.floor((x_mm - image.origin_mm[0]) / image.pixel_mm)
     row = n_rows - 1 - np.floor((y_mm - image.origin_mm[1]) / image.pixel_mm)

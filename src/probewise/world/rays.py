@@ -22,7 +22,7 @@ _BLOCK = 50_000  # pixels or rays at a time, to fit a processor's cache
 _STEP_U, _STEP_V = 0.7548776662466927, 0.5698402909980532
 
 
-def seen_white(
+def seen_white_fraction(
     surface: Surface,
     spot: Spot,
     x_mm: FloatArray,
@@ -71,11 +71,11 @@ def seen_white(
     per_block = max(1, _BLOCK // spot.weights.size)
     for start in range(0, len(rest), per_block):
         part = rest[start : start + per_block]
-        seen[part] = _seen_white_of_block(surface, spot, poses[:, part], retouch, n_rays)
+        seen[part] = _seen_white_fraction_of_block(surface, spot, poses[:, part], retouch, n_rays)
     return seen[again.ravel()]
 
 
-def _seen_white_of_block(
+def _seen_white_fraction_of_block(
     surface: Surface, spot: Spot, poses: FloatArray, retouch: Retouch | None, n_rays: int
 ) -> FloatArray:
     x_mm, y_mm, turn, scale, pattern_x, pattern_y = poses[:, :, None, None]

@@ -25,7 +25,7 @@ from probewise.world.concealed.stages import (
 )
 from probewise.world.edges import across_edge, edge_distance
 from probewise.world.painting import Surface
-from probewise.world.rays import seen_white
+from probewise.world.rays import seen_white_fraction
 from probewise.world.rows import Rows
 from probewise.world.spots import Spot
 
@@ -221,7 +221,7 @@ class World:
         for surface, chosen in surfaces:
             edge_mm[chosen] = edge_distance(surface, *(place - pattern)[chosen].T)
             white = partial(
-                seen_white,
+                seen_white_fraction,
                 surface,
                 orientation_rad=there.orientation_rad[chosen],
                 scale=scale[chosen],

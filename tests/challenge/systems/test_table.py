@@ -2,8 +2,8 @@
 
 import pytest
 
-from probewise.challenge.systems import family_of, score_systems
-from probewise.challenge.systems.table import gains_of
+from probewise.challenge.systems import name_without_target, score_systems
+from probewise.challenge.systems.table import gains_on_held_out_runs
 from probewise.report.challenge import write_page
 
 
@@ -102,7 +102,7 @@ def test_a_pair_needs_both_names_or_their_aliases():
 def test_held_out_gain_is_the_median_share_and_capped():
     """Shares 0.5, 1 (100 of 100 though 900 of 500 nats) and 0.25."""
     cases = [_single(gains=(20.0, 40.0)), _single(gains=(900.0, 500.0)), _single(gains=(10.0, 40.0))]
-    assert gains_of(cases[1], "right") == (100.0, 100.0)
+    assert gains_on_held_out_runs(cases[1], "right") == (100.0, 100.0)
     assert _row(cases, "held-out runs: median share of the right model's gain").found.value == 0.5
 
 
@@ -133,7 +133,7 @@ def test_a_case_that_failed_counts_in_the_last_row_alone():
 
 
 def test_targets_are_left_out_of_what_is_taken_for_what():
-    assert family_of("depends:k:warm+lag") == "depends+lag"
+    assert name_without_target("depends:k:warm+lag") == "depends+lag"
 
 
 def test_the_page_tells_every_case():

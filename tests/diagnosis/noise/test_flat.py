@@ -159,7 +159,9 @@ def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
     rng = np.random.default_rng(7)
     plan = paper_plan()
     mean = 50 + 35 * np.sin(np.arange(len(plan)))
-    recording = Recording(plan, STEP * np.round((mean + noise_sd * rng.standard_normal(len(plan))) / STEP)).unlimited()
+    recording = Recording(
+        plan, STEP * np.round((mean + noise_sd * rng.standard_normal(len(plan))) / STEP)
+    ).without_declared_range()
     nodes = NoiseModel((), recording, rounding=STEP).laws(mean)
     off = (recording.readings - mean)[:, None]
     each = np.array([-law.minus_log_likelihood(off, law.scale(off))[0] for law in nodes.laws])

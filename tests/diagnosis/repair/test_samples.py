@@ -29,7 +29,7 @@ def test_a_sensor_of_free_form_is_written_read_and_driven_by():
     samples = ModelSamples(chain, free.theta(z), np.full(500, 0.5), (), free.n_gaussians, exchangeable=False)
     readings = chain.predict(samples.theta[:1], PLAN)[0]
     sensor = samples.fitted_sensor(Recording(PLAN, readings + 0.5 * rng.standard_normal(len(PLAN))), rng=rng)
-    assert sensor.free_form
+    assert sensor.is_free_form
     assert "an SSF of free form" in sensor.summary()
     assert "a_2" not in sensor.summary()
     again = FittedSensor.from_json(sensor.to_json())

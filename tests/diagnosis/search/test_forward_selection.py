@@ -55,7 +55,7 @@ def test_a_prediction_leaves_open_what_a_clean_verdict_does(tmp_path):
     assert f"position_scale in {share:.0%} of them" in read.summary()
 
     # Whoever needs one sensor takes the most probable, and not a mean that is true of neither.
-    plain, leading = found.null.fitted_sensor(case.recording, rng=np.random.default_rng(1)), read.leading()
+    plain, leading = found.null.fitted_sensor(case.recording, rng=np.random.default_rng(1)), read.with_leading_effects()
     assert leading.effects == ()
     assert leading.names == plain.names
     assert leading.mean()["I_max"] == pytest.approx(plain.mean()["I_max"], abs=0.5 * plain.sd()["I_max"])

@@ -75,6 +75,23 @@ def test_effects_of_different_curves_are_no_twins(state):
     assert not are_proportional(of("sensitivity:room"), of("gain_step"))
 
 
+def test_a_fit_at_a_poor_optimum_is_made_again_from_where_one_more_effect_led(prepared):
+    state = _state(prepared)
+    good = state.refit(state.null, "sensitivity:room")
+    bigger = state.refits.extended(good, state.effects["offset_drift"])[0]
+    state.refit_without(bigger, "offset_drift")
+    assert state.of(("sensitivity:room",)) == [good]  # as good as from there: it stays
+    poor = replace(good.moved(-100.0), found=replace(good.found, objective=good.found.objective + 100.0))
+    state.keep(poor)
+    state.refits.replace(good, poor)
+    state.refit_without(bigger, "offset_drift")
+    (again,) = state.of(("sensitivity:room",))
+    assert again.log_z == pytest.approx(good.log_z, abs=0.02)
+    assert again.log_share == good.log_share
+    np.testing.assert_allclose(again.found.predicted, good.found.predicted, atol=1e-3)
+    assert state.refits.extended(state.null, state.effects["sensitivity:room"])[0] is again  # in a second search
+
+
 def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
     weighed = state.refits.extended(state.null, state.effects["sensitivity:room"])[0]
     assert weighed.evidence[()].log_z > state.null.evidence[()].log_z + 20

@@ -290,12 +290,51 @@ def test_a_wave_whose_frequency_changes_is_begun_from_its_two_columns():
 
 
 def test_two_settlings_add_up_at_the_start_of_each_run():
-    form = _proposed("since the start of the run")
+    form = _proposed("t since the start of the run")
     found = form.apply(np.zeros((1, N_ROWS)), np.array([[0.5, -0.8, 0.2, 2.0]]), TABLE)[0]
     np.testing.assert_allclose(found, 0.5 * np.exp(-_T / 0.2) - 0.8 * np.exp(-_T / 2.0))
     setting = form.start(form.bank()[0], np.array([2.0, -3.0]))
     typical = form.bank()[0, 0, 0]
     np.testing.assert_allclose(setting[:2], [2 * typical, -3 * typical])
+
+
+def test_a_dose_is_the_integral_since_the_start_of_the_run_and_saturates():
+    """Route two: the trapezoid rule by its own sum over each run."""
+    centre = float(f"{TABLE.columns['room_c'].mean():.6g}")
+    form = _proposed(f"|room_c - {centre:.4g}| since the start of the run")
+    found = form.apply(np.zeros((1, N_ROWS)), np.array([[0.5, 3.0]]), TABLE)[0]
+    away = np.abs(TABLE.columns["room_c"] - centre)
+    for rows in (slice(0, N_ROWS // 2), slice(N_ROWS // 2, N_ROWS)):
+        dose = [np.trapezoid(away[rows][: k + 1], _T[rows][: k + 1]) for k in range(N_ROWS // 2)]
+        np.testing.assert_allclose(found[rows], 0.5 * (1 - np.exp(-np.array(dose) / 3.0)), atol=1e-7)
+
+
+def test_the_influence_of_a_column_is_a_quadratic_function_of_the_reading():
+    (form,) = [form for form in proposals(ABOUT) if "(a + b z + c z^2) (room_c" in form.name]
+    column, level = TABLE.columns["room_c"], np.linspace(NOTHING.min(), NOTHING.max(), N_ROWS)
+    found = form.apply(level[None, :], np.array([[0.2, -0.1, 0.3]]), TABLE)[0] - level
+    z = np.linspace(-1, 1, N_ROWS)
+    np.testing.assert_allclose(found, (0.2 - 0.1 * z + 0.3 * z**2) * (column - column.mean()) / column.std())
+    sentence = form.sentence(np.array([0.2, -0.1, 0.3]), np.full(3, 0.01))
+    assert "0.200 ± 0.010 V per sd in the middle" in sentence
+    assert "0.600 ± 0.014 V at its low end" in sentence
+
+
+def test_a_law_is_tried_with_as_many_waves_as_its_rows_tell_apart():
+    """A force between two trial frequencies three widths apart starts no fit near it, and was missed."""
+    simulator = Simulator(
+        reading="y", unit="V", parameters={"rate": (0.0, 2.0)},
+        law=Law({"x": 0.0}, lambda s, p, u: {"x": p["rate"] - s["x"]}, max_step_s=0.02),
+        time="t_s", run="run", noise=Noise(sd=SD),
+    )  # fmt: skip
+    times = np.tile(np.linspace(0.0, 6.0, 200), 2)
+    table = RunTable(
+        {"t_s": times, "run": np.repeat([1.0, 2.0], 200), "y": np.zeros(400)}, time="t_s", run="run"
+    )  # fmt: skip
+    system = System.of(simulator, table)
+    tried = forms_of(About(system, table, np.zeros(system.n_params), SD))["periodic_forcing:x"].bank()[:, 0, 1]
+    assert np.diff(tried).max() <= 0.52 / 6.0
+    assert tried[-1] == pytest.approx(0.5 / np.diff(times)[0])
 
 
 def test_a_term_on_one_side_acts_beyond_its_threshold_alone():

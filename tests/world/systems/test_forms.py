@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from probewise.world.systems.forms.inputs import play
+from probewise.world.systems.forms.inputs import behind_gear_play
 from probewise.world.systems.forms.readings import delayed, direction_of_change
 from probewise.world.systems.rows import SystemRows
 
@@ -80,7 +80,7 @@ def test_the_way_is_kept_at_rest_and_known_at_the_first_row():
 
 def test_play_moves_nothing_until_it_is_taken_up():
     rows = _rows(range(7))
-    found = play(np.array([[0.0, 1, 2, 1.5, 1.2, 0, 1]]), rows, {"width": np.array([[1.0]])})
+    found = behind_gear_play(np.array([[0.0, 1, 2, 1.5, 1.2, 0, 1]]), rows, {"width": np.array([[1.0]])})
     np.testing.assert_allclose(found, [[-0.5, 0.5, 1.5, 1.5, 1.5, 0.5, 0.5]])
 
 

@@ -9,14 +9,16 @@ from probewise.systems import System, read_run_table, read_simulator
 from probewise.world.challenge import Stratum
 from probewise.world.systems import KINDS, SystemCase, draw_system, owners_file, write_system_case
 from probewise.world.systems.formulas import FLOW
-from probewise.world.systems.noise import noise_of
+from probewise.world.systems.noise import noise_of_size
 
 
 def _case(kind, said='noise = {"sd": 0.5}', seed=5):
     rng = np.random.default_rng(seed)
     drawn = draw_system(kind, rng=rng)
     noise_free = drawn.readings_at_all_rows([])
-    noise = noise_of("white", 12.0, noise_free[drawn.kept_rows], drawn.diagnosed, kind.sd, rng=rng)
+    noise = noise_of_size(
+        "white", 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_rows, kind.sd, rng=rng
+    )
     labels = tuple(f"r{k}" for k in range(drawn.rows.n_runs))
     return SystemCase(1, 0, Stratum("clean"), drawn, (), noise, said, labels, noise_free, np.round(noise_free, 9))
 
@@ -40,7 +42,7 @@ def test_the_owners_file_predicts_what_the_world_does(kind, tmp_path):
         system = replace(system, max_step=system.max_step / 16)
     predicted = system.chain(table, ()).predict(theta, table)[0]
     assert 140 <= len(table) <= 520
-    np.testing.assert_allclose(predicted, case.noise_free[case.drawn.kept_rows], atol=2e-3 * kind.sd)
+    np.testing.assert_allclose(predicted, case.noise_free[case.drawn.diagnosed_row_numbers], atol=2e-3 * kind.sd)
 
 
 @pytest.mark.parametrize("said", ["", 'noise = {"sd": 0.5, "step": 0.1}'])
@@ -54,7 +56,7 @@ def test_there_are_both_ways_in_with_and_without_time_and_runs():
     assert {kind.law is None for kind in KINDS} == {True, False}
     assert {kind.time is None for kind in KINDS} == {True, False}
     assert {kind.run is None for kind in KINDS} == {True, False}
-    assert {kind.time_anew for kind in KINDS} == {True, False}
+    assert {kind.restarts_time for kind in KINDS} == {True, False}
     assert any("for k in range" in kind.text for kind in KINDS)
     assert len(KINDS) >= 10
     assert all(kind.logged for kind in KINDS)
@@ -63,4 +65,4 @@ def test_there_are_both_ways_in_with_and_without_time_and_runs():
 def test_what_is_kept_back_is_two_runs_and_the_last_goes_further():
     drawn = draw_system(FLOW, rng=np.random.default_rng(2))
     flow = drawn.rows.columns["flow_lpm"]
-    assert flow[drawn.rows.run == drawn.rows.n_runs - 1].max() > 1.2 * flow[drawn.kept_rows].max()
+    assert flow[drawn.rows.run == drawn.rows.n_runs - 1].max() > 1.2 * flow[drawn.diagnosed_row_numbers].max()

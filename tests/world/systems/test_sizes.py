@@ -28,7 +28,7 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
     drawn = _drawn("orifice flow meter")
     effect = _of_size(_form(drawn, name), wanted, drawn, np.random.default_rng(1))
     with_effect = drawn.diagnosed_readings([effect.placed])
-    q = drawn.diagnosed.columns["flow_lpm"]
+    q = drawn.diagnosed_rows.columns["flow_lpm"]
     basis = np.stack([np.ones_like(q), q**2], axis=1)
     left = with_effect - basis @ np.linalg.lstsq(basis, with_effect, rcond=None)[0]
     assert np.linalg.norm(left) / drawn.kind.sd == pytest.approx(wanted, rel=0.01)
@@ -38,7 +38,7 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
 def test_what_a_bent_model_leaves_is_as_large_as_asked():
     drawn = _drawn("photodiode against distance")
     effect = _of_size(_form(drawn, "sensitivity:board_c"), 12.0, drawn, np.random.default_rng(1))
-    d, y = drawn.diagnosed.columns["dist_mm"], drawn.diagnosed_readings([effect.placed])
+    d, y = drawn.diagnosed_rows.columns["dist_mm"], drawn.diagnosed_readings([effect.placed])
 
     def law(d, dark, power, behind):
         return dark + 1e5 * power / (d + behind) ** 2
@@ -52,8 +52,8 @@ def test_an_offset_that_depends_on_a_column_is_a_sensitivity_by_another_name():
     forms = forms_of(drawn.true_system)
     effect = _of_size(_form(drawn, "sensitivity:water_c"), 12.0, drawn, np.random.default_rng(1))
     target = drawn.diagnosed_readings([effect.placed])
-    fitted = drawn.nominal.fit(target, drawn.true_coordinates)
-    rivals = rivals_of(drawn.true_system, forms, target, fitted, drawn.nominal, frozenset({effect.name}))
+    fitted = drawn.nominal_model.fit(target, drawn.true_coordinates)
+    rivals = rivals_of(drawn.true_system, forms, target, fitted, drawn.nominal_model, frozenset({effect.name}))
     assert rivals["depends:zero_kpa:water_c"] < 0.01
     assert "sensitivity:baro_hpa" not in rivals
     assert all(nats < 3 for nats in rivals.values())

@@ -7,7 +7,7 @@ import warnings
 from types import TracebackType
 from typing import Self
 
-from probewise._signals import deferred
+from probewise._signals import defer_signals
 from probewise.arm.basics import Clock
 from probewise.arm.nxt.light import LightSensor
 from probewise.arm.nxt.link import Link
@@ -76,7 +76,7 @@ class Brick:
         LinkError
             If this could not be confirmed, and no other exception is pending.
         """
-        with deferred():
+        with defer_signals():
             try:
                 self._come_to_rest()
             except LinkError:

@@ -169,7 +169,7 @@ class Link:
             If the connection is dead.
         """
         self.keep_awake()
-        for n_left in reversed(range(1 + self._timing.n_repeats if request.repeatable else 1)):
+        for n_left in reversed(range(1 + self._timing.n_repeats if request.is_repeatable else 1)):
             try:
                 self._await_turn()
                 if self._owed or self._stream.read(LONGEST, 0.0):

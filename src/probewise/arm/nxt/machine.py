@@ -31,7 +31,9 @@ class BrickMachine:
         self.limits = SoftLimits(geometry)
         self._joints = geometry.joints
         self._zeros = [0] * 3  # counts at home; not 0 between finding a stop and the next reset
-        self._motors = [brick.motor(joint.port, guard=partial(self._check, k)) for k, joint in enumerate(self._joints)]
+        self._motors = [
+            brick.motor(joint.port, guard=partial(self._check_move, k)) for k, joint in enumerate(self._joints)
+        ]
         self._light = brick.light(geometry.sensor_port)
 
     def __enter__(self) -> Self:
@@ -106,6 +108,6 @@ class BrickMachine:
         finally:
             self.limits.record(joint, motor.last_counts - self._zeros[joint])
 
-    def _check(self, joint: int, here: int, to: int) -> None:
+    def _check_move(self, joint: int, here: int, to: int) -> None:
         """Check a move against the limits, whose counts are from home."""
         self.limits.check(joint, here - self._zeros[joint], to - self._zeros[joint])

@@ -78,7 +78,7 @@ class Request(Fields, Generic[A_co]):
     REPLY: ClassVar[type[Answer]] = Done
 
     @property
-    def repeatable(self) -> bool:
+    def is_repeatable(self) -> bool:
         """Whether the command is idempotent."""
         return True
 
@@ -122,7 +122,7 @@ class SetOutputState(Request[Done]):
     limit_counts: int = field_of(IntegerField("I", 0, 0xFFFFFFFF), 0)
 
     @property
-    def repeatable(self) -> bool:
+    def is_repeatable(self) -> bool:
         """False for limited moves: limits add up, so a repeated move would go twice as far."""
         return self.limit_counts == 0
 

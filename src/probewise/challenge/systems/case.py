@@ -36,7 +36,7 @@ def run_system_case(task: Task) -> dict[str, Any]:
             case = draw_system_case(task.seed, task.number)
             result |= _truth_json(case)
             at = "diagnosis"
-            result |= _diagnosed(case, task)
+            result |= _diagnosis_result(case, task)
         # A campaign survives a case that breaks the diagnosis, and reports it.
         except (
             ProbewiseError,
@@ -61,7 +61,7 @@ def _truth_json(case: SystemCase) -> dict[str, Any]:
         "law": kind.law is not None,
         "noise_model": case.noise.name,
         "noise_text": case.noise_text,
-        "readings": len(case.drawn.kept_rows),
+        "readings": len(case.drawn.diagnosed_row_numbers),
         "truth": ["unknown"] if strange else sorted([*names, *of_noise]),
         "hidden": [_effect_json(effect) for effect in case.effects],
         "alias": None,
@@ -83,7 +83,7 @@ def _effect_json(effect: SystemEffect) -> dict[str, Any]:
     }
 
 
-def _diagnosed(case: SystemCase, task: Task) -> dict[str, Any]:
+def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
     blind, later = task.generators(2)
     with tempfile.TemporaryDirectory() as directory:
         file, table, test, _ = write_system_case(case, directory)

@@ -15,18 +15,18 @@ from probewise.challenge.scoring import (
     credible_set_covers,
     effects_to_name,
     is_out_of_vocabulary,
-    leading,
+    leading_hypothesis,
     leading_name_right,
     names_match,
 )
 from probewise.challenge.table import (
     Row,
-    confidently_wrong,
-    merged_size,
-    names_physics,
+    cases_with_one_effect,
+    is_confidently_wrong,
+    names_effect_on_mean,
     rejection_rate,
-    share_covered,
-    singles_of,
+    set_size_with_aliases_merged,
+    share_of_intervals_with_truth,
 )
 
 _MOST_NATS = 100.0  # cap on a recording's held-out gain
@@ -35,7 +35,7 @@ _AS_GOOD = 0.8  # share of the true law's held-out gain that counts as equally g
 _RUNS = ("inside", "beyond")
 
 
-def family_of(name: str) -> str:
+def name_without_target(name: str) -> str:
     """Return a name without its target."""
     return "+".join(part.split(":")[0] for part in name.split("+"))
 
@@ -63,21 +63,24 @@ def _clean_rows(done: list[Result]) -> list[Row]:
         Row("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.03, 0.06),
         Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
         *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05)) for m in models),
-        Row("physics named, clean", share([names_physics(r) for r in white]), most=0.005),
-        Row("physics named, other noise", share([names_physics(r) for r in other]), most=0.005),
-        Row("noise told as it is, other noise", share([leading(r, clean=True)[0] == tuple(r["truth"]) for r in other])),
+        Row("physics named, clean", share([names_effect_on_mean(r) for r in white]), most=0.005),
+        Row("physics named, other noise", share([names_effect_on_mean(r) for r in other]), most=0.005),
+        Row(
+            "noise told as it is, other noise",
+            share([leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]),
+        ),
     ]
 
 
 def _naming_rows(done: list[Result]) -> list[Row]:
     targets = {6.0: -math.inf, 8.0: 0.9, 12.0: 0.95, 20.0: 0.98}
-    shown = singles_of(done, 12.0)
+    shown = cases_with_one_effect(done, 12.0)
     pairs = [r for r in done if r["kind"] == "pair"]
     return [
         *(
             Row(
                 f"right name and target first, lambda {size:g}",
-                share([leading_name_right(r) for r in singles_of(done, size)]),
+                share([leading_name_right(r) for r in cases_with_one_effect(done, size)]),
                 least,
             )
             for size, least in targets.items()
@@ -92,34 +95,34 @@ def _naming_rows(done: list[Result]) -> list[Row]:
 
 
 def _probability_rows(done: list[Result]) -> list[Row]:
-    own = singles_of(done, 12.0)
+    own = cases_with_one_effect(done, 12.0)
     covered, covered_of_all = (share([credible_set_covers(r, merged=True) for r in rs]) for rs in (own, done))
     return [
         Row("95 % credible set holds the truth or its alias, lambda 12", covered, 0.95),
         Row("  the same, all cases", covered_of_all),
         Row(
             "size of the credible set, the truth and its aliases as one, lambda 12",
-            mean([merged_size(r) for r in own]),
+            mean([set_size_with_aliases_merged(r) for r in own]),
             most=1.4,
         ),
-        Row("wrong name stated above .9", share([_confidently_wrong(r) for r in done]), most=0.01),
+        Row("wrong name stated above .9", share([_is_confidently_wrong(r) for r in done]), most=0.01),
         Row("expected calibration error", calibration_error(done)),
     ]
 
 
-def _confidently_wrong(result: Result) -> bool:
+def _is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong name, not an alias of the truth, is stated above .9."""
-    return confidently_wrong(result) and not names_match(
-        leading(result, clean=True)[0], effects_to_name(result, merged=True)
+    return is_confidently_wrong(result) and not names_match(
+        leading_hypothesis(result, clean=True)[0], effects_to_name(result, merged=True)
     )
 
 
 def _interval_rows(done: list[Result]) -> list[Row]:
     stated = [interval for r in done for own in r["parameters"].values() for interval in own.values()]
-    return [Row("95 % intervals of effect parameters cover", share_covered(stated), 0.92, 0.98)]
+    return [Row("95 % intervals of effect parameters cover", share_of_intervals_with_truth(stated), 0.92, 0.98)]
 
 
-def gains_of(result: Result, best: str) -> tuple[float, float] | None:
+def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | None:
     """Return the gains of the repaired and the best model on the held-out runs, each at most 100 nats."""
     own = [result["held_out"][run] for run in _RUNS]
     if any(model not in scores for scores in own for model in ("null", "repaired", best)):
@@ -129,14 +132,14 @@ def gains_of(result: Result, best: str) -> tuple[float, float] | None:
 
 
 def _gain_shares(results: Sequence[Result]) -> FloatArray:
-    gains = [g for g in (gains_of(r, "right") for r in results) if g is not None and g[1] >= _LEAST_NATS]
+    gains = [g for g in (gains_on_held_out_runs(r, "right") for r in results) if g is not None and g[1] >= _LEAST_NATS]
     return np.array([[repaired / right] for repaired, right in gains]).reshape(-1, 1)
 
 
 def _held_out_rows(done: list[Result]) -> list[Row]:
     named = [r for r in done if r["kind"] in ("single", "pair")]
-    clean = [g[0] for g in (gains_of(r, "true") for r in done if r["kind"] == "clean") if g is not None]
-    every = [g[0] for g in (gains_of(r, "true") for r in done) if g is not None]
+    clean = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done if r["kind"] == "clean") if g is not None]
+    every = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done) if g is not None]
     return [
         Row("held-out runs: median share of the right model's gain", bootstrapped(_gain_shares(named), _median), 0.95),
         Row("held-out worse than the null by over 3 nats", share([bool(g < -3.0) for g in every])),
@@ -151,7 +154,7 @@ def _median(rows: FloatArray) -> float:
 def _unlisted_law_rows(done: list[Result]) -> list[Row]:
     outside = [r for r in done if r["kind"] == "outside"]
     inside = [r for r in done if r["kind"] != "outside"]
-    good = [_gains_like_true_law(r) for r in outside]
+    good = [_gains_as_much_as_true_law(r) for r in outside]
     told = [g or r["verdict"] == "unknown" for g, r in zip(good, outside, strict=True)]
     return [
         Row("not on the list, lambda 20: unknown, or as good as the true law", share(told), 0.9),
@@ -161,14 +164,14 @@ def _unlisted_law_rows(done: list[Result]) -> list[Row]:
     ]
 
 
-def _gains_like_true_law(result: Result) -> bool:
+def _gains_as_much_as_true_law(result: Result) -> bool:
     """Return whether a name or formula gains most of what the true law does; aliases count too."""
     if (
-        names_match(leading(result, clean=True)[0], effects_to_name(result, merged=True))
+        names_match(leading_hypothesis(result, clean=True)[0], effects_to_name(result, merged=True))
         and result["verdict"] != "unknown"
     ):
         return True
-    gains = gains_of(result, "right")
+    gains = gains_on_held_out_runs(result, "right")
     return gains is not None and gains[1] >= _LEAST_NATS and gains[0] >= _AS_GOOD * gains[1]
 
 

@@ -110,7 +110,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     inside = np.flatnonzero(in_scans(plan, effect.scans)) if effect.scans else slice(None)
     there = plan.take(inside) if isinstance(inside, np.ndarray) else plan
     # Effects after the light integral reuse it.
-    seen = None if effect.stage < Stage.SEEN else plain.chain.look(plain.theta_of(sensor, own), there)
+    seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.theta_of(sensor, own), there)
     change = np.zeros((n_rows, len(plan)))
     step = max(_AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):
@@ -119,7 +119,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
         each = {name: np.repeat(values, n, axis=0) for name, values in own.items()}
         each[effect.name] = bank.reshape(n_rows, -1)[rows]
         theta = model.theta_of(np.repeat(sensor, n, axis=0), each)
-        read = model.chain.predict(theta, there) if seen is None else model.chain.read(seen, theta, there)
+        read = model.chain.predict(theta, there) if seen is None else model.chain.readings_of_view(seen, theta, there)
         change[rows, inside] = read - before[inside]
     columns = change[:, usable].T
     columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + np.abs(before).max()))] = 0.0  # NaN too

@@ -87,6 +87,6 @@ def sensor_of(sensor: SensorPrior) -> CalibratedSensor:
     If the samples average several hypotheses, only the most probable is used: a normal prior holds one hypothesis.
     """
     if isinstance(sensor, FittedSensor):
-        sensor = sensor.leading()
+        sensor = sensor.with_leading_effects()
     samples = np.asarray(sensor.samples, dtype=np.float64)
     return sensor_from_posterior(sensor.names, samples.mean(axis=0), np.cov(samples.T))

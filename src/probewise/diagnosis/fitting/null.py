@@ -32,14 +32,14 @@ class Predictor(Protocol):
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         ...
 
-    def look(self, theta: FloatArray, plan: Plan) -> Any:
+    def simulated_view(self, theta: FloatArray, plan: Plan) -> Any:
         """Simulate the view: the result of the stages before `Stage.SEEN`, for one sample or for all.
 
         For a simulator, these are its own readings, with the effects on inputs, parameters and rates.
         """
         ...
 
-    def read(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
+    def readings_of_view(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effects from `Stage.SEEN` on to the view that `look` simulated: readings (n_samples, n_points)."""
         ...
 

@@ -110,9 +110,9 @@ class _OwnChain:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
-        return self.read(self.look(theta, plan), theta, plan)
+        return self.readings_of_view(self.simulated_view(theta, plan), theta, plan)
 
-    def look(self, theta: FloatArray, plan: Plan) -> FloatArray:
+    def simulated_view(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Simulate the readings before any effect on them, with the effects on the parameters: (n_samples, n_points).
 
         Raises
@@ -129,7 +129,7 @@ class _OwnChain:
             raise ShapeError(f"simulate gives {readings.shape}; allowed: {(len(theta), len(plan))}, samples x readings")
         return readings
 
-    def read(self, view: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+    def readings_of_view(self, view: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""
         for effect, columns in self._theta_columns:
             if Stage.OFFSET <= effect.stage <= Stage.SATURATION:

@@ -64,6 +64,10 @@ class LightSensor:
         """Return the names of effects defined outside this library."""
         return frozenset(effects.keys() - EFFECTS)
 
+    def spent_refit_budget(self) -> float:
+        """Return 0: predictions are cheap here."""
+        return 0.0
+
     def refit_budget_is_spent(self, share: float = 1.0) -> bool:
         """Return False: predictions are cheap here."""
         return False

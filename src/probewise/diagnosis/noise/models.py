@@ -141,7 +141,7 @@ class NoiseModel:
             n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._lost_value_resolution, 1.0)
             # Each lost reading has that value to within a cell.
             log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
-            log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.ends)
+            log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
         return NoiseLaw(
             sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd, walk=walk

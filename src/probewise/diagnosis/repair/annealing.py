@@ -14,7 +14,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.nested.weights import n_effective, power_bracket, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.progress import Progress, silent
 
 _ENOUGH = 0.5  # target effective sample size, as a share of the samples wanted
@@ -64,7 +64,7 @@ def importance_resample(
         gain = np.append(gain, log_p(more) - log_q(more))
     if _n_distinct_effective(gain, first[: len(gain)]) < least:
         return None
-    rows = resampled(np.exp(gain - gain.max()), n_wanted, rng)
+    rows = resampled_rows(np.exp(gain - gain.max()), n_wanted, rng)
     return np.asarray(first[rng.permutation(rows)])
 
 
@@ -117,7 +117,7 @@ def anneal(
     while beta < 1.0:
         gain = heights[1] - heights[0]
         after = _next_beta(gain, beta)
-        kept = resampled(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
+        kept = resampled_rows(np.exp((after - beta) * (gain - gain.max())), n_walkers, rng)
         beta, z, heights = after, z[kept], (heights[0][kept], heights[1][kept])
         progress("annealing samples to the posterior", note=f"beta {beta:.2f} of 1")
         for _ in range(n_moves if beta < 1.0 else _AT_LAST * n_moves):

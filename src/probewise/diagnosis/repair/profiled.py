@@ -19,7 +19,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.nested.weights import n_effective, resampled
+from probewise.nested.weights import n_effective, resampled_rows
 from probewise.recordings.plan import Recording
 
 _NODES = np.arange(-8.0, 8.5)  # of a slice, in sds of the Laplace approximation
@@ -168,7 +168,7 @@ class Profiled:
         gain = np.minimum(gain, logsumexp(gain) - 0.5 * np.log(n_first))
         if n_effective(gain) < _INDEPENDENT * n_wanted:
             return None
-        return np.asarray(first[rng.permutation(resampled(np.exp(gain - gain.max()), n_wanted, rng))])
+        return np.asarray(first[rng.permutation(resampled_rows(np.exp(gain - gain.max()), n_wanted, rng))])
 
     def log_density(self, z: FloatArray) -> FloatArray:
         """Return the log density of coordinates, up to a constant, (n_samples, n_params) -> (n_samples,)."""

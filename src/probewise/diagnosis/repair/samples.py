@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
-from probewise.calibration.fields import by_mass, choose_pixel_mm, mean_field
+from probewise.calibration.fields import choose_pixel_mm, mean_field, sorted_by_mass
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
 from probewise.diagnosis.evidence.joint import JointProblem
@@ -70,7 +70,7 @@ class ModelSamples:
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
         """Convert to a FittedSensor, for predictions, the robot, and sensor.json."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
-        from_chain = by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
+        from_chain = sorted_by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
         pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_usual_step_mm(recording))
         field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable

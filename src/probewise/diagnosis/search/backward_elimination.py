@@ -26,6 +26,8 @@ def eliminate_backward(state: SearchState) -> None:
         others = tuple(name for name in names if name != left_out)
         if others not in state.refitted | state.undetected:
             state.reach(others)
+        for candidate in state.of(names):
+            state.refit_without(candidate, left_out)
         held = state.of(others)
         if held:
             _select_again(state, max(held, key=lambda c: c.log_z), names)

@@ -45,7 +45,11 @@ class Noises:
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         seen = 0 < Quantisation.seen_above * rough_sd(self.recording) < self._step
         rounded = {Quantisation.name: np.array([self._step])} if Quantisation.name in self.effects and seen else {}
-        shown = {name: effect.seen for name, effect in self.effects.items() if effect.seen is not None}
+        shown = {
+            name: effect.certain_parameters
+            for name, effect in self.effects.items()
+            if effect.certain_parameters is not None
+        }
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
         self.certain = tuple(sorted(self._known))
         self._hidden = hides_the_noise(self._step, self.recording)

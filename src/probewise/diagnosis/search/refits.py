@@ -87,11 +87,11 @@ class Refits:
             evidence = self.noises.weigh(found)
         return WeighedFit.of(found, law, evidence, log_detectable(found, law, self.templates.usable))
 
-    def is_better_at(self, z: FloatArray, candidate: WeighedFit) -> bool:
-        """Return whether a candidate's model is better at coordinates z (n_params,) than at its fit."""
+    def is_better_at(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
+        """Return whether a candidate's model, its effects in any order, is better at z (n_params,) than at its fit."""
         found, law = candidate.found, candidate.law
         readings = found.predicted + found.residuals
-        whitened = law(readings - found.model.predict(z[None, :])[0, self.templates.usable])[:, None]
+        whitened = law(readings - model.predict(z[None, :])[0, self.templates.usable])[:, None]
         there = float(law.minus_log_likelihood(whitened, law.scale(whitened))[0]) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 
@@ -122,6 +122,10 @@ class Refits:
             twin = self._as_twin(parent, effect, against) or self._beside_twin(parent, effect, against)
             self.known[key] = twin or self._extended(parent, effect, against)
         return self.known[key]
+
+    def replace(self, held: WeighedFit, better: WeighedFit) -> None:
+        """Put a better fit of the same combination in the place of the one that was found before."""
+        self.known.update({key: (better, scores) for key, (fit, scores) in self.known.items() if fit is held})
 
     def _as_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
         """Return the earlier refit of a twin with this effect in its place; None if no twin was refitted."""

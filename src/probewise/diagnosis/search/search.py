@@ -85,9 +85,13 @@ def search(
     noises, templates, own = refits.noises, refits.templates, prepared.apparatus.own_effects(on_mean)
     if prepared.null is not None and prepared.null.nuisance:
         own = frozenset(on_mean)  # about a shape that is far off without the right effect, screening is no guide
-    state = SearchState(
-        on_mean, prior, noises, templates, refits, own, progress, prepared.apparatus.refit_budget_is_spent
-    )
+    spent = prepared.apparatus.spent_refit_budget()
+
+    def is_over(share: float) -> bool:
+        """Return whether a share of the budget that an earlier search left is spent."""
+        return prepared.apparatus.refit_budget_is_spent(spent + share * max(1.0 - spent, 0.0))
+
+    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, is_over)
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
     else:

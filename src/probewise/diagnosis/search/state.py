@@ -47,7 +47,7 @@ class SearchState:
     progress
         Progress function.
     is_over
-        Function that returns whether a share of the budget of refits is spent.
+        Function that returns whether a share of this search's budget of refits is spent.
     share
         Share of it that may be spent by now.
     """
@@ -163,11 +163,27 @@ class SearchState:
         """Refit a given null from its coordinates in a fit with one more effect, if it fits better there."""
         null = self.candidates[candidate.n_gaussians, ()]
         start = candidate.found.z[: null.found.model.n_params]
-        if self.refits.sensor is None or not self.refits.is_better_at(start, null):
+        if self.refits.sensor is None or not self.refits.is_better_at(null.found.model, start, null):
             return
         again = self.refits.weighed(null.found.model, start[None, :], candidate.law)
         if again.log_z > null.log_z + SAME_MODE:
             self.keep(again)
+
+    def refit_without(self, candidate: WeighedFit, left_out: str) -> None:
+        """Refit a combination from its coordinates in a fit with one more effect, if it fits better there.
+
+        Where an effect changes what other parameters are (a stiffness that hardens, and a frequency), a fit from where
+        they were without it may stop at a poor local optimum, which one more effect lets it leave.
+        """
+        model, stay = candidate.found.model.without(left_out)
+        start = candidate.found.z[stay]
+        for held in self.of(tuple(name for name in candidate.names if name != left_out)):
+            alike = held.n_gaussians == candidate.n_gaussians and set(model.effects) == set(held.found.model.effects)
+            if alike and self.refits.is_better_at(model, start, held):
+                again = self.refits.weighed(model, start[None, :], candidate.law).as_share(held.log_share, held.weights)
+                if again.log_z > held.log_z + SAME_MODE:
+                    self.keep(again)
+                    self.refits.replace(held, again)
 
     def reach(self, names: Names) -> None:
         """Refit a combination, starting from its largest refitted subset."""

@@ -114,15 +114,18 @@ class SimulatorApparatus:
         """Return the names of the extra effects of the user's file."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
-    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
-        """Return whether this share of the budget of calls of `simulate`, or of integration steps, is spent."""
-        caller, tally = self.system.caller, self.system.tally
+    def spent_refit_budget(self) -> float:
+        """Return the share of the budget of calls of `simulate`, or of integration steps, that is spent."""
+        caller = self.system.caller
         if caller is None:
-            over = tally.n_steps >= share * STEPS_OF_A_SEARCH
-            tally.cut_short |= over
-            return over
-        over = not caller.broadcasts and caller.n_calls >= share * CALLS_OF_A_SEARCH
-        caller.cut_short |= over
+            return self.system.tally.n_steps / STEPS_OF_A_SEARCH
+        return 0.0 if caller.broadcasts else caller.n_calls / CALLS_OF_A_SEARCH
+
+    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
+        """Return whether this share of that budget is spent, and record that it was."""
+        over = self.spent_refit_budget() >= share
+        tally = self.system.caller or self.system.tally
+        tally.cut_short |= over
         return over
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:

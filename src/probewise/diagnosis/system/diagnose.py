@@ -124,7 +124,8 @@ def prepare_system(
     told = _with_call_count(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
-    apparatus = SimulatorApparatus(About(system, table, found.z, sd, misfit=float(np.std(found.residuals)) / sd), stop)
+    misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
+    apparatus = SimulatorApparatus(About(system, table, found.z, sd, misfit=misfit), stop)
     begun = replace(system, first=found.z)
     told("building the effects")
     effects = apparatus.effects(recording, begun) if bound else {}

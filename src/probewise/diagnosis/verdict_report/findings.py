@@ -174,7 +174,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
         gain = holder.evidence[noise].log_z - max(without)
         return math.sqrt(2 * max(gain, 0.0))
     model, stay = found.model.without(name)
-    noise_free = prepared.recording.with_readings(prepared.spread(found.predicted)).unlimited()
+    noise_free = prepared.recording.with_readings(prepared.spread(found.predicted)).without_declared_range()
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
     sigma = float(law.scale(law(found.residuals)[:, None])[0])
     refit = fit(model, noise_free, found.z[stay], law.at_least(sigma), max_steps=12, tolerance=0.02)

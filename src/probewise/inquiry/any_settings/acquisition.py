@@ -82,7 +82,7 @@ class Predictive:
             given = (1 - share) * given + share * own
         return np.asarray(np.maximum(given - mixed, 0.0) / math.log(2))
 
-    def distance(self, values: FloatArray, goal: FloatArray) -> FloatArray:
+    def distance_from_goal(self, values: FloatArray, goal: FloatArray) -> FloatArray:
         """Return the expected distance from the goal after a reading, (n_settings,): the sum of ln(sd / goal) above 0.
 
         Parameters

@@ -19,7 +19,7 @@ from probewise.inquiry.any_settings.settings import Settings
 from probewise.inquiry.choice import choose
 from probewise.nested import Weighted, pose
 from probewise.nested.pose import AnyPrior
-from probewise.nested.weights import resampled
+from probewise.nested.weights import resampled_rows
 from probewise.priors import require_prior
 
 _N_ASKED = 1000  # samples whose predictions value the settings
@@ -158,7 +158,7 @@ class Inquiry(ShowsItself):
         if self._readings is None:
             return None
         best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
-        p_value, worst = self._readings.fit(best)
+        p_value, worst = self._readings.goodness_of_fit(best)
         if p_value >= _DOUBT_P:
             return None
         setting, value = self._taken[worst]
@@ -254,7 +254,7 @@ class Inquiry(ShowsItself):
     def _utility_by_weights(self, weight: FloatArray) -> FloatArray:
         """Compute the acquisition function for the posterior samples with these weights, (n_settings,)."""
         n = _N_ASKED if self._model.caller.broadcasts else _FEWER_ASKED
-        theta = self._posterior.theta[resampled(weight, n, self._rng)]
+        theta = self._posterior.theta[resampled_rows(weight, n, self._rng)]
         theta = theta[self._rng.permutation(n)]  # copies of one sample apart
         predicted = self._model.predict(theta, self._settings)
         predictive = Predictive(predicted, self._model.scale(theta, predicted), self._model.noise)
@@ -262,7 +262,7 @@ class Inquiry(ShowsItself):
             return predictive.information()
         values, goal = theta[:, [self._posterior.names.index(name) for name in self._goal]], [*self._goal.values()]
         now = np.maximum(np.log(values.std(axis=0) / goal), 0.0).sum()
-        return np.asarray(now - predictive.distance(values, np.array(goal)))
+        return np.asarray(now - predictive.distance_from_goal(values, np.array(goal)))
 
     def _costs_s(self) -> FloatArray:
         """Return the seconds of a reading at each setting from here, (n_settings,) or a single number."""

@@ -41,7 +41,7 @@ class Model:
         """Find out how a user's function can be called: with arrays, for one sample, or for one reading."""
 
         def call_with_arrays(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
-            return function(dict(parameters), settings.given(columns))
+            return function(dict(parameters), settings.in_model_form(columns))
 
         def call_for_one_sample(parameters: Mapping[str, Any], columns: Mapping[str, Column]) -> Any:
             rows = Settings(columns, settings.form)
@@ -116,11 +116,11 @@ class Readings:
 
     @property
     def prior(self) -> Prior:
-        """See `Problem`."""
+        """Prior of the model's parameters."""
         return self.model.prior
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """See `Problem`."""
+        """Return the log likelihood of all readings, (n_samples, n_params) -> (n_samples,)."""
         out = np.empty(len(theta))
         at_once = max(_BLOCK // len(self.values), 1)
         for k in range(0, len(theta), at_once):
@@ -131,7 +131,7 @@ class Readings:
             out[k : k + at_once] = density.sum(axis=1)
         return out
 
-    def fit(self, theta: FloatArray) -> tuple[float, int]:
+    def goodness_of_fit(self, theta: FloatArray) -> tuple[float, int]:
         """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
 
         It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.

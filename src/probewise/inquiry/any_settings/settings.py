@@ -61,7 +61,7 @@ class Settings:
         """Append other settings."""
         return Settings({n: np.concatenate([c, other.columns[n]]) for n, c in self.columns.items()}, self.form)
 
-    def given(self, columns: Mapping[str, Column]) -> Any:
+    def in_model_form(self, columns: Mapping[str, Column]) -> Any:
         """Return the settings in the model's form; several knobs as (n_knobs, n), to be unpacked."""
         if self.form == "one":
             return columns["setting"]

@@ -14,16 +14,16 @@ from probewise.report.plots.arm import reach_map
 from probewise.report.plots.audit import audit_matrix
 from probewise.report.plots.canvas import PAGE_IN, SMALL_PT, AxesGrid, grid_of_axes, png, stack_of_axes, svg
 from probewise.report.plots.challenge import confusion_matrix, reliability_diagram
-from probewise.report.plots.concealed import doubt_beside_trust
-from probewise.report.plots.doubt import belief_in_the_sensor
+from probewise.report.plots.concealed import doubt_against_trust
+from probewise.report.plots.doubt import effect_probabilities_by_reading
 from probewise.report.plots.fit import predicted_and_recorded
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.noise import (
     correlation_of_neighbours,
     lattice_of_readings,
     lost_readings,
+    residual_histogram,
     spread_by_level,
-    tails,
 )
 from probewise.report.plots.patterns import quadrant_patterns, sensor_orientations
 from probewise.report.plots.prediction import calibration_check, predicted_against_recorded, residuals_against
@@ -32,15 +32,15 @@ from probewise.report.plots.readings import readings_by_orientation
 from probewise.report.plots.residuals import (
     gain_by_scan,
     mean_residuals_along,
-    one_scan,
     readings_in_order,
-    residual_clouds,
+    residuals_against_covariates,
+    scan_with_residuals,
 )
 from probewise.report.plots.scans import before_and_after, residuals_by_scan
-from probewise.report.plots.scene import explain_field, playing_field
+from probewise.report.plots.scene import field_legend, playing_field
 from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
-from probewise.report.plots.study import readings_needed, widths_of_runs
-from probewise.report.plots.verdict import beliefs_by_round, hypothesis_probabilities
+from probewise.report.plots.study import posterior_widths_of_runs, readings_needed
+from probewise.report.plots.verdict import hypothesis_probabilities, probabilities_by_round
 
 __all__ = [
     "PAGE_IN",
@@ -49,14 +49,13 @@ __all__ = [
     "arm_and_sensor",
     "audit_matrix",
     "before_and_after",
-    "belief_in_the_sensor",
-    "beliefs_by_round",
     "calibration_check",
     "confusion_matrix",
     "corner_plot",
     "correlation_of_neighbours",
-    "doubt_beside_trust",
-    "explain_field",
+    "doubt_against_trust",
+    "effect_probabilities_by_reading",
+    "field_legend",
     "gain_by_scan",
     "grid_of_axes",
     "hypothesis_probabilities",
@@ -66,29 +65,54 @@ __all__ = [
     "log_evidences",
     "lost_readings",
     "mean_residuals_along",
-    "one_scan",
     "playing_field",
     "png",
     "posterior_widths",
+    "posterior_widths_of_runs",
     "predicted_against_recorded",
     "predicted_and_recorded",
+    "probabilities_by_round",
     "quadrant_patterns",
     "reach_map",
     "readings_by_orientation",
     "readings_in_order",
     "readings_needed",
     "reliability_diagram",
-    "residual_clouds",
+    "residual_histogram",
     "residuals_against",
+    "residuals_against_covariates",
     "residuals_by_scan",
     "run_plot",
+    "scan_with_residuals",
     "sensor_orientations",
     "spatial_sensitivity",
     "spread_by_level",
     "ssf_by_order",
     "stack_of_axes",
     "svg",
-    "tails",
     "trace_plot",
-    "widths_of_runs",
 ]
+
+belief_in_the_sensor = effect_probabilities_by_reading
+"""The old name of `effect_probabilities_by_reading`."""
+
+beliefs_by_round = probabilities_by_round
+"""The old name of `probabilities_by_round`."""
+
+doubt_beside_trust = doubt_against_trust
+"""The old name of `doubt_against_trust`."""
+
+tails = residual_histogram
+"""The old name of `residual_histogram`."""
+
+one_scan = scan_with_residuals
+"""The old name of `scan_with_residuals`."""
+
+explain_field = field_legend
+"""The old name of `field_legend`."""
+
+residual_clouds = residuals_against_covariates
+"""The old name of `residuals_against_covariates`."""
+
+widths_of_runs = posterior_widths_of_runs
+"""The old name of `posterior_widths_of_runs`."""

@@ -76,7 +76,7 @@ def audit_matrix(
     if numbered:
         bars.set_yticks(at, [f"{name}  {k + 1}" for k, name in enumerate(labels)])
         labels = [str(k + 1) if k % 5 == 4 else "" for k in range(len(labels))]
-    _matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
+    _draw_matrix(matrix, cosines[np.ix_(order, order)], labels, alias)
     if own:
         legend_below(axes)
     else:
@@ -84,7 +84,7 @@ def audit_matrix(
     return axes
 
 
-def _matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) -> None:
+def _draw_matrix(ax: Axes, cosines: FloatArray, labels: Sequence[str], alias: float) -> None:
     shown = np.where(np.eye(len(labels), dtype=np.bool_), np.nan, cosines)
     alone = ~(np.nan_to_num(shown).any(axis=0) | np.nan_to_num(shown).any(axis=1))
     shown[alone, :] = shown[:, alone] = np.nan

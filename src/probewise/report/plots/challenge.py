@@ -18,7 +18,7 @@ def reliability_diagram(bins: Sequence[Bin], *, ax: Axes | None = None) -> Axes:
     Parameters
     ----------
     bins
-        From `challenge.reliability`.
+        From `challenge.reliability_bins`.
     ax
         Axes to draw on; a new figure without.
     """

@@ -33,7 +33,7 @@ def row_name(row: ConcealedRow) -> str:
     return name if row.size is None else f"{name}, {row.size:g}"
 
 
-def doubt_beside_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None = None) -> AxesGrid:
+def doubt_against_trust(rows: Sequence[ConcealedRow], *, axes: AxesGrid | None = None) -> AxesGrid:
     """Compare doubt with trust: runs that are sure and wrong, intervals that cover the truth, and readings.
 
     Parameters

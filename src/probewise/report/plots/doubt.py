@@ -15,7 +15,7 @@ _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 _CLEAN, _REST = "#D9D9D9", "#7F7F7F"
 
 
-def belief_in_the_sensor(left_out: Sequence[Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
+def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
     """Draw one stacked bar per reading: the probability of each effect that the sensor model may leave out.
 
     A dashed line marks each reading after which the most probable effect changes.

@@ -100,7 +100,7 @@ def spread_by_level(
     return ax
 
 
-def tails(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
+def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
     """Draw a histogram of residuals, with a normal distribution of the noise's sd.
 
     Parameters

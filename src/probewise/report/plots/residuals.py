@@ -26,7 +26,7 @@ from probewise.report.plots.canvas import (
     plain_numbers,
     stack_of_axes,
 )
-from probewise.report.residual_means import Means, running_mean
+from probewise.report.residual_means import ResidualMeans, running_mean
 from probewise.report.words import number, signed, unit_name
 
 BEFORE, AFTER = "as calibrated", "repaired"
@@ -38,7 +38,7 @@ _MOST_SCANS = 12
 
 
 def mean_residuals_along(
-    means: Means,
+    means: ResidualMeans,
     *,
     label: str,
     unit: str,
@@ -94,7 +94,7 @@ def mean_residuals_along(
     return ax
 
 
-def one_scan(
+def scan_with_residuals(
     along: FloatArray,
     readings: FloatArray,
     models: Sequence[tuple[str, FloatArray]],
@@ -152,7 +152,7 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def residual_clouds(
+def residuals_against_covariates(
     covariates: Sequence[tuple[str, FloatArray]], models: Sequence[tuple[str, FloatArray]], *, unit: str
 ) -> AxesGrid:
     """Draw all residuals against each covariate, with running means, one panel per covariate.

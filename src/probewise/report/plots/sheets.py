@@ -63,10 +63,10 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
             number += len(tiles)
         n_pages = number - 1
         for k, batch in enumerate(_groups_of_five(list(zip(cut, firsts, strict=True)))):
-            pdf.savefig(_cover_page(batch, paper, title, f"page {k + 1} of {n_pages}"))
+            pdf.savefig(_draw_cover_page(batch, paper, title, f"page {k + 1} of {n_pages}"))
         for (sheet, tiles), first in zip(cut, firsts, strict=True):
             for k, tile in enumerate(tiles):
-                pdf.savefig(_page(sheet, tiles, tile, first, f"page {first + k} of {n_pages}"))
+                pdf.savefig(_draw_page(sheet, tiles, tile, first, f"page {first + k} of {n_pages}"))
     return buffer.getvalue()
 
 
@@ -83,7 +83,7 @@ def _open_page(page_mm: tuple[float, float]) -> Axes:
     return ax
 
 
-def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
+def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
     page = PAPERS_MM[paper]
     ax = _open_page(page)
     top = page[1] - 18.0
@@ -101,7 +101,7 @@ def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Fi
         ax.text(LEFT_MM, top - 8.0 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
     y = top - 8.0 - 4.6 * len(told) - 4.0
     for (sheet, tiles), first in batch:
-        _thumbnail(ax, sheet, tiles, (LEFT_MM, y - _THUMB_MM))
+        _draw_thumbnail(ax, sheet, tiles, (LEFT_MM, y - _THUMB_MM))
         x = LEFT_MM + 72.0
         last = first + len(tiles) - 1
         said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; page {first}"]
@@ -115,7 +115,7 @@ def _cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Fi
         for k, line in enumerate(said):
             ax.text(x, y - 10.5 - 4.6 * k, line, fontsize=_USUAL, va="baseline")
         y -= _THUMB_MM + 6.0
-    _ruler(ax, LEFT_MM, 11.0)
+    _draw_ruler(ax, LEFT_MM, 11.0)
     ax.text(page[0] - 12.0, 8.5, number, fontsize=_SMALL, ha="right")
     return ax.figure  # type: ignore[return-value]
 
@@ -124,7 +124,7 @@ def _grid_in_words(tiles: Sequence[Tile]) -> str:
     return f"{tiles[-1].column + 1} side by side, {tiles[-1].row + 1} one above the other, from the lower left"
 
 
-def _thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float, float]) -> None:
+def _draw_thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float, float]) -> None:
     """Draw a small overview of a sheet: its pages, its origin, and the sensor at orientation 0."""
     width, height = sheet.size_mm
     scale = min(66.0 / width, (_THUMB_MM - 2.0) / height)
@@ -148,7 +148,7 @@ def _thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[float
         ax.plot(x, y, marker="+", ms=7, mew=1.2, color=VERMILLION, zorder=7, clip_on=False)
 
 
-def _page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: str) -> Figure:
+def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: str) -> Figure:
     ax = _open_page(tile.page_mm)
     low, high = np.array(tile.low_mm), np.array(tile.high_mm)
     size, beyond = high - low, np.array(tile.beyond_mm)
@@ -181,7 +181,7 @@ def _page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: s
         ax.plot([x0 - 8.0, x0 - 0.5], [y, y], **heavy)
         ax.plot([far_x + 0.5, far_x + 5.0], [y, y], **heavy)
         ax.text(x0 - 10.0, y, "y = 0", color=VERMILLION, rotation=90, **said)
-    _ruler(ax, LEFT_MM, 6.5)
+    _draw_ruler(ax, LEFT_MM, 6.5)
     place = f", {number}, column {tile.column + 1}, row {tile.row + 1}" if len(tiles) > 1 else ""
     ax.text(
         LEFT_MM + 3.0, tile.page_mm[1] - 6.0, f"{sheet.name}{place}: {sheet.lines[0]}", fontsize=_USUAL, va="center"
@@ -204,7 +204,7 @@ def _label_strips(ax: Axes, tiles: Sequence[Tile], tile: Tile, first: int) -> No
             ax.text(x, y, f"page {number[neighbour]} lies here", rotation=rotation, **text)
 
 
-def _ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
+def _draw_ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
     ax.plot([x_mm, x_mm + _RULER_MM], [y_mm, y_mm], color=BLACK, lw=0.5, solid_capstyle="butt", gid="ruler")
     for mm in range(0, _RULER_MM + 1, 5):
         length = 3.0 if mm % 50 == 0 else 2.0 if mm % 10 == 0 else 1.2

@@ -26,7 +26,7 @@ from probewise.study import Summary
 _BAND = (0.16, 0.84)
 
 
-def widths_of_runs(
+def posterior_widths_of_runs(
     runs: Mapping[str, Sequence[FloatArray]], *, target_mm: float = 4.0, axes: AxesGrid | None = None
 ) -> AxesGrid:
     """Draw the widest posterior sd after each reading: median and middle 68 % of the runs, one panel per row.
@@ -51,7 +51,7 @@ def widths_of_runs(
     own = axes is None
     size_in = (PAGE_IN if n_columns == 2 else 6.8, 0.5 + 2.9 * n_rows)
     axes = axes_or_grid(axes, n_rows, n_columns, size_in=size_in, sharex=True, sharey=True)
-    tables = {name: _extended(widths) for name, widths in runs.items()}
+    tables = {name: _extended_at_last_width(widths) for name, widths in runs.items()}
     for ax, (name, table) in zip(axes.flat, tables.items(), strict=False):
         for other, more in tables.items():
             if other != name:
@@ -76,7 +76,7 @@ def widths_of_runs(
     return axes
 
 
-def _extended(widths: Sequence[FloatArray]) -> FloatArray:
+def _extended_at_last_width(widths: Sequence[FloatArray]) -> FloatArray:
     """Extend every run at its last width to the length of the longest: (n_runs, n_readings)."""
     longest = max(len(w) for w in widths)
     return np.array([np.pad(w, (0, longest - len(w)), mode="edge") for w in widths])

@@ -50,7 +50,7 @@ def hypothesis_probabilities(
     return label_axes(ax, x="probability", y="")
 
 
-def beliefs_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
+def probabilities_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
     """Draw the probabilities of the hypotheses after each round, one stacked bar per round.
 
     Parameters

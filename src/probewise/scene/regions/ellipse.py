@@ -32,12 +32,12 @@ class EllipseRegion(RegionBatch):
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         """Return the albedo at points, the edge inside: (n_points, 2) -> (n_regions, n_points)."""
-        p, q = self._unit(points_mm)
+        p, q = self._unit_circle_coordinates(points_mm)
         return np.where(p * p + q * q <= 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, a tangent in place of the edge: (n_regions, n_points)."""
-        p, q = self._unit(centers_mm)
+        p, q = self._unit_circle_coordinates(centers_mm)
         a, b = self.semi_axes_mm[:, :1], self.semi_axes_mm[:, 1:]
         level = np.hypot(p, q)
         # Gradient of the level sqrt(p^2 + q^2); it is zero only at the centre, far from the edge.
@@ -48,7 +48,7 @@ class EllipseRegion(RegionBatch):
         share = share_behind_edge(distance, angle - turn_rad, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 
-    def _unit(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _unit_circle_coordinates(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return coordinates in which the edge is the unit circle, each (n_regions, n_points)."""
         cosine, sine = np.cos(self.angle_rad)[:, None], np.sin(self.angle_rad)[:, None]
         dx = points_mm[:, 0] - self.center_mm[:, :1]
@@ -66,7 +66,7 @@ def disc_region(
 
 
 @outlines.register
-def _(region: EllipseRegion, *, n_vertices: int = 96) -> list[FloatArray]:
+def _outlines_of_ellipse(region: EllipseRegion, *, n_vertices: int = 96) -> list[FloatArray]:
     t = np.linspace(0, 2 * np.pi, n_vertices + 1)
     p = region.semi_axes_mm[:, :1] * np.cos(t)
     q = region.semi_axes_mm[:, 1:] * np.sin(t)
@@ -77,7 +77,7 @@ def _(region: EllipseRegion, *, n_vertices: int = 96) -> list[FloatArray]:
 
 
 @edge_distance.register
-def _(region: EllipseRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_ellipse(region: EllipseRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     cosine, sine = np.cos(region.angle_rad)[:, None], np.sin(region.angle_rad)[:, None]
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
     dx, dy = x_mm - region.center_mm[:, :1], y_mm - region.center_mm[:, 1:]

@@ -25,19 +25,19 @@ class HalfPlaneRegion(RegionBatch):
         broadcast_fields(self, normal_rad=(), offset_mm=())
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        return np.where(self._distance(points_mm) > 0, self.inside, self.outside)
+        return np.where(self._signed_distance(points_mm) > 0, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
-        share = share_behind_edge(self._distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm)
+        share = share_behind_edge(self._signed_distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 
-    def _distance(self, points_mm: FloatArray) -> FloatArray:
+    def _signed_distance(self, points_mm: FloatArray) -> FloatArray:
         normal = self.normal_rad[:, None]
         return points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal) - self.offset_mm[:, None]
 
 
 @edge_distance.register
-def _(region: HalfPlaneRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_half_plane(region: HalfPlaneRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     normal = region.normal_rad[:, None]
     return np.abs(np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.offset_mm[:, None])

@@ -38,7 +38,7 @@ class ImageRegion:
         return 1
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        return self._at(points_mm[:, 0], points_mm[:, 1])[None]
+        return self._albedo_at(points_mm[:, 0], points_mm[:, 1])[None]
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, from strips along x: exact for unturned pixels."""
@@ -57,30 +57,30 @@ class ImageRegion:
             right = np.maximum(left, np.minimum(middle_1 + half / steep, middle_2 + half / flat))
             bottom, top = centers_mm[:, 1] + low, centers_mm[:, 1] + high
             near, far = centers_mm[:, 0] + left, centers_mm[:, 0] + right
-            total += self._summed(far, top) - self._summed(near, top)
-            total -= self._summed(far, bottom) - self._summed(near, bottom)
+            total += self._integral_to_lower_left(far, top) - self._integral_to_lower_left(near, top)
+            total -= self._integral_to_lower_left(far, bottom) - self._integral_to_lower_left(near, bottom)
             area += (right - left) * (high - low)
         return (total / area)[None]
 
     @cached_property
-    def _cumulative(self) -> FloatArray:
+    def _summed_area_table(self) -> FloatArray:
         """Summed-area table: sums of the pixels to the lower left of each corner, (n_rows + 1, n_columns + 1)."""
         padded = np.zeros((self.values.shape[0] + 1, self.values.shape[1] + 1))
         padded[1:, 1:] = self.values[::-1].cumsum(axis=0).cumsum(axis=1)
         return padded
 
-    def _summed(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    def _integral_to_lower_left(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Return the integral of the albedo over the quadrant to the lower left, mm^2."""
         n_rows, n_columns = self.values.shape
         u = np.clip((x_mm - self.origin_mm[0]) / self.pixel_mm, 0, n_columns)
         v = np.clip((y_mm - self.origin_mm[1]) / self.pixel_mm, 0, n_rows)
         i, j = np.minimum(v.astype(np.int64), n_rows - 1), np.minimum(u.astype(np.int64), n_columns - 1)
-        u, v, table = u - j, v - i, self._cumulative
+        u, v, table = u - j, v - i, self._summed_area_table
         lower = (1 - u) * table[i, j] + u * table[i, j + 1]
         upper = (1 - u) * table[i + 1, j] + u * table[i + 1, j + 1]
         return np.asarray(((1 - v) * lower + v * upper) * self.pixel_mm**2)
 
-    def _at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    def _albedo_at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         n_rows, n_columns = self.values.shape
         column = np.floor((x_mm - self.origin_mm[0]) / self.pixel_mm).astype(np.int64)
         row = n_rows - 1 - np.floor((y_mm - self.origin_mm[1]) / self.pixel_mm).astype(np.int64)

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, ShapeError
-from probewise.scene._pixels import share_in_edges
+from probewise.scene._pixels import share_inside_polygon
 from probewise.scene.regions.checks import RegionBatch, broadcast_fields
 from probewise.scene.regions.geometry import edge_distance, outlines
 
@@ -60,7 +60,7 @@ class PolygonRegion(RegionBatch):
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
-        share = share_in_edges(self.edges_mm, centers_mm, pixel_mm, turn_rad)
+        share = share_inside_polygon(self.edges_mm, centers_mm, pixel_mm, turn_rad)
         return self.outside + (self.inside - self.outside) * share
 
 
@@ -119,7 +119,7 @@ def _directed_pieces(edges: FloatArray) -> FloatArray:
 
 
 @outlines.register
-def _(region: PolygonRegion, *, n_vertices: int = 96) -> list[FloatArray]:
+def _outlines_of_polygon(region: PolygonRegion, *, n_vertices: int = 96) -> list[FloatArray]:
     return [_outline_of_edges(edges) for edges in region.edges_mm]
 
 
@@ -133,7 +133,7 @@ def _outline_of_edges(edges: FloatArray) -> FloatArray:
 
 
 @edge_distance.register
-def _(region: PolygonRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_polygon(region: PolygonRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     nearest = np.full(np.broadcast_shapes(x_mm.shape, y_mm.shape, (region.n_regions, 1)), np.inf)
     for k in range(region.edges_mm.shape[1]):
         (x1, y1), (x2, y2) = (region.edges_mm[:, k, end, :, None].transpose(1, 0, 2) for end in (0, 1))

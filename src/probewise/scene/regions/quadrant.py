@@ -46,7 +46,7 @@ class QuadrantRegion(RegionBatch):
 
 
 @edge_distance.register
-def _(region: QuadrantRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_quadrant(region: QuadrantRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     right = (x_mm - region.corner_mm[:, :1]) * region.direction[:, :1]
     above = (y_mm - region.corner_mm[:, 1:]) * region.direction[:, 1:]
     # The edges are two rays from the corner: to the right, and up.

@@ -32,13 +32,13 @@ class StripesRegion(RegionBatch):
             raise ParameterError("duty", self.duty.tolist(), "0 to 1")
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        share = self._along(points_mm) / self.period_mm[:, None]
+        share = self._position_along_normal(points_mm) / self.period_mm[:, None]
         return np.where(share - np.floor(share) < self.duty[:, None], self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
         period = self.period_mm[:, None]
-        along = self._along(centers_mm)
+        along = self._position_along_normal(centers_mm)
         along = along - period * np.floor(along / period)
         angle = self.normal_rad[:, None] - turn_rad
         share = np.zeros_like(along)
@@ -50,13 +50,13 @@ class StripesRegion(RegionBatch):
             share -= share_behind_edge(along - start - self.duty[:, None] * period, angle, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 
-    def _along(self, points_mm: FloatArray) -> FloatArray:
+    def _position_along_normal(self, points_mm: FloatArray) -> FloatArray:
         normal = self.normal_rad[:, None]
         return points_mm[:, 0] * np.cos(normal) + points_mm[:, 1] * np.sin(normal) - self.phase_mm[:, None]
 
 
 @edge_distance.register
-def _(region: StripesRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_stripes(region: StripesRegion, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     normal, period = region.normal_rad[:, None], region.period_mm[:, None]
     along = np.cos(normal) * x_mm + np.sin(normal) * y_mm - region.phase_mm[:, None]
     edges = (along, along - region.duty[:, None] * period)

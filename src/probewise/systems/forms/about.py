@@ -29,7 +29,7 @@ class About:
     """The reference fit about which forms are bound: coordinates z (n_params,), and the sd of a reading.
 
     The typical size of a form changes the readings here by one sd, so that no quantity needs a declared range.
-    `misfit` is the scatter of the fit's residuals, in sds: what is left out may be larger by it.
+    `misfit` is the rms of the fit's residuals, in sds: what is left out may be larger by it.
     """
 
     system: System

@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import first_of
-from probewise.effects.vocabulary import Gates, give_or_take
+from probewise.effects.vocabulary import Gates, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
 from probewise.systems.table import RunTable
@@ -195,5 +195,5 @@ class Form:
 
 def with_unit(mean: float, sd: float, unit: str) -> str:
     """Write mean ± sd with a unit, rounded according to the sd."""
-    digits = give_or_take(mean, sd) if sd > 1e-7 else f"{mean:.3g} ± {sd:.1g}"
+    digits = value_with_sd(mean, sd) if sd > 1e-7 else f"{mean:.3g} ± {sd:.1g}"
     return f"{digits} {unit}" if unit not in ("", "1") else digits

@@ -14,14 +14,14 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, Form, Say, with_unit
-from probewise.systems.forms.modulations import wave_numbers
+from probewise.systems.forms.modulations import most_waves_of_a_law, wave_numbers
 from probewise.systems.forms.readings import delayed, earlier
 from probewise.systems.table import RunTable
 
 _N_SIZES = 9
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
-_MOST_WAVES_OF_A_LAW = 96
 _MOST_WAVES = 600
+_MOST_WAVES_CALLED = 96  # where each is two calls of a person's function
 _ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, some wave fits any readings
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
@@ -157,6 +157,12 @@ def _cut_off_forms(about: About, name: str, low: float, high: float) -> Iterator
         )
 
 
+def _most_waves(about: About) -> int:
+    if about.system.caller is None:
+        return most_waves_of_a_law(len(about.table))
+    return _MOST_WAVES if about.system.in_bulk else _MOST_WAVES_CALLED
+
+
 def _wave_forms(about: About, name: str) -> Iterator[Form]:
     values = about.table.covariates[name]
     if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
@@ -166,8 +172,7 @@ def _wave_forms(about: About, name: str) -> Iterator[Form]:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
 
     act = _on_column(name, change)
-    most = _MOST_WAVES if about.system.caller is not None and about.system.in_bulk else _MOST_WAVES_OF_A_LAW
-    waves = wave_numbers(np.sort(values), [np.arange(len(values))], most, _ROWS_OF_A_WAVE)
+    waves = wave_numbers(np.sort(values), [np.arange(len(values))], _most_waves(about), _ROWS_OF_A_WAVE)
     guess = 1e-4 * float(np.nanstd(values))
     typical = about.typical(Stage.INPUT, act, sine_and_cosine(guess, 1 / waves), guess)
     if typical is None:

@@ -17,6 +17,7 @@ from probewise.systems.table import RunTable
 
 _MOST_MOMENTS = 512
 _MOST_WAVES = 1024
+_ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial waves of one form: a fifth of a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +132,11 @@ def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES,
     highest = min(highest, len(np.unique(values)) / (rows_each * reach))
     n = int(np.clip(np.ceil(2 * highest * reach), 8, most))
     return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
+
+
+def most_waves_of_a_law(n_points: int) -> int:
+    """Return how many trial waves of one form a law is solved for: two times as many solutions."""
+    return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, _MOST_WAVES))
 
 
 def wave_number_prior(waves: FloatArray) -> LogUniform:

@@ -19,6 +19,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.form import Act, ChangePoints, Form, with_unit
 from probewise.systems.forms.proposals_in_time import proposals_in_time
+from probewise.systems.forms.proposals_of_columns import proposals_of_columns
 from probewise.systems.motion import Motion
 from probewise.systems.table import RunTable
 
@@ -64,6 +65,7 @@ def proposals(about: About) -> Iterator[Form]:
     yield from _of_reading(about)
     for name in _columns(about):
         yield from _switch(about, name)
+    yield from proposals_of_columns(about, _columns(about))
     if about.table.has_time:
         yield from proposals_in_time(about)
     for state in about.states:

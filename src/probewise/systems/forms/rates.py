@@ -15,10 +15,9 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import About
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, with_unit
-from probewise.systems.forms.modulations import wave_number_prior, wave_numbers
+from probewise.systems.forms.modulations import most_waves_of_a_law, wave_number_prior, wave_numbers
 from probewise.systems.motion import Limit, Motion
 
-_MOST_WAVES = 64
 _N_SIZES = 9
 _NO_SHARE = 1e-9  # of what a bound stops: none
 
@@ -114,7 +113,8 @@ def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
 
 def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
     table = about.table
-    time, waves = table.time, wave_numbers(table.time_s, table.rows_by_scan(), _MOST_WAVES)
+    time = table.time
+    waves = wave_numbers(table.time_s, table.rows_by_scan(), most_waves_of_a_law(len(table)))
 
     def act(value: Motion, theta: FloatArray, rows: Any) -> Motion:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]

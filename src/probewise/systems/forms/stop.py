@@ -50,7 +50,7 @@ class MeterStop(NoiseEffect):
         return None
 
     @property
-    def seen(self) -> FloatArray:
+    def certain_parameters(self) -> FloatArray:
         """The level, (1,)."""
         return np.array([self.level])
 
@@ -94,7 +94,7 @@ def find_meter_stop(recording: Recording, reading: str = "the reading") -> tuple
         level = float(readings.max() if is_ceiling else readings.min())
         stands = readings == level
         elsewhere = steps[~stands[1:][in_turn]]
-        if level in recording.plan.instrumentation.ends or np.mean(elsewhere == 0) > _OFTEN:
+        if level in recording.plan.instrumentation.declared_ends or np.mean(elsewhere == 0) > _OFTEN:
             continue
         if stands.sum() >= _LEAST_IN_ALL and _longest_streak(stands, in_turn) >= _LEAST_IN_TURN:
             unit = recording.plan.instrumentation.unit

@@ -4,7 +4,7 @@ A case's sensor, plan, noise and effect follow from the seed and its number alon
 same world. The size of an effect is what a refit of the null model leaves of it: the caller supplies that refit.
 """
 
-from probewise.world.challenge.cases import ALIASES, Case, draw_case, held_out
+from probewise.world.challenge.cases import ALIASES, Case, draw_case, held_out_recordings
 from probewise.world.challenge.in_vocabulary import INSIDE, NEEDS_SENSOR, NO_PHYSICS, SINGLES
 from probewise.world.challenge.out_of_vocabulary import OUTSIDE
 from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
@@ -12,7 +12,7 @@ from probewise.world.challenge.regions import Region
 from probewise.world.challenge.sensors import NOISE_LEVELS, NOISE_MODELS, NOISE_NAMES, SSFS, draw_sensor, with_noise
 from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
 from probewise.world.challenge.strata import WHEEL, CaseKind, Stratum, stratum_of
-from probewise.world.challenge.truth import Alias, Hidden, Truth
+from probewise.world.challenge.truth import Alias, HiddenEffect, Truth
 
 __all__ = [
     "ALIASES",
@@ -31,7 +31,7 @@ __all__ = [
     "Case",
     "CaseKind",
     "EffectSizer",
-    "Hidden",
+    "HiddenEffect",
     "NormAfterRefit",
     "Region",
     "Stratum",
@@ -40,11 +40,17 @@ __all__ = [
     "draw_case",
     "draw_plan",
     "draw_sensor",
-    "held_out",
     "held_out_plans",
+    "held_out_recordings",
     "stratum_of",
     "with_noise",
 ]
 
 Kind = CaseKind
 """The old name of `CaseKind`."""
+
+Hidden = HiddenEffect
+"""The old name of `HiddenEffect`."""
+
+held_out = held_out_recordings
+"""The old name of `held_out_recordings`."""

@@ -17,7 +17,7 @@ from probewise.world.challenge.regions import region_of
 from probewise.world.challenge.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise
 from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
 from probewise.world.challenge.strata import Stratum, stratum_of
-from probewise.world.challenge.truth import Alias, Hidden, Truth
+from probewise.world.challenge.truth import Alias, HiddenEffect, Truth
 from probewise.world.concealed import Disturbs
 from probewise.world.world import World
 
@@ -111,7 +111,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     return Case(recording, truth, world, held_out_plans(plan, rng=np.random.default_rng(test)), test_noise)
 
 
-def held_out(case: Case) -> dict[str, Recording]:
+def held_out_recordings(case: Case) -> dict[str, Recording]:
     """Simulate the held-out readings, in the same world after the recording.
 
     Effects tied to a named scan are not in them; effects in time continue.
@@ -124,7 +124,7 @@ def held_out(case: Case) -> dict[str, Recording]:
 class _ConcealedEffects:
     """Effects chosen for a case, with the cosine of a pair or the alias."""
 
-    hidden: tuple[Hidden, ...] = ()
+    hidden: tuple[HiddenEffect, ...] = ()
     cosine: float | None = None
     alias: Alias | None = None
 
@@ -165,8 +165,8 @@ def _draw_effects(
     Raises NotConvergedError if they cannot have the size, a pair is too similar, or an alias is none.
     """
 
-    def of_size(name: str) -> Hidden:
-        return _hidden_of_size(name, stratum.size, setup, sizer, rng)
+    def of_size(name: str) -> HiddenEffect:
+        return _effect_of_size(name, stratum.size, setup, sizer, rng)
 
     match stratum.kind:
         case "single":
@@ -189,9 +189,9 @@ def _draw_effects(
             return _ConcealedEffects((of_size(stratum.kind),))
 
 
-def _hidden_of_size(
+def _effect_of_size(
     name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
-) -> Hidden:
+) -> HiddenEffect:
     sampler = INSIDE.get(name) or OUTSIDE[name]
     of_amplitude = sampler.draw(setup, rng)
     amplitude = sampler.first
@@ -200,7 +200,7 @@ def _hidden_of_size(
             lambda a: sizer.size(of_amplitude(a)), wanted, first=sampler.first, limit=sampler.limit
         )
     effect = of_amplitude(amplitude)
-    return Hidden(effect, sizer.size(effect), region_of(effect, sizer))
+    return HiddenEffect(effect, sizer.size(effect), region_of(effect, sizer))
 
 
 def _instrumentation_of(plan: Plan, model: str) -> Instrumentation:

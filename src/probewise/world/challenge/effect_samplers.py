@@ -87,12 +87,12 @@ class EffectSampler:
     scalable: bool = True
 
 
-def sign(rng: np.random.Generator) -> float:
+def draw_sign(rng: np.random.Generator) -> float:
     """Draw +1 or -1."""
     return float(rng.choice([-1.0, 1.0]))
 
 
-def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     """Draw a number whose logarithm is uniform."""
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
@@ -102,11 +102,11 @@ def amplitude_only(make: OfAmplitude) -> Draw:
     return lambda setup, rng: make
 
 
-def random_sign(make: OfAmplitude) -> Draw:
+def sign_only(make: OfAmplitude) -> Draw:
     """Make the `Draw` of an effect whose only drawn parameter is the sign of its amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-        s = sign(rng)
+        s = draw_sign(rng)
         return lambda a: make(s * a)
 
     return draw

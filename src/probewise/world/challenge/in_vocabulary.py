@@ -14,9 +14,9 @@ from probewise.world.challenge.effect_samplers import (
     EffectSampler,
     OfAmplitude,
     amplitude_only,
-    log_uniform,
-    random_sign,
-    sign,
+    draw_log_uniform,
+    draw_sign,
+    sign_only,
 )
 
 
@@ -24,54 +24,54 @@ def _draw_of_gradient(make: Callable[[float, float], concealed.Concealed]) -> Dr
     """Make the `Draw` of a gradient: its direction, within 60 degrees of X, which every plan moves along."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-        s, angle = sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
+        s, angle = draw_sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
         return lambda a: make(s * a * math.cos(angle), s * a * math.sin(angle))
 
     return draw
 
 
-def _ambient_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, at_s = sign(rng), setup.start_s + rng.uniform(0.15, 0.85) * setup.duration_s
+def _draw_ambient_step(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, at_s = draw_sign(rng), setup.start_s + rng.uniform(0.15, 0.85) * setup.duration_s
     return lambda a: concealed.AmbientStep(s * a, at_s)
 
 
-def _gain_drift(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, tau_s = sign(rng), log_uniform(rng, 60.0, setup.duration_s)
+def _draw_gain_drift(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, tau_s = draw_sign(rng), draw_log_uniform(rng, 60.0, setup.duration_s)
     return lambda a: concealed.GainDrift(s * a, tau_s)
 
 
-def _flicker(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    alias_hz, phase = log_uniform(rng, 0.01, setup.fastest_hz), rng.uniform(0, 2 * math.pi)
+def _draw_flicker(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    alias_hz, phase = draw_log_uniform(rng, 0.01, setup.fastest_hz), rng.uniform(0, 2 * math.pi)
     return lambda a: concealed.Flicker(a, alias_hz, phase)
 
 
-def _saturation(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+def _draw_saturation(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     """Draw a ceiling below white by the amplitude, a share of the span; hard, or softened over one unit."""
     white, span = setup.world.white, setup.world.white - setup.world.black
     softness = float(rng.choice([0.0, 1.0]))
     return lambda a: concealed.Saturation(white - a * span, softness)
 
 
-def _position_scale(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, ratio = sign(rng), rng.uniform(-1, 1)
+def _draw_position_scale(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, ratio = draw_sign(rng), rng.uniform(-1, 1)
     return lambda a: concealed.PositionScale(s * a, ratio * a)
 
 
-def _periodic(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    period_mm, phase = log_uniform(rng, 4.0, 25.0), rng.uniform(0, 2 * math.pi)
+def _draw_periodic_position_error(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    period_mm, phase = draw_log_uniform(rng, 4.0, 25.0), rng.uniform(0, 2 * math.pi)
     return lambda a: concealed.PeriodicPositionError(a, period_mm, phase)
 
 
-def _scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, scan = sign(rng), str(rng.choice(setup.scans))
+def _draw_scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, scan = draw_sign(rng), str(rng.choice(setup.scans))
     return lambda a: concealed.ScanMisplacement(s * a, scan)
 
 
-def _in_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
+def _on_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
     """Make the `Draw` of an effect on one scan, or on all scans at that scan's orientation, with its sign."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-        s, scan = sign(rng), str(rng.choice(setup.scans))
+        s, scan = draw_sign(rng), str(rng.choice(setup.scans))
         scans = setup.scans_at_orientation_of(scan) if rng.random() < 0.5 else (scan,)
         return lambda a: make(s * a, scans)
 
@@ -80,78 +80,78 @@ def _in_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> 
 
 def _draw_patch_place(rng: np.random.Generator) -> tuple[float, float, float]:
     """Draw the place x, y of a stain or glint, near the scans along X, and its sd."""
-    return rng.uniform(-40, 40), rng.uniform(-4, 4), log_uniform(rng, 3.0, 10.0)
+    return rng.uniform(-40, 40), rng.uniform(-4, 4), draw_log_uniform(rng, 3.0, 10.0)
 
 
-def _albedo_patch(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, (x, y, r) = sign(rng), _draw_patch_place(rng)
+def _draw_albedo_patch(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    s, (x, y, r) = draw_sign(rng), _draw_patch_place(rng)
     return lambda a: concealed.AlbedoPatch(s * a, x, y, r)
 
 
-def _glint(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+def _draw_glint(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     x, y, r = _draw_patch_place(rng)
     return lambda a: concealed.Glint(a, x, y, r)
 
 
-def _edge_shadow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    w = log_uniform(rng, 2.0, 8.0)
+def _draw_edge_shadow(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    w = draw_log_uniform(rng, 2.0, 8.0)
     return lambda a: concealed.EdgeShadow(a, w)
 
 
-def _halo(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    r_mm = log_uniform(rng, 12.0, 40.0)
+def _draw_halo(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    r_mm = draw_log_uniform(rng, 12.0, 40.0)
     return lambda a: concealed.Halo(a, r_mm)
 
 
-def _ssf_order(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+def _draw_ssf_order(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     turn, sd_mm = rng.uniform(0, 2 * math.pi), rng.uniform(1.5, 4.0)
     return lambda a: concealed.SSFOrder(a, 5.0 * math.cos(turn), 1.5 + 5.0 * math.sin(turn), sd_mm)
 
 
-def _outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    share = log_uniform(rng, 0.01, 0.05)
+def _draw_outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+    share = draw_log_uniform(rng, 0.01, 0.05)
     return lambda a: concealed.Outliers(share, a)
 
 
-def _dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
+def _draw_dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
     """Draw the value and the share of lost readings; one is obvious already, so that their size is not chosen."""
-    value, factor = float(rng.choice([0.0, 100.0])), log_uniform(rng, 0.5, 5.0)
+    value, factor = float(rng.choice([0.0, 100.0])), draw_log_uniform(rng, 0.5, 5.0)
     return lambda a: concealed.Dropouts(factor * a, value)
 
 
 INSIDE: Mapping[str, EffectSampler] = {
     "ambient_gradient": EffectSampler(("place",), _draw_of_gradient(concealed.AmbientGradient), 0.01, 2.0),
-    "ambient_step": EffectSampler(("time",), _ambient_step, 0.5, 30.0),
-    "offset_drift": EffectSampler(("time",), random_sign(concealed.OffsetDrift), 5.0, 500.0),
-    "gain_drift": EffectSampler(("time",), _gain_drift, 0.03, 0.9),
-    "battery_sag": EffectSampler(("battery_mv",), random_sign(concealed.BatterySag), 0.5, 10.0),
-    "flicker": EffectSampler(("time",), _flicker, 0.3, 20.0),
-    "saturation": EffectSampler(("level",), _saturation, 0.05, 0.9),
-    "nonlinearity": EffectSampler(("level",), random_sign(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5),
+    "ambient_step": EffectSampler(("time",), _draw_ambient_step, 0.5, 30.0),
+    "offset_drift": EffectSampler(("time",), sign_only(concealed.OffsetDrift), 5.0, 500.0),
+    "gain_drift": EffectSampler(("time",), _draw_gain_drift, 0.03, 0.9),
+    "battery_sag": EffectSampler(("battery_mv",), sign_only(concealed.BatterySag), 0.5, 10.0),
+    "flicker": EffectSampler(("time",), _draw_flicker, 0.3, 20.0),
+    "saturation": EffectSampler(("level",), _draw_saturation, 0.05, 0.9),
+    "nonlinearity": EffectSampler(("level",), sign_only(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5),
     "quantisation": EffectSampler(("lattice",), amplitude_only(concealed.Quantisation), 1.0, 20.0),
-    "hysteresis": EffectSampler(("direction",), random_sign(concealed.Hysteresis), 0.3, 20.0),
+    "hysteresis": EffectSampler(("direction",), sign_only(concealed.Hysteresis), 0.3, 20.0),
     "lag": EffectSampler(("slope", "direction"), amplitude_only(concealed.Lag), 0.5, 20.0),
     "backlash": EffectSampler(("slope", "direction"), amplitude_only(concealed.Backlash), 0.5, 15.0),
-    "position_scale": EffectSampler(("place",), _position_scale, 0.02, 0.4),
-    "periodic_position_error": EffectSampler(("place",), _periodic, 0.3, 10.0),
-    "edge_misplacement": EffectSampler(("slope",), random_sign(concealed.EdgeMisplacement), 0.3, 8.0),
-    "scan_misplacement": EffectSampler(("slope", "scan"), _scan_misplacement, 0.3, 8.0),
-    "scan_angle_error": EffectSampler(("scan", "orientation"), _in_scans(concealed.ScanAngleError), 5.0, 45.0),
-    "orientation_error": EffectSampler(("orientation",), random_sign(concealed.OrientationError), 5.0, 45.0),
+    "position_scale": EffectSampler(("place",), _draw_position_scale, 0.02, 0.4),
+    "periodic_position_error": EffectSampler(("place",), _draw_periodic_position_error, 0.3, 10.0),
+    "edge_misplacement": EffectSampler(("slope",), sign_only(concealed.EdgeMisplacement), 0.3, 8.0),
+    "scan_misplacement": EffectSampler(("slope", "scan"), _draw_scan_misplacement, 0.3, 8.0),
+    "scan_angle_error": EffectSampler(("scan", "orientation"), _on_scans(concealed.ScanAngleError), 5.0, 45.0),
+    "orientation_error": EffectSampler(("orientation",), sign_only(concealed.OrientationError), 5.0, 45.0),
     "sensor_tilt": EffectSampler(("orientation", "slope"), _draw_of_gradient(concealed.SensorTilt), 0.3, 8.0),
-    "height_gradient": EffectSampler(("place",), random_sign(concealed.HeightGradient), 0.01, 0.12),
-    "height_offset": EffectSampler(("scan",), _in_scans(concealed.HeightOffset), 0.3, 8.0),
+    "height_gradient": EffectSampler(("place",), sign_only(concealed.HeightGradient), 0.01, 0.12),
+    "height_offset": EffectSampler(("scan",), _on_scans(concealed.HeightOffset), 0.3, 8.0),
     "albedo_gradient": EffectSampler(("place",), _draw_of_gradient(concealed.AlbedoGradient), 5e-4, 0.012),
-    "albedo_patch": EffectSampler(("place",), _albedo_patch, 0.05, 1.0),
+    "albedo_patch": EffectSampler(("place",), _draw_albedo_patch, 0.05, 1.0),
     "edge_blur": EffectSampler(("edge_distance",), amplitude_only(concealed.EdgeBlur), 1.0, 8.0),
-    "edge_shadow": EffectSampler(("edge_distance",), _edge_shadow, 0.02, 0.6),
-    "halo": EffectSampler(("edge_distance",), _halo, 0.05, 0.6),
-    "glint": EffectSampler(("place",), _glint, 1.0, 40.0),
-    "ssf_order": EffectSampler(("edge_distance",), _ssf_order, 0.05, 0.5),
+    "edge_shadow": EffectSampler(("edge_distance",), _draw_edge_shadow, 0.02, 0.6),
+    "halo": EffectSampler(("edge_distance",), _draw_halo, 0.05, 0.6),
+    "glint": EffectSampler(("place",), _draw_glint, 1.0, 40.0),
+    "ssf_order": EffectSampler(("edge_distance",), _draw_ssf_order, 0.05, 0.5),
     "signal_dependent_noise": EffectSampler(("level",), amplitude_only(concealed.SignalDependentNoise), 1.0, 100.0),
     "correlated_noise": EffectSampler(("scan",), amplitude_only(concealed.CorrelatedNoise), 0.3, 0.95),
-    "outliers": EffectSampler((), _outliers, 5.0, 30.0),
-    "dropouts": EffectSampler((), _dropouts, 0.01, 0.01, scalable=False),
+    "outliers": EffectSampler((), _draw_outliers, 5.0, 30.0),
+    "dropouts": EffectSampler((), _draw_dropouts, 0.01, 0.01, scalable=False),
 }
 """Samplers of the vocabulary's effects by name, in the order of the diagnosis page, section 2."""
 

@@ -37,37 +37,40 @@ NOISE_NAMES: Mapping[str, str] = {
 """Names of noise models in the vocabulary; the other models are declared in the plan or out of vocabulary."""
 
 
-def _gaussian(rng: np.random.Generator) -> Spot:
+def _draw_gaussian(rng: np.random.Generator) -> Spot:
     blob = Blob(
-        1.0, _center(rng), (4.0 * _factor_about_one(rng), 2.5 * _factor_about_one(rng)), float(rng.uniform(-0.4, 0.4))
+        1.0,
+        _draw_center(rng),
+        (4.0 * _draw_factor_about_one(rng), 2.5 * _draw_factor_about_one(rng)),
+        float(rng.uniform(-0.4, 0.4)),
     )
     return gaussian_spot([blob], pixel_mm=_PIXEL_MM)
 
 
-def _two_lobes(rng: np.random.Generator) -> Spot:
-    u, v = _center(rng)
-    apart = 3.5 * _factor_about_one(rng)
+def _draw_two_lobes(rng: np.random.Generator) -> Spot:
+    u, v = _draw_center(rng)
+    apart = 3.5 * _draw_factor_about_one(rng)
     blobs = [
         Blob(
             float(rng.uniform(0.5, 0.7)),
             (u - apart, v),
-            (2.2 * _factor_about_one(rng), 2.5 * _factor_about_one(rng)),
+            (2.2 * _draw_factor_about_one(rng), 2.5 * _draw_factor_about_one(rng)),
             0.2,
         ),
         Blob(
             float(rng.uniform(0.3, 0.5)),
             (u + apart, v - 1.0),
-            (2.0 * _factor_about_one(rng), 3.0 * _factor_about_one(rng)),
+            (2.0 * _draw_factor_about_one(rng), 3.0 * _draw_factor_about_one(rng)),
             -0.2,
         ),
     ]
     return gaussian_spot(blobs, pixel_mm=_PIXEL_MM)
 
 
-def _ridge(rng: np.random.Generator) -> Spot:
+def _draw_ridge(rng: np.random.Generator) -> Spot:
     return ridge_spot(
-        9.0 * _factor_about_one(rng),
-        center_mm=_center(rng),
+        9.0 * _draw_factor_about_one(rng),
+        center_mm=_draw_center(rng),
         lobes=float(rng.uniform(0.15, 0.35)),
         ridge_mm=float(rng.uniform(-4.0, -2.0)),
         ridge_width_mm=1.5,
@@ -76,28 +79,28 @@ def _ridge(rng: np.random.Generator) -> Spot:
     )
 
 
-def _ring(rng: np.random.Generator) -> Spot:
+def _draw_ring(rng: np.random.Generator) -> Spot:
     off_axis = float(rng.uniform(0.2, 0.6))
     return ring_spot(
-        3.3 * _factor_about_one(rng),
-        2.0 * _factor_about_one(rng),
-        center_mm=_center(rng),
+        3.3 * _draw_factor_about_one(rng),
+        2.0 * _draw_factor_about_one(rng),
+        center_mm=_draw_center(rng),
         off_axis=off_axis,
         pixel_mm=_PIXEL_MM,
     )
 
 
-def _skewed(rng: np.random.Generator) -> Spot:
-    core = (1.6 * _factor_about_one(rng), 1.1 * _factor_about_one(rng))
-    return tailed_spot(core, center_mm=_center(rng), skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
+def _draw_skewed(rng: np.random.Generator) -> Spot:
+    core = (1.6 * _draw_factor_about_one(rng), 1.1 * _draw_factor_about_one(rng))
+    return tailed_spot(core, center_mm=_draw_center(rng), skew=float(rng.uniform(0.3, 0.5)), pixel_mm=_PIXEL_MM)
 
 
 SSFS: Mapping[str, Callable[[np.random.Generator], Spot]] = {
-    "gaussian": _gaussian,
-    "two_lobes": _two_lobes,
-    "ridge": _ridge,
-    "ring": _ring,
-    "skewed": _skewed,
+    "gaussian": _draw_gaussian,
+    "two_lobes": _draw_two_lobes,
+    "ridge": _draw_ridge,
+    "ring": _draw_ring,
+    "skewed": _draw_skewed,
 }
 """The last three are not mixtures of Gaussians; the best mixture of four leaves a residual of lambda about 1 at the
 middle noise level: a good but inexact model."""
@@ -133,9 +136,9 @@ def with_noise(world: World, model: str, *, duration_s: float) -> World:
     return replace(world, concealed=(*world.concealed, *more[model]))
 
 
-def _factor_about_one(rng: np.random.Generator) -> float:
+def _draw_factor_about_one(rng: np.random.Generator) -> float:
     return float(rng.uniform(0.85, 1.15))
 
 
-def _center(rng: np.random.Generator) -> tuple[float, float]:
+def _draw_center(rng: np.random.Generator) -> tuple[float, float]:
     return float(rng.uniform(-0.8, 0.8)), float(rng.uniform(0.8, 2.2))

@@ -118,18 +118,20 @@ class EffectSizer:
     @cached_property
     def clean(self) -> Recording:
         """Recording of noise-free readings without any effect."""
-        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._view).unlimited()
+        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._view).without_declared_range()
 
     def recording(self, *concealed: Concealed) -> Recording:
         """Return a recording of the noise-free readings with these effects."""
         same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
         world = replace(self.setup.world, concealed=concealed)
-        return world.simulate(self.setup.plan, rng=None, view=self._view if same_view else None).unlimited()
+        return world.simulate(
+            self.setup.plan, rng=None, view=self._view if same_view else None
+        ).without_declared_range()
 
     def size(self, *concealed: Concealed) -> float:
         """Return lambda of the effects together, in sds of the noise's Gaussian core."""
         if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
-            return noise_size(concealed[0], self._view, self.clean.readings, self.setup.world.noise_sd)
+            return noise_effect_size(concealed[0], self._view, self.clean.readings, self.setup.world.noise_sd)
         return self.norm_after_refit(self.clean, self.recording(*concealed)) / self.setup.world.noise_sd
 
     def cosine(self, one: Concealed, other: Concealed) -> float:
@@ -138,7 +140,7 @@ class EffectSizer:
         return float(np.clip((both**2 - a**2 - b**2) / (2 * a * b), -1.0, 1.0))
 
 
-def noise_size(effect: Disturbs, view: View, readings: FloatArray, noise_sd: float) -> float:
+def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_sd: float) -> float:
     """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
 
     lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant

@@ -15,7 +15,7 @@ from probewise.world.concealed import Concealed
 
 
 @dataclass(frozen=True)
-class Hidden:
+class HiddenEffect:
     """One concealed effect.
 
     Parameters
@@ -93,7 +93,7 @@ class Truth:
     noise_sd: float
     black: float
     white: float
-    hidden: tuple[Hidden, ...] = ()
+    hidden: tuple[HiddenEffect, ...] = ()
     cosine: float | None = None
     alias: Alias | None = None
 

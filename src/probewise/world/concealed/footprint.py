@@ -16,7 +16,7 @@ from probewise.world.spots import Blob, blurred, gaussian_spot
 
 @dataclass(frozen=True)
 class SensorTilt:
-    """A tilted sensor: the footprint is shifted in the lab frame, independent of orientation."""
+    """A tilted sensor: the footprint is shifted by one vector of the lab frame, whatever the orientation."""
 
     name: ClassVar[str] = "sensor_tilt"
     stage: ClassVar[Stage] = "tilt"

@@ -4,17 +4,17 @@ It produces what a user would provide (a table and a short file) with a separate
 fits are implemented a second time.
 """
 
-from probewise.world.systems.cases import KINDS, Drawn, SystemCase, SystemEffect, draw_system, draw_system_case
+from probewise.world.systems.cases import KINDS, DrawnSystem, SystemCase, SystemEffect, draw_system, draw_system_case
 from probewise.world.systems.files import owners_file, truth_of, write_system_case
 from probewise.world.systems.noise import OTHER_NOISE
-from probewise.world.systems.right import right_predictions
+from probewise.world.systems.right_model import right_predictions
 from probewise.world.systems.strata import SYSTEMS_WHEEL, system_stratum_of
 
 __all__ = [
     "KINDS",
     "OTHER_NOISE",
     "SYSTEMS_WHEEL",
-    "Drawn",
+    "DrawnSystem",
     "SystemCase",
     "SystemEffect",
     "draw_system",
@@ -25,3 +25,6 @@ __all__ = [
     "truth_of",
     "write_system_case",
 ]
+
+Drawn = DrawnSystem
+"""The old name of `DrawnSystem`."""

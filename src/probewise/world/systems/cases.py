@@ -17,14 +17,14 @@ from probewise.world.challenge.sizing import amplitude_of_size
 from probewise.world.challenge.strata import Stratum
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.designs import design_runs
-from probewise.world.systems.fit import AddedForm, Fitted, Model, numbers_of, project_out
+from probewise.world.systems.fit import AddedForm, LeastSquaresFit, Model, numbers_of_setting, project_out
 from probewise.world.systems.forms.form import Form, Placed
 from probewise.world.systems.forms.out_of_vocabulary import OUT_OF_VOCABULARY, forms_out_of_vocabulary
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.formulas import FORMULAS
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
-from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of
+from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
 from probewise.world.systems.rivals import rivals_of, short_name
 from probewise.world.systems.rows import SystemRows
 from probewise.world.systems.strata import system_stratum_of
@@ -41,7 +41,7 @@ _RUN_AWAY = 1e3  # times the largest reading: larger ones count as divergence
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
+class DrawnSystem:
     """A system with true parameters, without effects.
 
     Parameters
@@ -58,38 +58,42 @@ class Drawn:
     by_run: Mapping[str, FloatArray]
 
     @cached_property
-    def kept_rows(self) -> IntArray:
+    def diagnosed_row_numbers(self) -> IntArray:
         """Numbers of the rows that are not held out."""
         return np.flatnonzero(self.rows.run < self.rows.n_runs - 2)
 
     @cached_property
-    def diagnosed(self) -> SystemRows:
+    def diagnosed_rows(self) -> SystemRows:
         """The rows given to the diagnosis."""
-        return self.rows.take(self.kept_rows)
+        return self.rows.take(self.diagnosed_row_numbers)
 
     @cached_property
-    def nominal(self) -> Model:
+    def nominal_model(self) -> Model:
         """The nominal model of those rows."""
-        return Model(self.kind, self.diagnosed)
+        return Model(self.kind, self.diagnosed_rows)
 
     @cached_property
     def true_coordinates(self) -> FloatArray:
         """Coordinates of the true parameters."""
-        return self.nominal.coordinates(self.shared, self.by_run)
+        return self.nominal_model.coordinates(self.shared, self.by_run)
 
     @cached_property
-    def without_effects(self) -> Fitted:
+    def without_effects(self) -> LeastSquaresFit:
         """The noise-free readings without any effect, as a fit of the nominal model, with its slopes."""
-        readings, slopes = self.nominal.with_slopes(self.true_coordinates)
-        return Fitted(self.true_coordinates, readings, slopes, 0.0)
+        readings, slopes = self.nominal_model.with_slopes(self.true_coordinates)
+        return LeastSquaresFit(self.true_coordinates, readings, slopes, 0.0)
 
     @cached_property
     def true_system(self) -> TrueSystem:
         """The system at its true parameters, about which effects are built."""
-        parameters = self.nominal.parameters(self.true_coordinates[None, :])
-        trace = simulate(self.kind, self.diagnosed, parameters)
+        parameters = self.nominal_model.parameters(self.true_coordinates[None, :])
+        trace = simulate(self.kind, self.diagnosed_rows, parameters)
         return TrueSystem(
-            self.kind, self.diagnosed, parameters, trace.readings[0], {name: v[0] for name, v in trace.states.items()}
+            self.kind,
+            self.diagnosed_rows,
+            parameters,
+            trace.readings[0],
+            {name: v[0] for name, v in trace.states.items()},
         )
 
     def readings_at_all_rows(self, effects: Sequence[Placed]) -> FloatArray:
@@ -107,7 +111,7 @@ class Drawn:
         """
         with np.errstate(all="ignore"):
             readings: FloatArray = simulate(
-                self.kind, self.diagnosed, self.nominal.parameters(self.true_coordinates[None, :]), effects
+                self.kind, self.diagnosed_rows, self.nominal_model.parameters(self.true_coordinates[None, :]), effects
             ).readings[0]
         if not np.isfinite(readings).all():
             raise NotConvergedError(f"the {self.kind.name} runs away")
@@ -115,12 +119,13 @@ class Drawn:
 
     def size(self, effects: Sequence[Placed]) -> float:
         """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
-        return math.sqrt(self.nominal.fit(self.diagnosed_readings(effects), self.true_coordinates).chi_square)
+        return math.sqrt(self.nominal_model.fit(self.diagnosed_readings(effects), self.true_coordinates).chi_square)
 
     # Old names.
     everywhere, changed = readings_at_all_rows, diagnosed_readings
     kept, seen, at, bare = (
-        property(attrgetter(name)) for name in ("kept_rows", "diagnosed", "true_coordinates", "without_effects")
+        property(attrgetter(name))
+        for name in ("diagnosed_row_numbers", "diagnosed_rows", "true_coordinates", "without_effects")
     )
 
 
@@ -147,7 +152,7 @@ class SystemEffect:
     @property
     def placed(self) -> Placed:
         """The form with its parameters."""
-        return self.form, numbers_of(self.values)
+        return self.form, numbers_of_setting(self.values)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -184,7 +189,7 @@ class SystemCase:
     seed: int
     number: int
     stratum: Stratum
-    drawn: Drawn
+    drawn: DrawnSystem
     effects: tuple[SystemEffect, ...]
     noise: SystemNoise
     noise_text: str
@@ -194,11 +199,13 @@ class SystemCase:
     cosine: float | None = None
 
 
-def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> Drawn:
+def draw_system(kind: SystemKind, *, rng: np.random.Generator) -> DrawnSystem:
     """Draw rows and true parameters of a kind."""
     rows = design_runs(kind, rng=rng)
     each = [kind.draw_run(rng) for _ in range(rows.n_runs)]
-    return Drawn(kind, rows, kind.draw(rng), {name: np.array([own[name] for own in each]) for name in kind.per_run})
+    return DrawnSystem(
+        kind, rows, kind.draw(rng), {name: np.array([own[name] for own in each]) for name in kind.per_run}
+    )
 
 
 def draw_system_case(seed: int, number: int) -> SystemCase:
@@ -224,16 +231,16 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         except NotConvergedError as error:
             failure = error
             continue
-        return _recorded(seed, number, stratum, n_earlier, drawn, effects, cosine, everywhere, noise)
+        return _recorded_case(seed, number, stratum, n_earlier, drawn, effects, cosine, everywhere, noise)
     raise failure
 
 
-def _recorded(
+def _recorded_case(
     seed: int,
     number: int,
     stratum: Stratum,
     n_earlier: int,
-    drawn: Drawn,
+    drawn: DrawnSystem,
     effects: tuple[SystemEffect, ...],
     cosine: float | None,
     noise_free: FloatArray,
@@ -244,7 +251,7 @@ def _recorded(
     name = OTHER_NOISE[n_earlier % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
         name = "correlated_noise"  # the table has no column of runs
-    noise = noise_of(name, 12.0, noise_free[drawn.kept_rows], drawn.diagnosed, kind.sd, rng=rng)
+    noise = noise_of_size(name, 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_rows, kind.sd, rng=rng)
     readings = noise.draw(noise_free, drawn.rows, rng)
     knows = str(rng.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
     step = noise.step
@@ -276,7 +283,7 @@ def _recorded(
 
 
 def _draw_effects(
-    stratum: Stratum, n_earlier: int, family: str, drawn: Drawn, rng: np.random.Generator
+    stratum: Stratum, n_earlier: int, family: str, drawn: DrawnSystem, rng: np.random.Generator
 ) -> tuple[tuple[SystemEffect, ...], float | None]:
     """Draw the effects of a stratum once."""
     if stratum.kind == "clean":
@@ -289,14 +296,16 @@ def _draw_effects(
             for f in forms_out_of_vocabulary(drawn.true_system, rng)
             if f.name.removeprefix("strange_").split(":")[0] == wanted
         ]
-        one = _of_size(_random_one(own, wanted, rng), stratum.size, drawn, rng)
+        one = _of_size(_random_form_named(own, wanted, rng), stratum.size, drawn, rng)
         return (_with_rivals(one, forms, drawn, ()),), None
     if stratum.kind == "single":
         own = [f for f in forms if short_name(f).split(":")[0] == family]
-        one = _of_size(_random_one(own, family, rng), stratum.size, drawn, rng)
+        one = _of_size(_random_form_named(own, family, rng), stratum.size, drawn, rng)
         return (_with_rivals(one, forms, drawn, ()),), None
     names = rng.choice(FAMILIES, 2, replace=False)
-    both = [_random_one([f for f in forms if short_name(f).split(":")[0] == name], str(name), rng) for name in names]
+    both = [
+        _random_form_named([f for f in forms if short_name(f).split(":")[0] == name], str(name), rng) for name in names
+    ]
     first, second = (_of_size(form, stratum.size, drawn, rng) for form in both)
     cosine = _cosine(drawn, first, second)
     if abs(cosine) >= _APART:
@@ -304,19 +313,19 @@ def _draw_effects(
     return (_with_rivals(first, forms, drawn, (second,)), _with_rivals(second, forms, drawn, (first,))), cosine
 
 
-def _random_one(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
+def _random_form_named(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
     if not forms:
         raise NotConvergedError(f"this system has no target for {name}")
     return forms[int(rng.integers(len(forms)))]
 
 
-def _of_size(form: Form, wanted: float, drawn: Drawn, rng: np.random.Generator) -> SystemEffect:
+def _of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.random.Generator) -> SystemEffect:
     """Choose the amplitude at which a form has the requested size."""
     more = form.draw(rng)
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
     def placed(amplitude: float) -> list[Placed]:
-        return [(form, numbers_of(form.of_amplitude(sign * amplitude, more)))]
+        return [(form, numbers_of_setting(form.of_amplitude(sign * amplitude, more)))]
 
     change = (drawn.diagnosed_readings(placed(form.first)) - drawn.without_effects.readings) / drawn.kind.sd
     seen = float(np.linalg.norm(project_out(change, drawn.without_effects.slopes)))
@@ -341,7 +350,7 @@ def _with_true_time(form: Form, values: Mapping[str, float]) -> Form:
     return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
 
 
-def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
+def _cosine(drawn: DrawnSystem, one: SystemEffect, other: SystemEffect) -> float:
     a, b = (
         project_out(drawn.diagnosed_readings([e.placed]) - drawn.without_effects.readings, drawn.without_effects.slopes)
         for e in (one, other)
@@ -350,12 +359,12 @@ def _cosine(drawn: Drawn, one: SystemEffect, other: SystemEffect) -> float:
 
 
 def _with_rivals(
-    effect: SystemEffect, forms: Sequence[Form], drawn: Drawn, others: Sequence[SystemEffect]
+    effect: SystemEffect, forms: Sequence[Form], drawn: DrawnSystem, others: Sequence[SystemEffect]
 ) -> SystemEffect:
     """Find the aliases of an effect, given the other effects."""
     target = drawn.diagnosed_readings([e.placed for e in (effect, *others)])
     beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
-    model = Model(drawn.kind, drawn.diagnosed, beside)
+    model = Model(drawn.kind, drawn.diagnosed_rows, beside)
     start = model.coordinates(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
     rivals = rivals_of(

@@ -15,7 +15,7 @@ from probewise.world.systems.rows import SystemRows
 
 
 @dataclass(frozen=True, eq=False)
-class Trace:
+class NoiseFreeResult:
     """Noise-free readings and the states behind them, (n_samples, n_points)."""
 
     readings: FloatArray
@@ -24,7 +24,7 @@ class Trace:
 
 def simulate(
     kind: SystemKind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()
-) -> Trace:
+) -> NoiseFreeResult:
     """Simulate a system without noise: its readings and states.
 
     Parameters
@@ -60,7 +60,7 @@ def simulate(
             p[form.target] = p[form.target] + form.act(now, numbers)
         readings = np.asarray(kind.formula(p, columns))
     readings = np.array(np.broadcast_to(readings, (n_samples, len(rows))))
-    return Trace(with_reading_effects(readings, rows, placed), states)
+    return NoiseFreeResult(with_reading_effects(readings, rows, placed), states)
 
 
 def with_reading_effects(readings: FloatArray, rows: SystemRows, effects: Sequence[Placed]) -> FloatArray:

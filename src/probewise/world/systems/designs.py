@@ -12,11 +12,11 @@ _PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
 
 def irregular_times(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
-    """Draw times from 0 whose gaps lie between 0.6 and 1.4 of `gap`, (n,)."""
+    """Draw times from 0 whose gaps lie between 0.6 and 1.4 of `median_gap`, (n,)."""
     return np.concatenate([[0.0], np.cumsum(gap * rng.uniform(0.6, 1.4, n - 1))])
 
 
-def held_levels(rng: np.random.Generator, n: int, levels: FloatArray, length: int) -> FloatArray:
+def random_steps(rng: np.random.Generator, n: int, levels: FloatArray, length: int) -> FloatArray:
     """Return random levels, each held for about `length` rows, without repetition, (n,)."""
     out: list[float] = []
     while len(out) < n:
@@ -32,7 +32,7 @@ def random_waves(rng: np.random.Generator, t: FloatArray, size: float, fastest: 
     return np.asarray(size * waves.sum(axis=0) / np.sqrt(2.0))
 
 
-def there_and_back(rng: np.random.Generator, n: int, low: float, high: float) -> FloatArray:
+def sweep_there_and_back(rng: np.random.Generator, n: int, low: float, high: float) -> FloatArray:
     """Return a sweep from low to high in uneven steps and back, (n,)."""
     up = n // 2
     first, second = np.sort(rng.uniform(0, 1, up)), np.sort(rng.uniform(0, 1, n - up))[::-1]
@@ -50,7 +50,7 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
         n = int(each * rng.uniform(0.8, 1.2))
         regime = 1.5 if k == n_runs - 1 else 1.0
         t, own = kind.design(rng, n, regime)
-        if not kind.time_anew:
+        if not kind.restarts_time:
             t = t + clock
             clock = float(t[-1]) + _PAUSE * float(t[-1] - t[0]) * rng.uniform(0.5, 1.5) + float(t[1] - t[0])
         whole = {**own, **_irrelevant_columns(kind, n, k, regime, rng)}

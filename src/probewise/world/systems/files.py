@@ -19,7 +19,7 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
     """Write simulator.py, table.csv, table_test.csv and truth.json into a directory, and return their paths."""
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
-    seen = case.drawn.kept_rows
+    seen = case.drawn.diagnosed_row_numbers
     later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
     texts = {
         "simulator.py": owners_file(case),
@@ -34,7 +34,7 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
 
 
 def owners_file(case: SystemCase) -> str:
-    """Return the text of the owner's file."""
+    """Return the text of simulator.py: the nominal simulator as its owner would hand it in."""
     return case.drawn.kind.text.replace("{noise}\n", f"{case.noise_text}\n" if case.noise_text else "")
 
 
@@ -54,7 +54,7 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
 
 def truth_of(case: SystemCase) -> dict[str, Any]:
     """Return the truth of a case."""
-    seen = case.drawn.kept_rows
+    seen = case.drawn.diagnosed_row_numbers
     later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
     pair = len(case.effects) == 2
     effects = [_effect_json(effect) for effect in case.effects]

@@ -21,7 +21,7 @@ _FORM_STEP = 0.1  # of the form's own step
 _FAR = 1e9  # residual in sds where a law diverges
 
 
-def free_numbers(form: Form) -> tuple[str, ...]:
+def fitted_parameters(form: Form) -> tuple[str, ...]:
     """Return the parameters to fit: not the time of a step, nor values of absent runs."""
     return tuple(name for name, step in form.steps.items() if step > 0)
 
@@ -36,7 +36,7 @@ class AddedForm:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class LeastSquaresFit:
     """A least-squares fit: coordinates, readings (n_points,), slopes (n_points, n_coordinates), chi-square."""
 
     coordinates: FloatArray
@@ -62,7 +62,7 @@ class Model:
         return [int(self.rows.run[own[0]]) for own in self.rows.by_run]
 
     @property
-    def n_nominal(self) -> int:
+    def n_nominal_coordinates(self) -> int:
         """Number of coordinates of the nominal model."""
         return len(self.kind.shared) + len(self.kind.per_run) * len(self._runs)
 
@@ -87,7 +87,7 @@ class Model:
     def effects(self, x: FloatArray) -> list[Placed]:
         """Return forms with their parameters at coordinates."""
         out: list[Placed] = []
-        n = self.n_nominal
+        n = self.n_nominal_coordinates
         for b in self.added:
             numbers: dict[str, FloatArray] = {name: np.full((len(x), 1), value) for name, value in b.start.items()}
             for name in b.free:
@@ -109,8 +109,8 @@ class Model:
         moves = [np.eye(len(x))[k] for k in range(n_shared)]
         for j in range(len(self.kind.per_run)):
             moves.append(np.isin(np.arange(len(x)), n_shared + j * n_runs + np.arange(n_runs)).astype(float))
-        moves += [np.eye(len(x))[k] for k in range(self.n_nominal, len(x))]
-        sizes = np.where([np.flatnonzero(m)[0] >= self.n_nominal for m in moves], 1.0, _STEP)
+        moves += [np.eye(len(x))[k] for k in range(self.n_nominal_coordinates, len(x))]
+        sizes = np.where([np.flatnonzero(m)[0] >= self.n_nominal_coordinates for m in moves], 1.0, _STEP)
         steps = np.array(moves) * sizes[:, None]
         found = self.predict(np.concatenate([x[None], x + steps, x - steps]))
         n = len(moves)
@@ -118,7 +118,7 @@ class Model:
         out = np.zeros((len(self.rows), len(x)))
         for move, slope in zip(moves, slopes, strict=True):
             columns = np.flatnonzero(move)
-            if len(columns) == 1 and not n_shared <= columns[0] < self.n_nominal:
+            if len(columns) == 1 and not n_shared <= columns[0] < self.n_nominal_coordinates:
                 out[:, columns[0]] = slope
             else:
                 for column, run in zip(columns, self._runs, strict=True):
@@ -126,7 +126,7 @@ class Model:
                     out[here, column] = slope[here]
         return found[0], out
 
-    def _with_slopes_or_far(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _with_slopes_or_huge(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings with their slopes; if a law diverges, values so large that the fit steps back."""
         try:
             readings, slopes = self.with_slopes(x)
@@ -136,7 +136,7 @@ class Model:
             return np.full(len(self.rows), _FAR * self.kind.sd), np.zeros((len(self.rows), len(x)))
         return readings, np.nan_to_num(slopes)
 
-    def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> Fitted:
+    def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> LeastSquaresFit:
         """Fit readings (n_points,) by least squares from a start.
 
         Raises
@@ -151,7 +151,7 @@ class Model:
             key = x.tobytes()
             if key not in last:
                 last.clear()
-                last[key] = self._with_slopes_or_far(x)
+                last[key] = self._with_slopes_or_huge(x)
             return last[key]
 
         def standardised_residuals(x: FloatArray) -> FloatArray:
@@ -175,7 +175,7 @@ class Model:
                 f, slopes = readings_and_slopes(np.asarray(found.x))
         except (ValueError, np.linalg.LinAlgError) as error:
             raise NotConvergedError(f"a fit of the {self.kind.name} left the finite numbers") from error
-        return Fitted(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))
+        return LeastSquaresFit(found.x, f, slopes, float(np.sum(((f - readings) / sd) ** 2)))
 
 
 def project_out(change: FloatArray, slopes: FloatArray) -> FloatArray:
@@ -186,6 +186,6 @@ def project_out(change: FloatArray, slopes: FloatArray) -> FloatArray:
     return np.asarray(change - basis @ (basis.T @ change))
 
 
-def numbers_of(values: Mapping[str, float]) -> Numbers:
+def numbers_of_setting(values: Mapping[str, float]) -> Numbers:
     """Convert one setting to parameter arrays."""
     return {name: np.array([[value]]) for name, value in values.items()}

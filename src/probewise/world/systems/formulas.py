@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.designs import held_levels, irregular_times, there_and_back
-from probewise.world.systems.kind import Columns, Logged, Prior, SystemKind
+from probewise.world.systems.designs import irregular_times, random_steps, sweep_there_and_back
+from probewise.world.systems.kind import Columns, IrrelevantColumn, Prior, SystemKind
 
 Rng = np.random.Generator
 
@@ -45,11 +45,11 @@ def simulate(p, data):
     formula=lambda p, u: (
         p["scale"] * u["bath_c"] * (1 - np.exp(-u["t_s"] / p["tau_s"])) + p["start_c"] * np.exp(-u["t_s"] / p["tau_s"])
     ),
-    time_anew=True,
+    restarts_time=True,
     logged=(
-        Logged("room_c", 21.5, 0.8, 0.03, 2, 4.0),
-        Logged("stir_rpm", 300, 15, 3, 0),
-        Logged("rh_pct", 45, 3, 0.3, 1),
+        IrrelevantColumn("room_c", 21.5, 0.8, 0.03, 2, 4.0),
+        IrrelevantColumn("stir_rpm", 300, 15, 3, 0),
+        IrrelevantColumn("rh_pct", 45, 3, 0.3, 1),
     ),
     n_runs=5,
 )
@@ -90,8 +90,12 @@ def simulate(p, data):
     drives=("room_c",),
     sd=0.12,
     formula=lambda p, u: u["room_c"] + (p["hot_c"] - u["room_c"]) * np.exp(-u["t_min"] / p["tau_min"]),
-    time_anew=True,
-    logged=(Logged("rh_pct", 50, 4, 0.4, 1), Logged("fill_ml", 240, 6, 0.4, 1), Logged("baro_hpa", 1012, 2, 0.1, 1)),
+    restarts_time=True,
+    logged=(
+        IrrelevantColumn("rh_pct", 50, 4, 0.4, 1),
+        IrrelevantColumn("fill_ml", 240, 6, 0.4, 1),
+        IrrelevantColumn("baro_hpa", 1012, 2, 0.1, 1),
+    ),
     n_runs=5,
     reading_decimals=3,
 )
@@ -99,7 +103,7 @@ def simulate(p, data):
 
 def _photodiode_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     far = 90.0 * (1.5 if regime > 1 else 1.0)
-    return irregular_times(rng, n, 1.0), {"dist_mm": there_and_back(rng, n, 20.0, far)}
+    return irregular_times(rng, n, 1.0), {"dist_mm": sweep_there_and_back(rng, n, 20.0, far)}
 
 
 PHOTODIODE = SystemKind(
@@ -130,9 +134,9 @@ def simulate(p, data):
     sd=0.4,
     formula=lambda p, u: p["dark_mv"] + p["power"] / (u["dist_mm"] + p["behind_mm"]) ** 2,
     logged=(
-        Logged("board_c", 27, 1.5, 0.05, 2, 6.0),
-        Logged("rail_v", 5.0, 0.01, 0.002, 4),
-        Logged("rh_pct", 42, 3, 0.3, 1),
+        IrrelevantColumn("board_c", 27, 1.5, 0.05, 2, 6.0),
+        IrrelevantColumn("rail_v", 5.0, 0.01, 0.002, 4),
+        IrrelevantColumn("rh_pct", 42, 3, 0.3, 1),
     ),
     n_runs=5,
     reading_decimals=3,
@@ -142,7 +146,7 @@ def simulate(p, data):
 def _flow_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     most = 12.0 * regime
     return irregular_times(rng, n, 6.0), {
-        "flow_lpm": held_levels(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)
+        "flow_lpm": random_steps(rng, n, np.linspace(0.5, most, 11), 4) * rng.uniform(0.97, 1.03, n)
     }
 
 
@@ -169,9 +173,9 @@ def simulate(p, data):
     sd=0.03,
     formula=lambda p, u: p["zero_kpa"] + p["k"] * u["flow_lpm"] ** 2,
     logged=(
-        Logged("water_c", 18, 1.5, 0.05, 2, 8.0),
-        Logged("pump_v", 24, 0.1, 0.02, 3),
-        Logged("baro_hpa", 1009, 2, 0.1, 1),
+        IrrelevantColumn("water_c", 18, 1.5, 0.05, 2, 8.0),
+        IrrelevantColumn("pump_v", 24, 0.1, 0.02, 3),
+        IrrelevantColumn("baro_hpa", 1009, 2, 0.1, 1),
     ),
     n_runs=4,
 )
@@ -179,7 +183,7 @@ def simulate(p, data):
 
 def _lens_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     low, high = (440, 640) if regime == 1 else (400, 700)
-    return irregular_times(rng, n, 9.0), {"nm": there_and_back(rng, n, low, high)}
+    return irregular_times(rng, n, 9.0), {"nm": sweep_there_and_back(rng, n, low, high)}
 
 
 LENS = SystemKind(
@@ -205,9 +209,9 @@ def simulate(p, data):
     sd=0.01,
     formula=lambda p, u: p["radius_mm"] / (2 * (1.504 + p["b_um2"] / (u["nm"] / 1000) ** 2 - 1)),
     logged=(
-        Logged("glass_c", 22, 1.2, 0.03, 2, 7.0),
-        Logged("lamp_w", 40, 0.3, 0.05, 2),
-        Logged("baro_hpa", 1015, 2, 0.1, 1),
+        IrrelevantColumn("glass_c", 22, 1.2, 0.03, 2, 7.0),
+        IrrelevantColumn("lamp_w", 40, 0.3, 0.05, 2),
+        IrrelevantColumn("baro_hpa", 1015, 2, 0.1, 1),
     ),
     n_runs=3,
 )
@@ -217,7 +221,7 @@ def _ph_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     levels = np.linspace(4, 9, 8) if regime == 1 else np.linspace(2.5, 11, 8)
     t = irregular_times(rng, n, 15.0)
     warm = rng.uniform(18, 32) + (12 if regime > 1 else 0) + 1.5 * np.sin(t / rng.uniform(80, 300))
-    return t, {"buffer_ph": held_levels(rng, n, levels, 5) + 0.02 * rng.standard_normal(n), "probe_c": warm}
+    return t, {"buffer_ph": random_steps(rng, n, levels, 5) + 0.02 * rng.standard_normal(n), "probe_c": warm}
 
 
 PH = SystemKind(
@@ -242,7 +246,7 @@ def simulate(p, data):
     drives=("buffer_ph", "probe_c"),
     sd=0.5,
     formula=lambda p, u: p["e0_mv"] - p["slope_mv"] * (u["probe_c"] + 273.15) / 298.15 * (u["buffer_ph"] - 7),
-    logged=(Logged("salt_g_l", 3.0, 0.15, 0.02, 3), Logged("rh_pct", 48, 3, 0.3, 1)),
+    logged=(IrrelevantColumn("salt_g_l", 3.0, 0.15, 0.02, 3), IrrelevantColumn("rh_pct", 48, 3, 0.3, 1)),
     n_runs=4,
     reading_decimals=3,
 )

@@ -75,7 +75,7 @@ class Prior:
 
 
 @dataclass(frozen=True)
-class Logged:
+class IrrelevantColumn:
     """An irrelevant logged column: a random walk about a middle with jitter, printed to some decimals.
 
     `beyond` is the shift of its middle in a new regime.
@@ -120,7 +120,7 @@ class SystemKind:
         The nominal model, one of the two.
     time, time_unit, run
         Names of the columns; None if absent.
-    time_anew
+    restarts_time
         Whether time restarts in each run.
     logged
         Irrelevant columns.
@@ -128,7 +128,7 @@ class SystemKind:
         Number of runs not held out, and the parameters with a value in each.
     reading_decimals
         Decimals of a reading.
-    tells_states
+    defines_states
         Whether the owner's file defines states and rates, or integrates by itself.
     """
 
@@ -148,12 +148,12 @@ class SystemKind:
     time: str | None = "t_s"
     time_unit: str = "s"
     run: str | None = "run"
-    time_anew: bool = False
-    logged: tuple[Logged, ...] = ()
+    restarts_time: bool = False
+    logged: tuple[IrrelevantColumn, ...] = ()
     n_runs: int = 5
     per_run: tuple[str, ...] = ()
     reading_decimals: int = 4
-    tells_states: bool = True
+    defines_states: bool = True
 
     @property
     def shared(self) -> tuple[str, ...]:

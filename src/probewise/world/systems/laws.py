@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.designs import held_levels, irregular_times, random_waves
-from probewise.world.systems.kind import Columns, Law, Logged, Prior, SystemKind
+from probewise.world.systems.designs import irregular_times, random_steps, random_waves
+from probewise.world.systems.kind import Columns, IrrelevantColumn, Law, Prior, SystemKind
 
 Rng = np.random.Generator
 
 
 def _tank_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular_times(rng, n, 5.0), {
-        "valve_v": held_levels(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)
+        "valve_v": random_steps(rng, n, np.array([0.0, 1.0, 2.0, 3.0, 4.0]) * regime, 9)
     }
 
 
@@ -57,18 +57,18 @@ def simulate(p, data):
         lambda s, p, u: s["level"],
     ),
     logged=(
-        Logged("water_c", 16, 1.0, 0.04, 2, 6.0),
-        Logged("hall_c", 20, 0.8, 0.04, 2),
-        Logged("supply_v", 12, 0.05, 0.01, 3),
+        IrrelevantColumn("water_c", 16, 1.0, 0.04, 2, 6.0),
+        IrrelevantColumn("hall_c", 20, 0.8, 0.04, 2),
+        IrrelevantColumn("supply_v", 12, 0.05, 0.01, 3),
     ),
     n_runs=4,
-    tells_states=False,
+    defines_states=False,
 )
 
 
 def _filter_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular_times(rng, n, 0.002), {
-        "in_v": held_levels(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)
+        "in_v": random_steps(rng, n, np.array([-2.0, -1.0, 0.5, 1.5, 3.0]) * regime, 10)
     }
 
 
@@ -114,7 +114,7 @@ def observe(s, p, u):
         },
         lambda s, p, u: s["second"],
     ),
-    logged=(Logged("board_c", 30, 1.5, 0.04, 2, 8.0), Logged("rail_v", 12.0, 0.02, 0.004, 3)),
+    logged=(IrrelevantColumn("board_c", 30, 1.5, 0.04, 2, 8.0), IrrelevantColumn("rail_v", 12.0, 0.02, 0.004, 3)),
     n_runs=4,
     reading_decimals=5,
 )
@@ -158,7 +158,7 @@ def observe(s, p, u):
         lambda s, p, u: 1000 * s["x"],
         linear=True,
     ),
-    logged=(Logged("air_c", 22, 0.8, 0.03, 2, 5.0), Logged("mains_v", 230, 1.0, 0.3, 1)),
+    logged=(IrrelevantColumn("air_c", 22, 0.8, 0.03, 2, 5.0), IrrelevantColumn("mains_v", 230, 1.0, 0.3, 1)),
     n_runs=4,
     reading_decimals=3,
 )
@@ -166,7 +166,7 @@ def observe(s, p, u):
 
 def _servo_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
     return irregular_times(rng, n, 0.03), {
-        "volts": held_levels(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)
+        "volts": random_steps(rng, n, np.array([-6.0, -3.0, 0.0, 2.0, 5.0]) * regime, 9)
     }
 
 
@@ -197,9 +197,9 @@ def rates(s, p, u):
         lambda s, p, u: s["angle"],
     ),
     logged=(
-        Logged("case_c", 33, 2.5, 0.05, 2, 10.0),
-        Logged("bus_v", 9.0, 0.05, 0.01, 3),
-        Logged("load_g", 120, 6, 0.5, 1),
+        IrrelevantColumn("case_c", 33, 2.5, 0.05, 2, 10.0),
+        IrrelevantColumn("bus_v", 9.0, 0.05, 0.01, 3),
+        IrrelevantColumn("load_g", 120, 6, 0.5, 1),
     ),
     n_runs=5,
     reading_decimals=3,
@@ -247,11 +247,11 @@ def observe(s, p, u):
         lambda s, p, u: {"a": -p["k1_per_s"] * s["a"], "b": p["k1_per_s"] * s["a"] - p["k2_per_s"] * s["b"]},
         lambda s, p, u: s["b"],
     ),
-    time_anew=True,
+    restarts_time=True,
     logged=(
-        Logged("jacket_c", 30, 0.7, 0.04, 2, 4.0),
-        Logged("stir_rpm", 500, 12, 4, 0),
-        Logged("lamp_a", 0.8, 0.01, 0.001, 4),
+        IrrelevantColumn("jacket_c", 30, 0.7, 0.04, 2, 4.0),
+        IrrelevantColumn("stir_rpm", 500, 12, 4, 0),
+        IrrelevantColumn("lamp_a", 0.8, 0.01, 0.001, 4),
     ),
     n_runs=5,
     reading_decimals=5,
@@ -259,7 +259,7 @@ def observe(s, p, u):
 
 
 def _predator_design(rng: Rng, n: int, regime: float) -> tuple[FloatArray, Columns]:
-    return irregular_times(rng, n, 0.5), {"feed": held_levels(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)}
+    return irregular_times(rng, n, 0.5), {"feed": random_steps(rng, n, np.array([0.6, 1.0, 1.4]) * regime, 15)}
 
 
 PREDATOR = SystemKind(
@@ -300,9 +300,9 @@ def rates(s, p, u):
         lambda s, p, u: s["prey"],
     ),
     logged=(
-        Logged("room_c", 21, 0.8, 0.04, 2, 5.0),
-        Logged("oxygen_mg_l", 7.5, 0.3, 0.05, 2),
-        Logged("light_lx", 400, 15, 4, 0),
+        IrrelevantColumn("room_c", 21, 0.8, 0.04, 2, 5.0),
+        IrrelevantColumn("oxygen_mg_l", 7.5, 0.3, 0.05, 2),
+        IrrelevantColumn("light_lx", 400, 15, 4, 0),
     ),
     n_runs=4,
     reading_decimals=3,

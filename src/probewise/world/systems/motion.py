@@ -98,11 +98,13 @@ class _Integration:
         assert law is not None
         out = []
         for given in law.start.values():
-            at = self._of_run(self.parameters[given]) if isinstance(given, str) else np.full((1, 1), float(given))
+            at = (
+                self._at_first_rows(self.parameters[given]) if isinstance(given, str) else np.full((1, 1), float(given))
+            )
             out.append(np.broadcast_to(at, (self.n_samples, self.places.shape[1])))
         return np.array(out)
 
-    def _of_run(self, values: FloatArray) -> FloatArray:
+    def _at_first_rows(self, values: FloatArray) -> FloatArray:
         return values if values.shape[1] == 1 else values[:, self.places[0]]
 
     def within_gap(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Instants]]:
@@ -161,7 +163,7 @@ class _Integration:
                 out[form.target] = out[form.target] + form.act(s, now, numbers)
         return out
 
-    def breaks(self, k: int) -> list[float]:
+    def discontinuity_shares(self, k: int) -> list[float]:
         """Return the shares of the gap from position k to the next with discontinuities, with 0 and 1."""
         here, there = self.places[k], self.places[k + 1]
         begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
@@ -181,7 +183,7 @@ class _Integration:
         law = self.kind.law
         assert law is not None
         names, places = list(law.start), self.places
-        s = self.bounded(self.initial_states().copy(), names)
+        s = self.clipped_to_bounds(self.initial_states().copy(), names)
         kept = np.empty((*s.shape, len(places)))
         kept[..., 0] = s
         for k in range(len(places) - 1):
@@ -194,13 +196,13 @@ class _Integration:
         time = self.rows.time
         assert time is not None
         t = self.columns[time]
-        gap, at, hard = t[:, self.places[k + 1]] - t[:, self.places[k]], self.within_gap(k), self.switching
+        gap, at, hard = t[:, self.places[k + 1]] - t[:, self.places[k]], self.within_gap(k), self.frictions_and_bounds
 
         def free(share: float, y: FloatArray) -> dict[str, Any]:
             p, now = at(share)
             return self.rates(dict(zip(names, y, strict=True)), p, now)
 
-        edges, begun = self.breaks(k), s
+        edges, begun = self.discontinuity_shares(k), s
         again = np.zeros(s.shape[1:], dtype=bool)
         for low, high in _intervals_between(edges):
             # Slightly inside: a discontinuity at an end belongs to the other side.
@@ -241,14 +243,14 @@ class _Integration:
                 own = y.reshape(s.shape)
                 rates = free(x, own)
                 for (form, size), mode in zip(hard, modes, strict=True):
-                    again |= _mode_ended(form, size, mode, own[names.index(form.target)], rates[form.target])
+                    again |= _has_mode_ended(form, size, mode, own[names.index(form.target)], rates[form.target])
             s = solved.y[:, -1].reshape(s.shape)
         for i, j in np.argwhere(again):
-            s[:, i, j] = self._of_sample(int(i)).through_gap_with_events(begun[:, i, j], k, int(j), names)
+            s[:, i, j] = self._integration_of_sample(int(i)).through_gap_with_events(begun[:, i, j], k, int(j), names)
         return s
 
     @property
-    def switching(self) -> list[tuple[Any, FloatArray]]:
+    def frictions_and_bounds(self) -> list[tuple[Any, FloatArray]]:
         """Dry friction and bounds with their sizes (n_samples, 1)."""
         return [(f, np.atleast_2d(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
 
@@ -261,7 +263,7 @@ class _Integration:
             out[name] = found
         return out
 
-    def _of_sample(self, i: int) -> _Integration:
+    def _integration_of_sample(self, i: int) -> _Integration:
         def one(v: Any) -> Any:
             v = np.atleast_2d(v)
             return v[i : i + 1] if len(v) > 1 else v
@@ -274,9 +276,9 @@ class _Integration:
             [(form, {name: one(v) for name, v in numbers.items()}) for form, numbers in self.effects],
         )
 
-    def bounded(self, s: FloatArray, names: list[str]) -> FloatArray:
+    def clipped_to_bounds(self, s: FloatArray, names: list[str]) -> FloatArray:
         """Clip initial states to their bounds."""
-        for form, size in self.switching:
+        for form, size in self.frictions_and_bounds:
             if form.stops:
                 k = names.index(form.target)
                 s[k] = np.minimum(s[k], size)
@@ -289,14 +291,14 @@ class _Integration:
         t = self.columns[time]
         gap = float(t[0, self.places[k + 1, j]] - t[0, self.places[k, j]])
         at = self.within_gap(k, slice(j, j + 1))
-        hard = [(form, float(size[0, 0])) for form, size in self.switching]
+        hard = [(form, float(size[0, 0])) for form, size in self.frictions_and_bounds]
 
         def free(share: float, y: FloatArray) -> dict[str, float]:
             p, now = at(share)
             found = self.rates(dict(zip(names, y, strict=True)), p, now)
             return {name: float(np.ravel(v)[0]) for name, v in found.items()}
 
-        edges = self.breaks(k)
+        edges = self.discontinuity_shares(k)
         for low, high in _intervals_between(edges):
             share, forced = low, dict[int, int]()
             for _ in range(_MOST_EVENTS):
@@ -366,7 +368,7 @@ def _mode_of_motion(form: Form, size: Any, value: Any, rate: Any) -> Any:
     return np.where((value >= size) & (rate > 0), 0, 1)
 
 
-def _mode_ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
+def _has_mode_ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
     """Return whether a mode has ended."""
     if form.sticks:
         return np.where(mode == 0, np.abs(rate) > size, value * mode < 0)

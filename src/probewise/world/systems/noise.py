@@ -51,7 +51,7 @@ class SystemNoise:
     step: float | None = None
 
 
-def noise_of(
+def noise_of_size(
     name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
     """Choose the strength of a noise so that it is as detectable as an effect of size `wanted`."""

@@ -13,8 +13,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.chain import simulate, with_reading_effects
-from probewise.world.systems.fit import AddedForm, Fitted, Model, free_numbers, project_out
-from probewise.world.systems.forms.form import Form, Placed, as_numbers
+from probewise.world.systems.fit import AddedForm, LeastSquaresFit, Model, fitted_parameters, project_out
+from probewise.world.systems.forms.form import Form, Placed, numbers_of_settings
 from probewise.world.systems.forms.true_system import TrueSystem
 
 TELLING_NATS = 3.0
@@ -28,11 +28,11 @@ _NEUTRAL = {"level": np.inf, "period": 1.0}
 
 
 def short_name(form: Form) -> str:
-    """Return the name in the vocabulary, where a saturation from below has no name of its own."""
+    """Return the vocabulary's name of a form: a saturation from below is `saturation` too."""
     return form.name.removesuffix(" (floor)")
 
 
-def _sticks_stops_or_delays(form: Form) -> bool:
+def _needs_own_integration(form: Form) -> bool:
     return form.sticks or form.stops or bool(form.late)
 
 
@@ -44,7 +44,12 @@ class _StartOfFit:
 
 
 def rivals_of(
-    true: TrueSystem, forms: Sequence[Form], target: FloatArray, fitted: Fitted, model: Model, without: frozenset[str]
+    true: TrueSystem,
+    forms: Sequence[Form],
+    target: FloatArray,
+    fitted: LeastSquaresFit,
+    model: Model,
+    without: frozenset[str],
 ) -> dict[str, float]:
     """Find the forms that explain noise-free readings as well.
 
@@ -68,7 +73,7 @@ def rivals_of(
     left = project_out((target - fitted.readings) / true.sd, fitted.slopes)
     near = _best_by_linearisation(true, [f for f in forms if short_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
-    hard = any(_sticks_stops_or_delays(b.form) for b in model.added)
+    hard = any(_needs_own_integration(b.form) for b in model.added)
     for candidate in near:
         name = short_name(candidate.form)
         if hard:  # fits with dry friction or a bound take minutes: the linearised result is used
@@ -77,16 +82,16 @@ def rivals_of(
         wider = Model(
             true.kind,
             true.rows,
-            [*model.added, AddedForm(candidate.form, candidate.start, free_numbers(candidate.form))],
+            [*model.added, AddedForm(candidate.form, candidate.start, fitted_parameters(candidate.form))],
         )
-        own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in free_numbers(candidate.form)]
+        own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in fitted_parameters(candidate.form)]
         try:
             nats = (
                 0.5
                 * wider.fit(
                     target,
                     np.concatenate([fitted.coordinates, own]),
-                    max_calls=5 if _sticks_stops_or_delays(candidate.form) else 7,
+                    max_calls=5 if _needs_own_integration(candidate.form) else 7,
                 ).chi_square
             )
         except NotConvergedError:
@@ -97,7 +102,7 @@ def rivals_of(
 
 
 def _best_by_linearisation(
-    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: Fitted, model: Model
+    true: TrueSystem, forms: Sequence[Form], left: FloatArray, fitted: LeastSquaresFit, model: Model
 ) -> list[_StartOfFit]:
     """Return the best candidates by linearisation, with each form's best two starts."""
     size = float(left @ left)
@@ -122,7 +127,9 @@ def _best_by_linearisation(
     return sorted(out, key=lambda c: c.nats)[:_MOST_FITS]
 
 
-def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model: Model) -> dict[Form, FloatArray]:
+def templates_of(
+    true: TrueSystem, forms: Sequence[Form], fitted: LeastSquaresFit, model: Model
+) -> dict[Form, FloatArray]:
     """Return the change of the readings by every setting of every form's bank about a fit, (n_settings, n_points)."""
     settings = {form: [each for group in form.bank for each in group] for form in forms}
     x = fitted.coordinates[None, :]
@@ -135,12 +142,13 @@ def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model:
         for form in (f for f in forms if f.side == "reading"):
             unread = np.repeat(bare, len(settings[form]), axis=0)
             out[form] = (
-                with_reading_effects(unread, true.rows, [*outer, (form, as_numbers(settings[form]))]) - fitted.readings
+                with_reading_effects(unread, true.rows, [*outer, (form, numbers_of_settings(settings[form]))])
+                - fitted.readings
             )
-        alone, together = _alone_and_together(true, [f for f in forms if f.side != "reading"])
+        alone, together = _split_by_way_of_simulation(true, [f for f in forms if f.side != "reading"])
         for form in alone:
             found = _simulated_or_nan(
-                true, parameters, [*beside, (form, as_numbers(settings[form]))], len(settings[form])
+                true, parameters, [*beside, (form, numbers_of_settings(settings[form]))], len(settings[form])
             )
             out[form] = found - fitted.readings
         for chunk in _chunks_of_forms(together, settings):
@@ -148,7 +156,7 @@ def templates_of(true: TrueSystem, forms: Sequence[Form], fitted: Fitted, model:
     return out
 
 
-def _alone_and_together(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
+def _split_by_way_of_simulation(true: TrueSystem, forms: Sequence[Form]) -> tuple[list[Form], list[Form]]:
     """Divide forms into those to be simulated each alone, and those of one integration together."""
     alone = [f for f in forms if f.sticks or f.stops or true.kind.law is None]
     return alone, [f for f in forms if f not in alone]
@@ -167,14 +175,18 @@ def _chunks_of_forms(forms: Sequence[Form], settings: dict[Form, list[dict[str, 
 
 
 def _simulated_together(
-    true: TrueSystem, forms: Sequence[Form], settings: dict[Form, list[dict[str, float]]], fitted: Fitted, model: Model
+    true: TrueSystem,
+    forms: Sequence[Form],
+    settings: dict[Form, list[dict[str, float]]],
+    fitted: LeastSquaresFit,
+    model: Model,
 ) -> dict[Form, FloatArray]:
     """Simulate many forms at once, each with its null setting except in its own samples."""
     ends = np.cumsum([len(settings[form]) for form in forms])
     total, x = int(ends[-1]), fitted.coordinates[None, :]
     placed = []
     for form, end in zip(forms, ends, strict=True):
-        own = as_numbers(settings[form])
+        own = numbers_of_settings(settings[form])
         numbers = {}
         for name, values in own.items():
             whole = np.full((total, 1), _NEUTRAL.get(name, 0.0))

@@ -55,7 +55,7 @@ class SystemRows:
         return out
 
     @cached_property
-    def gap(self) -> float:
+    def median_gap(self) -> float:
         """Median time from a row to the next of its run."""
         return float(np.median(np.concatenate([np.diff(self.t[rows]) for rows in self.by_run])))
 

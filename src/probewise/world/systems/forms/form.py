@@ -114,6 +114,6 @@ Placed: TypeAlias = tuple[Form, Numbers]
 """A form with its parameters."""
 
 
-def as_numbers(settings: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
+def numbers_of_settings(settings: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
     """Stack settings to parameter arrays, (n_settings, 1) each."""
     return {name: np.array([[each[name]] for each in settings]) for name in settings[0]}

@@ -9,9 +9,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
-from probewise.world.systems.forms.modulations import one_by_one, wave_bank, wave_joined
+from probewise.world.systems.forms.modulations import join_sine_and_cosine, join_single_member, wave_bank
 from probewise.world.systems.forms.readings import delayed
-from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
+from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.rows import SystemRows
 
 Change = Callable[[FloatArray, SystemRows, Numbers], Any]
@@ -23,7 +23,7 @@ def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
         yield from _forms_of_column(true, column)
     time = true.rows.time
     # A clock error is detectable only if the law or the formula uses time.
-    if time is not None and (true.kind.law is not None or true.kind.time_anew):
+    if time is not None and (true.kind.law is not None or true.kind.restarts_time):
         yield _linear_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
 
 
@@ -43,7 +43,7 @@ def _linear_form(
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": first}]],
-        one_by_one,
+        join_single_member,
         {"a": first},
         first,
         limit,
@@ -107,7 +107,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
     moves = np.concatenate([np.diff(values[rows]) for rows in true.rows.by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
-        yield _nonlinear_form(f"backlash:{column}", "width", play, column, sizes, ("previous", column))
+        yield _nonlinear_form(f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column))
     if len(np.unique(values)) > 20:
         waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
 
@@ -124,11 +124,11 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
             _changing_column(column, wavy),
             lambda a, drawn: {"a": a, **drawn},
             lambda rng: {
-                "period": span / log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
+                "period": span / draw_log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
                 "phase": float(rng.uniform(0, 2 * np.pi)),
             },
             bank,
-            wave_joined,
+            join_sine_and_cosine,
             {"a": first, "period": 0.002 * span, "phase": 0.05},
             first,
             0.2 * span,
@@ -136,7 +136,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
             signed=False,
         )
     if true.rows.time is not None:
-        taus = true.rows.gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
+        taus = true.rows.median_gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
         yield _nonlinear_form(
             f"input_delay:{column}",
             "tau_s",
@@ -148,7 +148,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
 
 
-def play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+def behind_gear_play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
     """Return a column behind gear play: it rests until the play is taken up.
 
     At the start of each run, the play is taken up in the direction of the first motion.

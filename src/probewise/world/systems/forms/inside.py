@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form
-from probewise.world.systems.forms.modulations import Modulation, one_by_one
+from probewise.world.systems.forms.modulations import Modulation, join_single_member
 from probewise.world.systems.forms.true_system import TrueSystem
 
 _N_WAVES = 20
@@ -74,7 +74,7 @@ def term_in_rate(
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": 0.1 * first}]],
-        one_by_one,
+        join_single_member,
         {"a": first},
         first,
         300 * first,
@@ -93,31 +93,37 @@ def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
     for state, values in true.states.items():
         size = float(np.abs(values).max())
         own = (f"state:{state}", "time")
-        yield term_in_rate(true, f"damping:{state}", state, _term_of(state, lambda r: -r), size, own, signed=False)
-        drags = _term_of(state, lambda r: -np.abs(r) * r)
+        yield term_in_rate(
+            true, f"damping:{state}", state, _term_in_state(state, lambda r: -r), size, own, signed=False
+        )
+        drags = _term_in_state(state, lambda r: -np.abs(r) * r)
         yield term_in_rate(true, f"drag:{state}", state, drags, size**2, own, signed=False)
         yield term_in_rate(
-            true, f"forcing:{state}", state, _term_of(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
+            true, f"forcing:{state}", state, _term_in_state(state, lambda r: 1.0 + 0.0 * r), 1.0, ("time", *own)
         )
         for other, there in true.states.items():
             most = float(np.abs(there).max())
             seen = (f"state:{other}", "time")
-            yield term_in_rate(true, f"cubic:{state}:{other}", state, _term_of(other, lambda r: -(r**3)), most**3, seen)
             yield term_in_rate(
-                true, f"quadratic:{state}:{other}", state, _term_of(other, lambda r: -(r**2)), most**2, seen
+                true, f"cubic:{state}:{other}", state, _term_in_state(other, lambda r: -(r**3)), most**3, seen
+            )
+            yield term_in_rate(
+                true, f"quadratic:{state}:{other}", state, _term_in_state(other, lambda r: -(r**2)), most**2, seen
             )
             if other != state:
-                yield term_in_rate(true, f"coupling:{state}:{other}", state, _term_of(other, lambda r: -r), most, seen)
-        yield _periodic(true, state)
+                yield term_in_rate(
+                    true, f"coupling:{state}:{other}", state, _term_in_state(other, lambda r: -r), most, seen
+                )
+        yield _periodic_term(true, state)
         yield from _friction_and_bound(true, state)
 
 
-def _term_of(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
+def _term_in_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
     """Return a push from a term in one state."""
     return lambda s, now, v: term(s[state])
 
 
-def _periodic(true: TrueSystem, state: str) -> Form:
+def _periodic_term(true: TrueSystem, state: str) -> Form:
     how = modulations.waves(true, _N_WAVES)
     first = 0.02 * true.rms_rate(state)
     return Form(

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Bank, Instants, Numbers
-from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
+from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +34,7 @@ def _no_values(rng: np.random.Generator) -> dict[str, float]:
     return {}
 
 
-def one_by_one(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+def join_single_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
     """Scale the amplitude of a group's only member."""
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
@@ -47,7 +47,7 @@ def _of_amplitude_alone(
         lambda a, drawn: {"a": a},
         _no_values,
         lambda a: [[{"a": a}]],
-        one_by_one,
+        join_single_member,
         lambda a: {"a": a},
         covariates,
         reach,
@@ -82,7 +82,7 @@ def step(true: TrueSystem) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {at: true.random_time(rng)},
         lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
-        one_by_one,
+        join_single_member,
         lambda a: {"a": a, at: 0.0},
         ("time", str(true.rows.time)) if timed else ("row",),
         1.0,
@@ -120,7 +120,7 @@ def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
     return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
 
 
-def wave_joined(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+def join_sine_and_cosine(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
     """Convert the amounts of sine and cosine to amplitude and phase."""
     sine, cosine = amounts * group[0]["a"]
     return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
@@ -129,13 +129,13 @@ def wave_joined(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[
 def waves(true: TrueSystem, n: int) -> Modulation:
     """Return one sinusoid in time, up to one period in four rows; the bank has n frequencies."""
     rows = true.rows
-    slowest, fastest = 1.5 / rows.duration, 0.25 / rows.gap
+    slowest, fastest = 1.5 / rows.duration, 0.25 / rows.median_gap
     return Modulation(
         lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {"hz": log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
-        lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.gap, n), "hz"),
-        wave_joined,
+        lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
+        lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
+        join_sine_and_cosine,
         lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
         ("time", str(rows.time)),
         1.0,
@@ -146,13 +146,13 @@ def waves(true: TrueSystem, n: int) -> Modulation:
 def settling(true: TrueSystem) -> Modulation:
     """Return an exponential settling after the start of each run."""
     longest = float(true.rows.since_start.max())
-    taus = np.geomspace(true.rows.gap, longest, 12)
+    taus = np.geomspace(true.rows.median_gap, longest, 12)
     return Modulation(
         lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {"tau_s": log_uniform(rng, 3 * true.rows.gap, 0.4 * longest)},
+        lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.rows.median_gap, 0.4 * longest)},
         lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
-        one_by_one,
+        join_single_member,
         lambda a: {"a": a, "tau_s": 0.05 * longest},
         ("time", "run", str(true.rows.time)),
         1.0,

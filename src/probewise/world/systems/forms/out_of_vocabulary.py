@@ -9,9 +9,9 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Instants, Numbers
 from probewise.world.systems.forms.inside import term_in_rate
-from probewise.world.systems.forms.modulations import one_by_one
+from probewise.world.systems.forms.modulations import join_single_member
 from probewise.world.systems.forms.readings import OFFSET
-from probewise.world.systems.forms.true_system import TrueSystem, log_uniform
+from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.rows import SystemRows
 
 OUT_OF_VOCABULARY = (
@@ -67,7 +67,7 @@ def _added_to_reading(
         lambda a, more: {"a": a, **more},
         lambda rng: dict(drawn or {}),
         [[{"a": sd}]],
-        one_by_one,
+        join_single_member,
         {"a": sd},
         sd,
         1e4 * sd,
@@ -137,7 +137,7 @@ def _fading(true: TrueSystem, column: str) -> Form:
 
 
 def _square(true: TrueSystem, rng: np.random.Generator) -> Form:
-    hz = log_uniform(rng, 4 / true.rows.duration, 0.06 / true.rows.gap)
+    hz = draw_log_uniform(rng, 4 / true.rows.duration, 0.06 / true.rows.median_gap)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         return np.where((hz * rows.t) % 1.0 < 0.3, 1.0, 0.0)

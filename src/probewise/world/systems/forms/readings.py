@@ -91,7 +91,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": sd}]],
-        modulations.one_by_one,
+        modulations.join_single_member,
         {"a": sd},
         sd,
         1e3 * sd,
@@ -113,7 +113,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))},
         [[{"a": first, "power": p}] for p in (0.5, 0.7, 1.4, 2.0, 3.0, 4.5)],
-        modulations.one_by_one,
+        modulations.join_single_member,
         {"a": first, "power": 0.05},
         first,
         0.5,
@@ -177,7 +177,7 @@ def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
 def _lag_and_delay(true: TrueSystem) -> Iterator[Form]:
     if true.rows.time is None:
         return
-    gap = true.rows.gap
+    gap = true.rows.median_gap
     acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: delayed(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
     for name, (act, least) in acts.items():
         yield Form(

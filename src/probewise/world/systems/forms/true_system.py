@@ -66,7 +66,7 @@ class TrueSystem:
         return math.floor(at) + 0.5 if self.rows.time is None else at
 
 
-def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
     """Draw a number whose logarithm is uniform; raise NotConvergedError if the range is empty."""
     if not 0 < low < high:
         raise NotConvergedError(f"nothing lies between {low:g} and {high:g}: too few rows")

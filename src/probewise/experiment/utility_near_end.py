@@ -14,12 +14,12 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
-from probewise.experiment.checking import ENOUGH_BITS, FAR_SIDE, NAMES, Outline, bits_of_names, places_of
+from probewise.experiment.checking import ENOUGH_BITS, FAR_SIDE, NAMES, Outline, bits_about_name, places_of_designs
 from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.stopping_rule import OFF_SDS
-from probewise.inquiry import Prospect, UtilityMap, entropy_bits
+from probewise.inquiry import UtilityInput, UtilityMap, entropy_bits
 from probewise.inquiry.given_reading import GivenReading
 from probewise.recordings.plan import Plan
 from probewise.scene import outlines
@@ -45,7 +45,7 @@ _ENDS = "probability that a reading there ends the run, plus bits about what the
 def utility_near_end(
     experiment: Experiment,
     posterior: Posterior,
-    prospect: Prospect,
+    utility_input: UtilityInput,
     utilities: UtilityMap,
     readings: tuple[Reading, ...],
     *,
@@ -60,62 +60,66 @@ def utility_near_end(
     Candidates are the designs with the largest information, those at edges and centres of probable shapes and on the
     far side, earlier places, and some random ones.
     """
-    goal = prospect.goal
+    goal = utility_input.goal
     if goal is None:
         return utilities, False
     theta, lengths, weight = _draw_hypotheses(experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng)
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return utilities, False
-    outline = Outline.of(prospect, experiment.shape.region(_mean_shape(experiment, prospect)), readings)
+    outline = Outline.of(utility_input, experiment.shape.region(_mean_shape(experiment, utility_input)), readings)
     far = () if outline is None or outline.far_side is None else (outline.far_side,)
-    rows = np.union1d(_candidate_designs(experiment, prospect, utilities, theta, readings, rng), far).astype(np.int64)
-    plan = Pace.of(readings).on(_plan_of_candidates(prospect, rows, readings[-1]))
+    rows = np.union1d(_candidate_designs(experiment, utility_input, utilities, theta, readings, rng), far).astype(
+        np.int64
+    )
+    plan = Pace.of(readings).plan_with_run_time(_plan_of_candidates(utility_input, rows, readings[-1]))
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
     names = np.array([kind.left_out for kind, own in zip(posterior.kinds, theta, strict=True) for _ in own])
     seen = (
-        np.ones(len(rows), dtype=np.bool_) if outline is None else outline.leaves_no_far_side(places_of(prospect)[rows])
+        np.ones(len(rows), dtype=np.bool_)
+        if outline is None
+        else outline.leaves_no_far_side(places_of_designs(utility_input)[rows])
     )
     if known and not far:
-        utility = bits_of_names(weight, answers, names, prospect.readout)
-        return _map_of_candidates(prospect, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
-    utility = _expected_bits(weight, answers, prospect)
+        utility = bits_about_name(weight, answers, names, utility_input.readout)
+        return _map_of_candidates(utility_input, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
+    utility = _expected_bits(weight, answers, utility_input)
     if known:
         # The far side first: it has to be read in any case, and tells something about the names too.
         there = seen if seen.any() else np.isin(rows, far)
         return _map_of_candidates(
-            prospect, utilities, rows, np.where(there, np.maximum(utility, _LEAST_BITS), 0.0), FAR_SIDE
+            utility_input, utilities, rows, np.where(there, np.maximum(utility, _LEAST_BITS), 0.0), FAR_SIDE
         ), True
     order = np.argsort(-utility, kind="stable")
     best = np.unique(np.concatenate([order[:_ENDING], order[seen[order]][:_ENDING]]))
-    chance = _probability_of_knowing(
-        lengths, weight, answers[:, best], prospect, goal.sd, OFF_SDS * experiment.stop_sd_mm
+    chance = _probability_of_meeting_rule(
+        lengths, weight, answers[:, best], utility_input, goal.sd, OFF_SDS * experiment.stop_sd_mm
     )
     if chance.max() < _LEAST_CHANCE:
-        return _map_of_candidates(prospect, utilities, rows, utility, _LABEL), False
+        return _map_of_candidates(utility_input, utilities, rows, utility, _LABEL), False
     # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
-    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_of_names(
-        weight, answers[:, best], names, prospect.readout
+    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_about_name(
+        weight, answers[:, best], names, utility_input.readout
     )
-    return _map_of_candidates(prospect, utilities, rows[best], ends, _ENDS), False
+    return _map_of_candidates(utility_input, utilities, rows[best], ends, _ENDS), False
 
 
 def _map_of_candidates(
-    prospect: Prospect, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str
+    utility_input: UtilityInput, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str
 ) -> UtilityMap:
     """Return the map of the utility of some available designs, (n,)."""
-    values = np.zeros(len(prospect.designs))
-    values[prospect.rows[rows]] = utility
+    values = np.zeros(len(utility_input.designs))
+    values[utility_input.rows[rows]] = utility
     values.flags.writeable = False
-    return UtilityMap(prospect.designs, values, utilities.reachable, label)
+    return UtilityMap(utility_input.designs, values, utilities.reachable, label)
 
 
-def _mean_shape(experiment: Experiment, prospect: Prospect) -> FloatArray:
+def _mean_shape(experiment: Experiment, utility_input: UtilityInput) -> FloatArray:
     """Return the posterior mean of the shape's parameters, (1, n_params)."""
-    theta = prospect.theta[:, experiment.shape_columns]
-    return np.asarray((prospect.weight @ theta)[None] / prospect.weight.sum())
+    theta = utility_input.theta[:, experiment.shape_columns]
+    return np.asarray((utility_input.weight @ theta)[None] / utility_input.weight.sum())
 
 
 def _draw_hypotheses(
@@ -134,7 +138,7 @@ def _draw_hypotheses(
         own = particles.weighted.samples(int(n), rng=rng) if n else np.empty((0, len(kind.prior.names)))
         theta.append(own)
         if n:
-            lengths.append(kind.placed(own, rng)[:, columns])
+            lengths.append(kind.to_whole_theta(own, rng)[:, columns])
             weight.append(np.full(n, p / n))
     share = np.concatenate(weight)
     return theta, np.concatenate(lengths), share / share.sum()
@@ -142,58 +146,63 @@ def _draw_hypotheses(
 
 def _candidate_designs(
     experiment: Experiment,
-    prospect: Prospect,
+    utility_input: UtilityInput,
     utilities: UtilityMap,
     theta: list[FloatArray],
     readings: tuple[Reading, ...],
     rng: np.random.Generator,
 ) -> IntArray:
     """Choose candidates among the available designs, (n,)."""
-    utility = utilities.values[prospect.rows]
+    utility = utilities.values[utility_input.rows]
     n_shape = len(experiment.shape.prior.names)
     start = int(experiment.shape_columns[0])
     shapes = np.concatenate([own[:, start : start + n_shape] for own in theta if len(own)])
     some = shapes[rng.choice(len(shapes), _AT_EDGES)]  # equally often, regardless of probability
     places = [np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings])]
-    places += [card.informative_mm for card in experiment.cards]
+    places += [card.informative_places_mm for card in experiment.cards]
     region = experiment.shape.region(some)
     if isinstance(region, EllipseRegion | PolygonRegion):
         edges = outlines(region)
         places.append(np.array([edge[rng.integers(len(edge))] for edge in edges]))
         places.append(np.array([edge[:-1].mean(axis=0) for edge in edges[: _AT_EDGES // 4]]))
     wanted = np.concatenate(places)
-    there = np.stack([prospect.plan.x_mm[prospect.rows], prospect.plan.y_mm[prospect.rows]], axis=1)
+    there = np.stack([utility_input.plan.x_mm[utility_input.rows], utility_input.plan.y_mm[utility_input.rows]], axis=1)
     nearest = np.array([int(np.argmin(((there - place) ** 2).sum(axis=1))) for place in wanted])
     best = np.argsort(-utility, kind="stable")[:_BEST]
     return np.unique(np.concatenate([best, nearest, rng.integers(len(there), size=_ANYWHERE)]))
 
 
-def _plan_of_candidates(prospect: Prospect, rows: IntArray, last: Reading) -> Plan:
+def _plan_of_candidates(utility_input: UtilityInput, rows: IntArray, last: Reading) -> Plan:
     """Return a plan with each candidate as a scan from the arm's current place, with its own direction and time."""
     n = len(rows)
-    at = prospect.rows[rows]
-    taken = prospect.plan.take(np.repeat(at, 2))
+    at = utility_input.rows[rows]
+    taken = utility_input.plan.take(np.repeat(at, 2))
     x_mm, y_mm, time_s = taken.x_mm.copy(), taken.y_mm.copy(), np.repeat(last.time_s, 2 * n)
     x_mm[::2], y_mm[::2] = last.pose.x_mm, last.pose.y_mm
-    time_s[1::2] += prospect.cost_s[rows]
+    time_s[1::2] += utility_input.cost_s[rows]
     scan = np.repeat(np.arange(n), 2)
     return replace(taken, x_mm=x_mm, y_mm=y_mm, time_s=time_s, scan=scan, scan_names=tuple(str(k) for k in range(n)))
 
 
-def _expected_bits(weight: FloatArray, answers: FloatArray, prospect: Prospect) -> FloatArray:
+def _expected_bits(weight: FloatArray, answers: FloatArray, utility_input: UtilityInput) -> FloatArray:
     """Return the expected information in bits from predictions (n, n_designs) of hypotheses (n,): (n_designs,)."""
-    given = GivenReading(answers, weight, prospect.readout)
+    given = GivenReading(answers, weight, utility_input.readout)
     middle = np.array([0.5 * float(answers.min() + answers.max())])
-    of_noise = float(entropy_bits(prospect.readout.probability(middle, fine=1.0))[0])
+    of_noise = float(entropy_bits(utility_input.readout.probability(middle, fine=1.0))[0])
     return np.maximum(entropy_bits(given.weight_by_cell) - of_noise, 0.0)
 
 
-def _probability_of_knowing(
-    lengths: FloatArray, weight: FloatArray, answers: FloatArray, prospect: Prospect, goal_sd_mm: float, off_mm: float
+def _probability_of_meeting_rule(
+    lengths: FloatArray,
+    weight: FloatArray,
+    answers: FloatArray,
+    utility_input: UtilityInput,
+    goal_sd_mm: float,
+    off_mm: float,
 ) -> FloatArray:
     """Return the probability that a reading at each design meets the stopping rule, (n_designs,)."""
     away = lengths - weight @ lengths
-    given = GivenReading(answers, weight, prospect.readout)
+    given = GivenReading(answers, weight, utility_input.readout)
     out = np.empty(answers.shape[1])
     for design, mass in enumerate(given.weight_by_cell):
         joint = given.weight_by_hypothesis(design)

@@ -6,8 +6,8 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.calibration import default_prior
+from probewise.calibration.light_integral import LightIntegral, bridge_evidences
 from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.removal import Removal, bridged
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.recordings import Recording
 
@@ -39,17 +39,17 @@ def _by_grid(recording: Recording, theta: FloatArray, k: int) -> float:
 @pytest.mark.parametrize("n", [2, 3])
 def test_light_is_integrated_as_on_a_fine_grid(recording: Recording, truth: FloatArray, n: int) -> None:
     theta = _near_truth(truth, n, np.random.default_rng(4))
-    removal = Removal(default_prior(recording, n), OrderProblems(recording, default_prior).problem(1), 1)
-    taken = removal.taken(theta)
+    removal = LightIntegral(default_prior(recording, n), OrderProblems(recording, default_prior).problem(1), 1)
+    taken = removal.log_ratio_when_taken_away(theta)
     for k in range(1, n):
         assert taken[0, k - 1] == pytest.approx(_by_grid(recording, theta[0], k), abs=5e-3)
 
 
 def test_adding_is_taking_away_seen_from_below(recording: Recording, truth: FloatArray) -> None:
     theta = _near_truth(truth, 3, np.random.default_rng(5))
-    removal = Removal(default_prior(recording, 3), OrderProblems(recording, default_prior).problem(1), 1)
-    added = removal.added(np.delete(theta, slice(12, 18), axis=1), theta[:, 12:18])
-    np.testing.assert_allclose(added, removal.taken(theta)[:, 1], atol=1e-9)
+    removal = LightIntegral(default_prior(recording, 3), OrderProblems(recording, default_prior).problem(1), 1)
+    added = removal.log_ratio_when_added(np.delete(theta, slice(12, 18), axis=1), theta[:, 12:18])
+    np.testing.assert_allclose(added, removal.log_ratio_when_taken_away(theta)[:, 1], atol=1e-9)
 
 
 def test_a_bridge_finds_the_ratio_of_two_normal_densities() -> None:
@@ -60,11 +60,11 @@ def test_a_bridge_finds_the_ratio_of_two_normal_densities() -> None:
         return np.asarray(2.5 - 0.5 * (x - 1.0) ** 2 + 0.5 * x**2)
 
     below, above = rng.standard_normal(20_000), 1.0 + rng.standard_normal((20_000, 1))
-    found, share = bridged(log_ratio(below), log_ratio(above))
+    found, share = bridge_evidences(log_ratio(below), log_ratio(above))
     assert found == pytest.approx(2.5, abs=0.04)
     assert share > 0.5
 
 
 def test_a_bridge_without_ground_says_so() -> None:
-    _, share = bridged(np.array([*np.full(99, -50.0), 0.0]), np.full((100, 1), 40.0))
+    _, share = bridge_evidences(np.array([*np.full(99, -50.0), 0.0]), np.full((100, 1), 40.0))
     assert share < 0.05

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.cases import SystemCase
 from probewise.world.systems.chain import simulate
-from probewise.world.systems.fit import AddedForm, Model, free_numbers
+from probewise.world.systems.fit import AddedForm, Model, fitted_parameters
 from probewise.world.systems.forms.form import Numbers
 
 _MOMENTS = 8  # distinct values of a dead time over samples, since the integration stops at each of them in every gap
@@ -27,15 +27,15 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
         If the fit diverges.
     """
     drawn, kind = case.drawn, case.drawn.kind
-    beside = [AddedForm(e.form, e.values, free_numbers(e.form)) for e in case.effects]
-    model = Model(kind, drawn.diagnosed, beside)
-    fitted = model.fit(case.readings[drawn.kept_rows], model.coordinates(drawn.shared, drawn.by_run))
+    beside = [AddedForm(e.form, e.values, fitted_parameters(e.form)) for e in case.effects]
+    model = Model(kind, drawn.diagnosed_rows, beside)
+    fitted = model.fit(case.readings[drawn.diagnosed_row_numbers], model.coordinates(drawn.shared, drawn.by_run))
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
     x = fitted.coordinates + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
     for k, name in enumerate(name for b in beside for name in b.free):
         if name == "tau_s" and kind.law is not None:
-            x[:, model.n_nominal + k] = _rounded_to_quantiles(x[:, model.n_nominal + k])
+            x[:, model.n_nominal_coordinates + k] = _rounded_to_quantiles(x[:, model.n_nominal_coordinates + k])
     later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
     ahead = Model(kind, later, beside)
     n_shared = len(kind.shared)
@@ -50,16 +50,17 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
         )
         for name in kind.per_run
     ]
-    parts = [x[:, :n_shared], *own, x[:, model.n_nominal :]]
+    parts = [x[:, :n_shared], *own, x[:, model.n_nominal_coordinates :]]
     there = np.concatenate(parts, axis=1)
     effects = [
-        (form, _of_unseen_run(numbers, b.free)) for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
+        (form, _numbers_of_unseen_run(numbers, b.free))
+        for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
     ]
     with np.errstate(all="ignore"):
         return simulate(kind, later, ahead.parameters(there), effects).readings
 
 
-def _of_unseen_run(numbers: Numbers, free: Sequence[str]) -> Numbers:
+def _numbers_of_unseen_run(numbers: Numbers, free: Sequence[str]) -> Numbers:
     """Give a held-out run the mean of the fitted runs' values: a parameter takes up what they have in common."""
     fitted = [numbers[name] for name in free if name.startswith("values[")]
     if not fitted:

@@ -1,8 +1,8 @@
-"""Let one search of the whole prior vouch that a climb missed no peak: nested sampling with few live points.
+"""Check by one search of the whole prior that an SMC run missed no peak: nested sampling with few live points.
 
-A climb starts at the peaks that least squares found, so a peak with a small basin may be missed. A search needs no
-start. With few live points its evidence is rough, but its samples tell where the posterior lies: where many of them
-are far from all samples of the climb, or its evidence is higher than the errors allow, the climb missed a part.
+An SMC run (climb) starts at the peaks that least squares found, so it may miss a peak with a small basin. A search
+needs no start. With few live points its evidence is rough, but its samples show where the posterior lies: where many of
+them are far from all samples of the climb, or its evidence is higher than the errors allow, the climb missed a part.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ import warnings
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.climb import Climb
 from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.order_search import Progress, report_of
+from probewise.calibration.order_search import Progress, round_reporter
+from probewise.calibration.smc import SMCResult
 from probewise.errors import DoubtfulResultWarning
 from probewise.nested import NestedResult, run
 
@@ -26,35 +26,37 @@ _MISSED = 0.2
 _N_SAMPLES, _N_OWN, _N_OTHERS = 300, 500, 2000
 
 
-def part_missed(
-    problems: OrderProblems, n: int, climbed: Climb, *, rng: np.random.Generator, progress: Progress | None = None
+def missed_part_in_words(
+    problems: OrderProblems, n: int, climbed: SMCResult, *, rng: np.random.Generator, progress: Progress | None = None
 ) -> str:
-    """Say in words what a climb missed; empty where a search of the prior vouches for it.
+    """Search the prior, and describe in words what an SMC run missed; empty if nothing.
 
     Parameters
     ----------
     problems
-        Of the recording.
+        Problems of the recording, by order.
     n
         Number of Gaussians.
     climbed
-        Posterior samples and evidence as the climb has them.
+        The SMC run that is checked.
     rng
         Source of randomness.
     progress
-        Told of each round.
+        Called after each round of the search.
     """
     problem = problems.problem(n)
     n_live = max(_LEAST_LIVE, _LIVE_PER_PARAM * len(problem.prior.names))
-    report = None if progress is None else report_of(progress, n)
+    report = None if progress is None else round_reporter(progress, n)
     with warnings.catch_warnings():
         # So few live points are rough, which is known; nobody sees this run.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         found = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
-    return _missed_part(problems, n, climbed, found, rng)
+    return _missed_part_by_comparison(problems, n, climbed, found, rng)
 
 
-def _missed_part(problems: OrderProblems, n: int, climbed: Climb, found: NestedResult, rng: np.random.Generator) -> str:
+def _missed_part_by_comparison(
+    problems: OrderProblems, n: int, climbed: SMCResult, found: NestedResult, rng: np.random.Generator
+) -> str:
     error = float(np.hypot(found.log_z_error, climbed.log_z_error))
     if found.log_z - climbed.log_z > _N_ERRORS * error:
         return (
@@ -62,7 +64,7 @@ def _missed_part(problems: OrderProblems, n: int, climbed: Climb, found: NestedR
             f"{climbed.log_z:.2f} ± {climbed.log_z_error:.2f} by the quick way"
         )
     coordinates = problems.prior_of(n).coordinates
-    share = share_apart(
+    share = share_far_from_known(
         coordinates.enter(climbed.theta), coordinates.enter(found.samples(_N_SAMPLES, rng=rng)), rng=rng
     )
     if share > _MISSED:
@@ -70,15 +72,15 @@ def _missed_part(problems: OrderProblems, n: int, climbed: Climb, found: NestedR
     return ""
 
 
-def share_apart(known: FloatArray, asked: FloatArray, *, rng: np.random.Generator) -> float:
-    """Tell which share of samples lies further from known ones than these from each other.
+def share_far_from_known(known: FloatArray, asked: FloatArray, *, rng: np.random.Generator) -> float:
+    """Return the share of samples that lie further from known ones than the known ones from each other.
 
     Parameters
     ----------
     known
         Samples in coordinates, (n, d), cloud after cloud: the first 500 are held against 2,000 of the others.
     asked
-        Those that are asked about, (m, d).
+        The samples of which the share is returned, (m, d).
     rng
         Source of randomness.
     """

@@ -1,9 +1,9 @@
-"""The evidence of N Gaussians over that of N - 1, by taking one of the N away or adding one.
+"""The evidence of N Gaussians over that of N - 1, by taking one of the N away or adding one, its light integrated out.
 
-With one Gaussian's light at nothing, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
-posterior tell of the other's evidence: from N, take one faint Gaussian away; from N - 1, add one drawn from the prior.
-Its light is integrated out, which one predicted curve allows: residuals are linear in its share of the light. Both
-kinds of samples meet in a bridge (Bennett 1976).
+With one Gaussian's light at zero, N Gaussians are N - 1: the models are nested (Dickey 1971). So samples of either
+posterior estimate the ratio: from N, one faint Gaussian is taken away; from N - 1, one drawn from the prior is added.
+Residuals are linear in its share of the light, so one predicted curve suffices to integrate the light out. A bridge
+combines both kinds of samples (Bennett 1976).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import expit
 
 from probewise._arrays import FloatArray
-from probewise.calibration.gaussian_responses import LoneResponses, light_of
+from probewise.calibration.gaussian_responses import SingleGaussianResponses, light_by_gaussian
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError
@@ -35,13 +35,13 @@ _N_ROOT, _ROOT = 60, 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class Removal:
-    """Mean likelihood over the light of one faint Gaussian, over the likelihood without it.
+class LightIntegral:
+    """Mean likelihood over the light of one faint Gaussian, divided by the likelihood without it.
 
     Parameters
     ----------
     prior
-        Of N Gaussians, 2 or more, light uniform; see `has_reference`.
+        Prior of N Gaussians, 2 or more, with uniform light; see `has_uniform_light`.
     alone
         Problem of one Gaussian over the same recording.
     n_bright
@@ -52,15 +52,19 @@ class Removal:
     alone: SensorProblem
     n_bright: int
 
-    def taken(self, theta: FloatArray) -> FloatArray:
-        """Log of that ratio for each faint Gaussian of sorted samples of N, (n, 6 N + 2) -> (n, N - n_bright)."""
+    def log_ratio_when_taken_away(self, theta: FloatArray) -> FloatArray:
+        """Log of the ratio for each faint Gaussian of sorted samples of N, (n, 6 N + 2) -> (n, N - n_bright)."""
         n = self.prior.n_gaussians
         at_once = max(1, _AT_ONCE // (n * self._readings.size))
         blocks = [theta[at : at + at_once] for at in range(0, len(theta), at_once)]
-        return np.concatenate([self._taken(block) for block in blocks]) if blocks else np.empty((0, n - self.n_bright))
+        return (
+            np.concatenate([self._log_ratio_of_block(block) for block in blocks])
+            if blocks
+            else np.empty((0, n - self.n_bright))
+        )
 
-    def added(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
-        """Log of that ratio for a Gaussian more, (n, 6), of any light, beside samples of N - 1, (n, 6 N - 4)."""
+    def log_ratio_when_added(self, rest: FloatArray, gaussian: FloatArray) -> FloatArray:
+        """Log of the ratio for a Gaussian `gaussian`, (n, 6), of any light, added to samples of N - 1, (n, 6 N - 4)."""
         if not len(rest):
             return np.empty(0)
         at_once = max(1, _AT_ONCE // (self.prior.n_gaussians * self._readings.size))
@@ -68,38 +72,38 @@ class Removal:
         for at in range(0, len(rest), at_once):
             part = rest[at : at + at_once]
             seen, light = self._responses(part)
-            one = self._lone.to(gaussian[at : at + at_once])
-            found.append(self._log_gain(_mixture_response(seen, light), one, light, part[:, -2:]))
+            one = self._single_responses.responses_to(gaussian[at : at + at_once])
+            found.append(self._log_ratio(_mixture_response(seen, light), one, light, part[:, -2:]))
         return np.concatenate(found)
 
-    def _taken(self, theta: FloatArray) -> FloatArray:
+    def _log_ratio_of_block(self, theta: FloatArray) -> FloatArray:
         seen, light = self._responses(theta)
         out = np.empty((len(light), light.shape[1] - self.n_bright))
         for at in range(out.shape[1]):
             k = self.n_bright + at
             others = np.delete(light, k, axis=1)
-            out[:, at] = self._log_gain(
+            out[:, at] = self._log_ratio(
                 _mixture_response(np.delete(seen, k, axis=1), others), seen[:, k], others, theta[:, -2:]
             )
         return out
 
     def _responses(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Responses to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
-        return self._lone.to_each(theta), light_of(theta)
+        """Responses of the readings to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
+        return self._single_responses.responses_by_gaussian(theta), light_by_gaussian(theta)
 
-    def _log_gain(self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray) -> FloatArray:
-        """Integrate over the light of one Gaussian beside others.
+    def _log_ratio(self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray) -> FloatArray:
+        """Log of the ratio for one Gaussian with responses `one` beside `others`, which have `light`.
 
         With t the light over that of the brightest of the others, whose own scale is integrated out, the ratio is
         (N - 1) / N times the integral of the likelihood over t from 0, times min(1, t^-N), over that at t = 0.
         """
-        sums = self._sums(others, one, levels)
-        return self._integrated(*sums, light.sum(axis=-1) / light.max(axis=-1))
+        sums = self._sums_by_data_set(others, one, levels)
+        return self._log_integral_over_light(*sums, light.sum(axis=-1) / light.max(axis=-1))
 
-    def _sums(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> _Sums:
-        """Sum residual squared, residual times change, change squared over data sets, (..., n_sets) each.
+    def _sums_by_data_set(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> _Sums:
+        """Sum residual squared, residual times change, and change squared within data sets, (..., n_sets) each.
 
-        The residual is that of the others alone; the change, of a Gaussian that takes their place.
+        The residual is that without the Gaussian; the change is that of the prediction if the Gaussian held all light.
         """
         span = levels[..., 1:] - levels[..., :1]
         off = self._readings - levels[..., :1] - span * others
@@ -110,30 +114,35 @@ class Removal:
         square, both, own = (part.reshape(shape) for part, shape in zip(sums, shapes, strict=True))
         return np.broadcast_to(square, own.shape), both, own
 
-    def _integrated(self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray) -> FloatArray:
-        """Log of the integral over t, over the likelihood at t = 0; `whole`: the others' light over the brightest's."""
+    def _log_integral_over_light(
+        self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray
+    ) -> FloatArray:
+        """Log of the integral over t, over the likelihood at t = 0.
+
+        `whole`: light of all others over that of the brightest.
+        """
         n = self.prior.n_gaussians
-        low, high = self._bounds(square, both, own, FAINT / (FAINT + whole))
+        low, high = self._bounds_of_share(square, both, own, FAINT / (FAINT + whole))
         place, weight = _NODES
         share = (low[..., None] + (high - low)[..., None] * 0.5 * (place + 1.0)).clip(1e-14, 1.0 - 1e-12)
-        log_density = self._log_density(square, both, own, whole, share)
+        log_density = self._log_likelihood_times_prior(square, both, own, whole, share)
         most = log_density.max(axis=-1)
         summed = most + np.log(np.exp(log_density - most[..., None]) @ (0.5 * weight)) + np.log(high - low)
         return np.asarray(summed + math.log((n - 1) / n) - self._log_likelihood(square))
 
-    def _log_density(
+    def _log_likelihood_times_prior(
         self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray, share: FloatArray
     ) -> FloatArray:
-        """Log of likelihood times prior of shares of the light, (..., n_shares)."""
+        """Log of likelihood times prior at shares of the light `share`, (..., n_shares)."""
         q = share[..., None]
         left = square[..., None, :] - 2.0 * q * both[..., None, :] + q * q * own[..., None, :]
         log_measure = np.log(whole[..., None]) - 2.0 * np.log1p(-share)
         return np.asarray(self._log_likelihood(left) + log_measure)
 
-    def _bounds(
+    def _bounds_of_share(
         self, square: FloatArray, both: FloatArray, own: FloatArray, most: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Shares of light between which the likelihood is not negligible, (...,) each."""
+        """Least and greatest share of the light at which the likelihood is not negligible, (...,) each."""
         share = np.zeros(square.shape[:-1])
         for _ in range(_N_NEWTON):
             q = share[..., None]
@@ -152,7 +161,7 @@ class Removal:
 
     def _log_likelihood(self, square: FloatArray) -> FloatArray:
         """Log likelihood up to a constant from sums of squares, (..., n_sets) -> (...)."""
-        first, per_log, values = self._tables
+        first, per_log, values = self._log_likelihood_tables
         cells = np.log(np.maximum(square, 1e-300))
         cells -= first
         cells *= per_log
@@ -165,11 +174,11 @@ class Removal:
         return np.asarray(cells.sum(axis=-1))
 
     @cached_property
-    def _tables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Of each data set, the first log of the sum of squares and one over its step, (n_sets,) each; the table.
+    def _log_likelihood_tables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """First log sum of squares of each data set's table and one over its step, (n_sets,) each; and the tables.
 
-        Log integrals over sigma, one data set after the other, are a straight line but near the bounds of sigma, so
-        that linear interpolation serves.
+        A table holds log integrals over sigma, a straight line except near the bounds of sigma, so linear interpolation
+        suffices.
         """
         likelihood = self._likelihood
         sizes, of = np.unique(likelihood.sizes, return_inverse=True)
@@ -179,8 +188,8 @@ class Removal:
         return low[of], ((_N_TABLE - 1) / (high - low))[of], values[of].ravel()
 
     @property
-    def _lone(self) -> LoneResponses:
-        return LoneResponses(self.alone)
+    def _single_responses(self) -> SingleGaussianResponses:
+        return SingleGaussianResponses(self.alone)
 
     @cached_property
     def _readings(self) -> FloatArray:
@@ -195,19 +204,19 @@ class Removal:
 
 
 def _mixture_response(seen: FloatArray, light: FloatArray) -> FloatArray:
-    """Response to a mixture, (n, n_used), from its Gaussians', (n, N, n_used), and their light, (n, N)."""
+    """Response to a mixture, (n, n_used), from those to its Gaussians, (n, N, n_used), and their light, (n, N)."""
     return np.asarray(((light / light.sum(axis=1, keepdims=True))[:, None, :] @ seen)[:, 0])
 
 
-def bridged(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
-    """Bridge N - 1 and N Gaussians: log of the ratio of evidences, and the effective share of the samples.
+def bridge_evidences(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
+    """Estimate by a bridge the log of Z of N over Z of N - 1; also return the effective share of the samples.
 
     Parameters
     ----------
     added
-        `Removal.added` at samples of N - 1, (n_below,).
+        `LightIntegral.log_ratio_when_added` at samples of N - 1, (n_below,).
     taken
-        `Removal.taken` at samples of N, (n, N).
+        `LightIntegral.log_ratio_when_taken_away` at samples of N, (n, N - n_bright).
     """
     each, added = taken.ravel(), np.where(added > -np.inf, added, -1e300)
     real = np.concatenate([added[added > -1e300], each])
@@ -226,9 +235,9 @@ def bridged(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
     found = float(found)
     samples = expit(found - taken).sum(axis=1)
     up = expit(added - found)
-    return found, min(_share(up), _share(samples))
+    return found, min(_effective_share(up), _effective_share(samples))
 
 
-def _share(weight: FloatArray) -> float:
+def _effective_share(weight: FloatArray) -> float:
     """Effective share of weighted samples, (n,)."""
     return float(weight.sum() ** 2 / (weight @ weight) / len(weight)) if weight.any() else 0.0

@@ -6,11 +6,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from probewise.calibration import Calibration, Climb, Found, calibrate, default_prior, quick_fit
+from probewise.calibration import Calibration, OrderPosterior, SMCResult, calibrate, default_prior, quick_fit
+from probewise.calibration.check_by_search import missed_part_in_words, share_far_from_known
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import search_order
 from probewise.calibration.quick_fit import fit_orders_quickly
-from probewise.calibration.vouching import part_missed, share_apart
 from probewise.recordings import Disc, HalfPlane, Plan, Recording
 from probewise.world import Blob, World, gaussian_spot
 
@@ -41,52 +41,52 @@ def test_samples_of_a_part_that_is_not_known_lie_apart() -> None:
     """Of samples like the known ones, one in 500 or so; of those with 40 % in another place, these."""
     rng = np.random.default_rng(1)
     known, like = rng.standard_normal((4000, 8)), rng.standard_normal((1000, 8))
-    assert share_apart(known, like, rng=rng) < 0.02
+    assert share_far_from_known(known, like, rng=rng) < 0.02
     like[:400] += 5.0
-    assert 0.4 <= share_apart(known, like, rng=rng) < 0.42
+    assert 0.4 <= share_far_from_known(known, like, rng=rng) < 0.42
 
 
 @pytest.mark.slow
 def test_a_search_finds_the_mirror_image_that_a_climb_missed(mirrored: Recording) -> None:
     problems, rng = OrderProblems(mirrored, default_prior), np.random.default_rng(3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(quick_fit, "part_missed", lambda *_, **__: "")
+        patch.setattr(quick_fit, "missed_part_in_words", lambda *_, **__: "")
         found, why = fit_orders_quickly(problems, (1,), search=partial(search_order, problems, n_live=50), rng=rng)
     made = found[1].result
     assert not why
-    assert isinstance(made, Climb)
+    assert isinstance(made, SMCResult)
     correlated = made.theta[:, 5] < 0.0
     assert correlated.all() or not correlated.any()
-    assert "lie apart" in part_missed(problems, 1, made, rng=rng)
+    assert "lie apart" in missed_part_in_words(problems, 1, made, rng=rng)
 
 
 @pytest.fixture(scope="module")
-def vouched(recording: Recording) -> Found:
+def vouched(recording: Recording) -> OrderPosterior:
     problems = OrderProblems(recording, default_prior)
     search = partial(search_order, problems, n_live=50)
     return fit_orders_quickly(problems, (1,), search=search, rng=np.random.default_rng(4))[0][1]
 
 
-def test_a_search_vouches_for_a_climb_that_missed_nothing(vouched: Found) -> None:
-    assert isinstance(vouched.result, Climb)
+def test_a_search_vouches_for_a_climb_that_missed_nothing(vouched: OrderPosterior) -> None:
+    assert isinstance(vouched.result, SMCResult)
     assert not vouched.notes
 
 
 def test_the_order_that_missed_a_peak_and_those_above_are_searched(
-    vouched: Found, calibration: Calibration, recording: Recording, monkeypatch: pytest.MonkeyPatch
+    vouched: OrderPosterior, calibration: Calibration, recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of three the second is chosen; the first stays as it is."""
     searched: list[int] = []
 
-    def search(n: int, _: np.random.Generator) -> Found:
+    def search(n: int, _: np.random.Generator) -> OrderPosterior:
         searched.append(n)
         return calibration.chosen.found
 
     made = vouched.result
-    assert isinstance(made, Climb)
-    low = Found(replace(made, log_z_of_clouds=made.log_z_of_clouds - 90.0), None)
-    monkeypatch.setattr(quick_fit, "part_missed", lambda *_, **__: "it lies elsewhere")
-    found = quick_fit._vouched_for(
+    assert isinstance(made, SMCResult)
+    low = OrderPosterior(replace(made, log_z_of_clouds=made.log_z_of_clouds - 90.0), None)
+    monkeypatch.setattr(quick_fit, "missed_part_in_words", lambda *_, **__: "it lies elsewhere")
+    found = quick_fit._with_chosen_order_checked(
         OrderProblems(recording, default_prior),
         {1: low, 2: vouched, 3: low},
         np.random.default_rng(0),

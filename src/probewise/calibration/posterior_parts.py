@@ -1,7 +1,7 @@
 """Parts of a posterior, by how many of its Gaussians are bright.
 
 One Gaussian that holds nearly all of the light, beside faint ones, and several that share it, are far apart: moves
-rarely lead from the one to the other. So each such part is reached, and its evidence found, by itself.
+rarely lead from the one to the other. So each such part is sampled, and its evidence estimated, by itself.
 """
 
 from __future__ import annotations
@@ -14,39 +14,39 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.calibration.climb import N_CLOUDS, N_SNAPSHOTS, Climb
-from probewise.calibration.fields import by_mass
+from probewise.calibration.fields import sorted_by_mass
 from probewise.calibration.priors import SSFPrior
+from probewise.calibration.smc import N_CLOUDS, N_SNAPSHOTS, SMCResult
 from probewise.calibration.whole_coordinates import WholeCoordinates, count_bright
 from probewise.nested import NestedResult, Weighted
 
 _N_SAMPLES = 4000
 # A part of which there are fewer samples is left out.
 _LEAST_SAMPLES = 40
-# What speaks against a part speaks against the whole where the part holds this share.
+# A doubt about a part is a doubt about the whole where the part holds this share of the evidence.
 _COUNTS = 0.1
 
 
 @dataclass(frozen=True)
-class WholeFrame:
-    """Where a sensor is, and how large: `centre_mm`, and `size_mm2`, the trace of its covariance."""
+class FootprintPlaceAndSize:
+    """Place and size of the whole footprint: `centre_mm`, and `size_mm2`, the trace of its covariance."""
 
     centre_mm: tuple[float, float]
     size_mm2: float
 
     @classmethod
-    def of(cls, theta: FloatArray) -> WholeFrame:
-        """Take it from one Gaussian, (8,)."""
+    def from_gaussian(cls, theta: FloatArray) -> FootprintPlaceAndSize:
+        """Take place and size from the parameters of an SSF of one Gaussian, (8,)."""
         _, u, v, a, b, c = theta[:6]
         return cls((float(u), float(v)), float(0.5 * (a + b) / (a * b - c * c)))
 
     def coordinates(self, prior: SSFPrior, n_bright: int) -> WholeCoordinates:
-        """Coordinates of mixtures of which so many Gaussians are bright."""
+        """Return the coordinates of mixtures of which `n_bright` Gaussians are bright."""
         return WholeCoordinates(prior, self.centre_mm, self.size_mm2, n_bright)
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class PosteriorPart:
     """Equally weighted samples of a part, (n, 6 N + 2), cloud after cloud, sorted by mass, and its evidence."""
 
     theta: FloatArray
@@ -54,8 +54,8 @@ class Part:
     start_error: float
 
     @classmethod
-    def of(cls, climbed: Climb) -> Part:
-        """Take the samples and the evidence of a climb."""
+    def from_smc(cls, climbed: SMCResult) -> PosteriorPart:
+        """Take the samples and the evidence of an SMC run."""
         return cls(climbed.theta, climbed.log_z_of_clouds, climbed.start_error)
 
     @property
@@ -64,23 +64,23 @@ class Part:
         return float(logsumexp(self.log_z_of_clouds)) - math.log(len(self.log_z_of_clouds))
 
 
-def held_shares(parts: dict[int, Part]) -> dict[int, float]:
-    """Share of the evidence that each part holds."""
-    return dict(zip(parts, _shares_of_evidence(parts.values()).tolist(), strict=True))
+def evidence_shares(parts: dict[int, PosteriorPart]) -> dict[int, float]:
+    """Return the share of the evidence that each part holds."""
+    return dict(zip(parts, _normalised_evidences(parts.values()).tolist(), strict=True))
 
 
-def _shares_of_evidence(each: Iterable[Part | Climb]) -> FloatArray:
+def _normalised_evidences(each: Iterable[PosteriorPart | SMCResult]) -> FloatArray:
     log_z = np.array([one.log_z for one in each])
     return np.asarray(np.exp(log_z - logsumexp(log_z)))
 
 
-def split_by_bright(found: Climb | NestedResult | Weighted, rng: np.random.Generator) -> dict[int, Part]:
-    """Split a posterior into its parts, by its samples."""
-    if isinstance(found, Climb):
+def split_by_n_bright(found: SMCResult | NestedResult | Weighted, rng: np.random.Generator) -> dict[int, PosteriorPart]:
+    """Split a posterior's samples by their number of bright Gaussians, and its evidence by the samples' shares."""
+    if isinstance(found, SMCResult):
         theta, log_z, error = found.theta, found.log_z_of_clouds, found.start_error
     else:
         theta, log_z, error = found.samples(_N_SAMPLES, rng=rng), np.full(N_CLOUDS, found.log_z), found.log_z_error
-        theta = by_mass(theta, theta.shape[1] // 6)
+        theta = sorted_by_mass(theta, theta.shape[1] // 6)
     bright = count_bright(theta)
     parts = {}
     for m in np.unique(bright).tolist():
@@ -88,23 +88,26 @@ def split_by_bright(found: Climb | NestedResult | Weighted, rng: np.random.Gener
         if len(rows) >= _LEAST_SAMPLES:
             # In the order of the clouds.
             chosen = np.sort(rows[(np.arange(_N_SAMPLES) * len(rows)) // _N_SAMPLES])
-            parts[m] = Part(theta[chosen], log_z + math.log(len(rows) / len(theta)), error)
+            parts[m] = PosteriorPart(theta[chosen], log_z + math.log(len(rows) / len(theta)), error)
     return parts
 
 
-def joined(made: dict[int, Climb], rng: np.random.Generator) -> Climb:
-    """Join climbs to the parts of a posterior: samples of each by its share of the evidence."""
+def join_parts(made: dict[int, SMCResult], rng: np.random.Generator) -> SMCResult:
+    """Join SMC runs to the parts of a posterior, given by number of bright Gaussians.
+
+    Each part contributes samples by its share of the evidence.
+    """
     climbs = list(made.values())
-    share = _shares_of_evidence(climbs)
+    share = _normalised_evidences(climbs)
     main = climbs[int(np.argmax(share))]
     lost = [climbed for climbed in climbs if climbed.temperatures[-1] < 1.0]
     if lost:
-        # A climb that was not reached says so itself; how much it holds is not known.
+        # A run that did not reach its part says so itself; how much the part holds is not known.
         return lost[0]
     n_clouds = len(main.log_z_of_clouds)
     blocks = n_clouds * N_SNAPSHOTS
     size = len(main.theta) // blocks
-    # As many of each part as its share asks for, on average: in each cloud at each time.
+    # Samples of each part in proportion to its share, on average: in each cloud and snapshot.
     up_to = np.floor(np.concatenate([[0.0], np.cumsum(share)])[:, None] * size + rng.random(blocks)).astype(np.int64)
     up_to[0], up_to[-1] = 0, size
     counts = np.diff(up_to, axis=0)

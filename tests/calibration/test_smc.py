@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from probewise._arrays import FloatArray
-from probewise.calibration import Climb, Rung, calibrate, default_prior
-from probewise.calibration.climb import climb
+from probewise.calibration import SMCResult, TemperatureSummary, calibrate, default_prior
 from probewise.calibration.compensation import Compensation
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import search_order
-from probewise.calibration.parts import WholeFrame
+from probewise.calibration.posterior_parts import FootprintPlaceAndSize
 from probewise.calibration.quick_fit import fit_orders_quickly
-from probewise.calibration.reference import Reference
+from probewise.calibration.reference import FaintGaussianReference
+from probewise.calibration.smc import run_smc
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
@@ -37,23 +37,23 @@ class _Levels:
         return np.asarray(-0.5 * (((theta[:, -2] - 11.0) / 2.0) ** 2 + ((theta[:, -1] - 58.0) / 2.0) ** 2))
 
 
-def _climbed(recording: Recording, compensation: Compensation, seed: int) -> tuple[Climb, list[Rung]]:
+def _climbed(recording: Recording, compensation: Compensation, seed: int) -> tuple[SMCResult, list[TemperatureSummary]]:
     rng = np.random.default_rng(seed)
     below, prior = default_prior(recording, 1), default_prior(recording, 2)
     rest = below.from_unit_cube(rng.random((400, 8)))
     rest[:, -2:] = np.array([11.0, 58.0]) + 2.0 * rng.standard_normal((400, 2))
     problem = cast("SensorProblem", _Levels())
-    rungs: list[Rung] = []
-    found = climb(
+    rungs: list[TemperatureSummary] = []
+    found = run_smc(
         problem,
-        Reference(prior, problem, compensation, 1),
+        FaintGaussianReference(prior, problem, compensation, 1),
         rest,
         log_z_below=np.full(8, -3.0),
         error_below=0.0,
         rng=rng,
-        space=WholeFrame((0.0, 0.0), 50.0).coordinates(prior, 1),
+        space=FootprintPlaceAndSize((0.0, 0.0), 50.0).coordinates(prior, 1),
         n_steps=5,
-        told=rungs.append,
+        progress=rungs.append,
     )
     return found, rungs
 
@@ -126,7 +126,7 @@ def test_quick_is_yes_or_no(recording: Recording) -> None:
 @pytest.mark.slow
 def test_climbing_and_searching_find_the_same_evidences(recording: Recording) -> None:
     """Within four of both errors."""
-    told: list[tuple[int, RoundSummary | Rung]] = []
+    told: list[tuple[int, RoundSummary | TemperatureSummary]] = []
     quick = calibrate(
         recording,
         orders=(1, 2, 3),
@@ -135,9 +135,9 @@ def test_climbing_and_searching_find_the_same_evidences(recording: Recording) ->
         progress=lambda n, state: told.append((n, state)),
     )
     full = calibrate(recording, orders=(1, 2, 3), n_live=200, rng=np.random.default_rng(45))
-    assert isinstance(quick.fits[1].result, Climb)
+    assert isinstance(quick.fits[1].result, SMCResult)
     assert isinstance(full.fits[1].result, NestedResult)
     for one, other in zip(quick.orders, full.orders, strict=True):
         assert abs(one.log_z - other.log_z) < 4 * np.hypot(one.log_z_error, other.log_z_error)
     assert quick.chosen.n_gaussians == full.chosen.n_gaussians == 1
-    assert {n for n, state in told if isinstance(state, Rung)} == {1, 2, 3}
+    assert {n for n, state in told if isinstance(state, TemperatureSummary)} == {1, 2, 3}

@@ -28,7 +28,7 @@ class Goal:
 
 
 @dataclass(frozen=True, eq=False)
-class Prospect:
+class UtilityInput:
     """Posterior, designs and sensor, with the quantities that utilities need.
 
     Attributes
@@ -95,7 +95,7 @@ class Prospect:
     def information(self, weight: FloatArray) -> FloatArray:
         """Return the expected information in bits of a reading at every design, for weights (n_samples,)."""
         out = np.empty(len(self.rows))
-        for at, mass in self.predictive.maps(weight):
+        for at, mass in self.predictive.level_weights(weight):
             chance = self._cell_probability(at)
             out[at] = np.maximum(_entropy_of_readings(mass, chance) - _entropy_of_noise(mass, chance), 0.0)
         return out
@@ -106,7 +106,7 @@ class Prospect:
         The weights, (n_samples,), are normalised, and may be 0 for some hypotheses.
         """
         out = np.empty(len(self.rows))
-        for at, mass in self.predictive.maps(weight):
+        for at, mass in self.predictive.level_weights(weight):
             out[at] = _entropy_of_readings(mass, self._cell_probability(at))
         return out
 

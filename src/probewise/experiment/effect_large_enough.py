@@ -1,4 +1,4 @@
-"""Prior of an effect as a single run can show it: a size that matters, and a time within the run.
+"""An effect with the prior that a single run needs: sizes large enough to matter, and times within the run.
 
 A diagnosis of hundreds of readings weighs effects of all sizes, most of them far too small for the dozen readings
 of a run. Such an effect changes neither the readings nor the shape: it counts as nothing left out. A change point
@@ -25,7 +25,7 @@ _SMALLEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Shown(WrappedEffect[Any]):
+class EffectLargeEnoughForRun(WrappedEffect[Any]):
     """An effect whose prior excludes sizes too small to show in a run on a field of this width and height, mm."""
 
     effect: NamedEffect[Any]
@@ -35,7 +35,7 @@ class Shown(WrappedEffect[Any]):
 
     @cached_property
     def prior(self) -> Prior:
-        """The effect's prior, of sizes that show."""
+        """The effect's prior without its small sizes."""
         own = self.effect.prior
         if isinstance(own, PatchPrior):
             size = HeavyTailedPrior(own.typical, smallest=_SMALLEST)
@@ -44,14 +44,14 @@ class Shown(WrappedEffect[Any]):
         if not isinstance(own, Product):
             return own
         return Product(
-            {name: self._marginal_of_shown_sizes(name, marginal) for name, marginal in own.marginals.items()}
+            {name: self._marginal_without_small_sizes(name, marginal) for name, marginal in own.marginals.items()}
         )
 
-    def _marginal_of_shown_sizes(self, name: str, marginal: Any) -> Any:
+    def _marginal_without_small_sizes(self, name: str, marginal: Any) -> Any:
         if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
             return replace(marginal, smallest=_SMALLEST)
         return self.within_run.get(name, marginal)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """See `EffectWithSentence.sentence`."""
+        """Describe the effect, given posterior means and sds of its parameters."""
         return self.effect.sentence(mean, sd)

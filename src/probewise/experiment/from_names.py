@@ -8,7 +8,7 @@ from probewise.calibration import FittedSensor
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.paper import paper_experiment
-from probewise.experiment.simulation import Model, bin_width_of, experiment_for, usual_trust
+from probewise.experiment.simulation import Model, bin_width_of, default_trust, experiment_for
 from probewise.inference import Naive
 from probewise.inquiry import Finishing, ReadingEntropy, Utility, utility_named
 from probewise.nested import NestedStop
@@ -17,7 +17,7 @@ from probewise.scene import Card, Field, Shape
 MethodName: TypeAlias = Literal["particles", "paper"]
 
 
-def pose_experiment(
+def experiment_from_names(
     sensor: FittedSensor,
     shape: Shape,
     field: Field,
@@ -89,7 +89,7 @@ def pose_experiment(
         if given is not None:
             raise ParameterError(name, given, "None, but with the paper's method")
     chosen = Finishing() if chosen is None else chosen
-    usual = usual_trust(shape, model=model, learn_sensor=learn_sensor, utility=chosen)
+    usual = default_trust(shape, model=model, learn_sensor=learn_sensor, utility=chosen)
     return experiment_for(
         sensor,
         shape,

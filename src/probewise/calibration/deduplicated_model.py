@@ -10,11 +10,11 @@ from probewise.recordings import Plan
 from probewise.sensor import SensorModel
 
 
-class DistinctRows:
-    """Wrapper of a model whose predictions depend only on a row's place, orientation and pattern.
+class DeduplicatedModel:
+    """Wrapper of a model that predicts repeated rows of one plan only once.
 
-    This holds for every chain without effects, which ignores time, order and covariates. It predicts
-    only the plan it was made for.
+    The model's predictions may depend only on a row's place, orientation and pattern, as those of every chain without
+    effects do. The wrapper predicts only the plan that it was made for.
     """
 
     def __init__(self, model: SensorModel, plan: Plan) -> None:
@@ -40,6 +40,6 @@ class DistinctRows:
             If `plan` is another plan.
         """
         if plan is not self._plan:
-            raise ParameterError("plan", plan, "the plan that DistinctRows was made for; make another for this one")
+            raise ParameterError("plan", plan, "the plan that this model was made for; make another for this one")
         distinct = self._model.predict(theta, self._distinct)
         return distinct if self._rows is None else np.take(distinct, self._rows, axis=1)

@@ -1,9 +1,9 @@
-"""Climb to the posterior of N Gaussians by sequential Monte Carlo (Del Moral, Doucet & Jasra 2006).
+"""Sample the posterior of N Gaussians by sequential Monte Carlo (SMC; Del Moral, Doucet & Jasra 2006).
 
-Particles drawn from a density that is known, made from the posterior of N - 1 or about a peak, are carried in small
-changes of temperature to the posterior of N: weighed, resampled, and moved by Metropolis steps. They form clouds that
-are weighed and resampled each by itself, so that the scatter of the clouds' evidences is an honest error: it holds
-what one cloud found and another missed.
+Particles are drawn from a known density, made from the posterior of N - 1 or about a peak. In small changes of
+temperature they become samples of the posterior of N: weighted, resampled, and moved by Metropolis steps. They form
+clouds, each weighted and resampled by itself, so that the scatter of the clouds' evidences is a valid error: it
+includes what one cloud found and another missed. Notes and documentation call such a run a climb.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
-from probewise.calibration.known_density import KnownDensity
+from probewise.calibration.start_density import StartDensity
 from probewise.inference import SensorProblem
-from probewise.nested.weights import n_effective, power_bracket, resampled
+from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Coordinates
 
 # A change of temperature leaves at least this share of the particles effective.
@@ -30,18 +30,19 @@ _BISECTIONS = 40
 _BRIDGE_STEPS = 30
 # Draws of the reference for each particle that is kept: so many at a time, until enough are effective, and at most.
 _DRAWS, _MOST_DRAWS = 2, 16
-# Times that the posterior's samples are kept; moves of each particle once it is reached, and between two afresh.
+# Number of snapshots of the posterior's samples that are kept.
 N_SNAPSHOTS = 4
 # Clouds of particles, whose scatter gives the error of an evidence.
 N_CLOUDS = 8
+# Moves of each particle once the posterior is reached; an independent proposal after every second one.
 _N_MORE, _AFRESH = 16, 2
-# A posterior that is further than this lies elsewhere than that of the order below: where is for a search to find.
+# A posterior that takes more temperatures lies far from the reference, and is left to a search of the prior.
 _MOST_TEMPERATURES = 12
 # Share of the moves that change the coordinates of one Gaussian, or the levels, alone.
 _BY_BLOCK = 0.5
 _WHOLE_JUMP = 0.1
 _JITTER = 1e-5
-# Doubt the clouds where they agree less than this.
+# Limits beyond which a run is doubtful: error of ln Z, effective share of the clouds, moves accepted, overlap.
 _MOST_ERROR = 0.5
 _LEAST_CLOUDS = 0.3
 _LEAST_ACCEPTED = 0.02
@@ -49,8 +50,8 @@ _LEAST_OVERLAP = 0.02
 
 
 @dataclass(frozen=True)
-class Rung:
-    """Show how far a climb has come: temperature from 0 to 1, ln Z so far, likelihood evaluations so far."""
+class TemperatureSummary:
+    """Progress of a run after a temperature: the temperature, 0 to 1, ln Z and likelihood evaluations so far."""
 
     temperature: float
     log_z: float
@@ -58,13 +59,13 @@ class Rung:
 
 
 @dataclass(frozen=True, eq=False)
-class Climb(ShowsItself):
+class SMCResult(ShowsItself):
     """Weighted samples of a posterior and its evidence, by sequential Monte Carlo.
 
     Attributes
     ----------
     names
-        Parameters, one a column of theta.
+        Parameter names, one per column of theta.
     theta
         Samples, (n, n_params), cloud after cloud, early ones first, the Gaussians sorted by mass.
     log_likelihood, log_weight
@@ -72,15 +73,15 @@ class Climb(ShowsItself):
     log_z_of_clouds
         Natural log of the evidence from each cloud, (n_clouds,).
     start_error
-        Standard error of ln Z that the clouds have in common: of the order that the first climb began with, and drift.
+        Standard error of ln Z that all clouds share: from the order below, and from samples that still drift.
     temperatures
         From 0, the reference, to 1, the posterior, (n_temperatures,).
     accepted
         Share of the moves accepted at the last temperature.
     n_calls
-        Likelihood evaluations, those of the order below included.
+        Number of likelihood evaluations, those of the order below included.
     doubts
-        What else speaks against it.
+        Further reasons to doubt the result, in words.
     """
 
     names: tuple[str, ...]
@@ -100,7 +101,7 @@ class Climb(ShowsItself):
 
     @property
     def log_z(self) -> float:
-        """Natural log of the evidence: that of the clouds' mean."""
+        """Natural log of the mean of the clouds' evidences."""
         return float(logsumexp(self.log_z_of_clouds)) - math.log(len(self.log_z_of_clouds))
 
     @property
@@ -117,7 +118,7 @@ class Climb(ShowsItself):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Why the evidence is not to be trusted, in words; empty where nothing speaks against it."""
+        """Reasons to doubt the evidence, in words; empty if there are none."""
         share = n_effective(self.log_z_of_clouds) / len(self.log_z_of_clouds)
         told = (
             (self.temperatures[-1] != 1.0, f"the posterior was not reached in {_MOST_TEMPERATURES} temperatures"),
@@ -129,7 +130,7 @@ class Climb(ShowsItself):
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order."""
-        return np.asarray(self.theta[rng.permutation(resampled(self.weight, n, rng))])
+        return np.asarray(self.theta[rng.permutation(resampled_rows(self.weight, n, rng))])
 
     def summary(self) -> str:
         """Describe evidence and cost in plain text."""
@@ -141,44 +142,47 @@ class Climb(ShowsItself):
         return "\n".join([*lines, *(f"doubtful: {note}" for note in self.warnings)])
 
 
+Climb, Rung = SMCResult, TemperatureSummary  # their earlier names
+
+
 @dataclass(frozen=True, eq=False)
-class _Cloud:
-    """Particles in coordinates, (n, d): log density of prior, log likelihood, log reference over the prior, (n,)."""
+class _Particles:
+    """Particles: coordinates `x`, (n, d); logs of prior, likelihood, and reference over prior density, (n,) each."""
 
     x: FloatArray
     log_prior: FloatArray
     log_likelihood: FloatArray
     log_reference: FloatArray
 
-    def take(self, rows: IntArray) -> _Cloud:
-        return _Cloud(self.x[rows], self.log_prior[rows], self.log_likelihood[rows], self.log_reference[rows])
+    def take(self, rows: IntArray) -> _Particles:
+        return _Particles(self.x[rows], self.log_prior[rows], self.log_likelihood[rows], self.log_reference[rows])
 
-    def put(self, rows: IntArray, other: _Cloud) -> _Cloud:
+    def with_rows_replaced(self, rows: IntArray, other: _Particles) -> _Particles:
         out = self.take(np.arange(len(self.x)))
         out.x[rows], out.log_prior[rows] = other.x, other.log_prior
         out.log_likelihood[rows], out.log_reference[rows] = other.log_likelihood, other.log_reference
         return out
 
-    def joined(self, other: _Cloud, n_clouds: int) -> _Cloud:
-        """Join to each cloud that of another."""
+    def joined_cloud_by_cloud(self, other: _Particles, n_clouds: int) -> _Particles:
+        """Append to each cloud the cloud of the same number of `other`."""
         both = np.arange(len(self.x) + len(other.x))
         mine, others = np.split(both, [len(self.x)])
         rows = np.concatenate([mine.reshape(n_clouds, -1), others.reshape(n_clouds, -1)], axis=1).ravel()
         pairs = ((self.x, other.x), (self.log_prior, other.log_prior))
         logs = ((self.log_likelihood, other.log_likelihood), (self.log_reference, other.log_reference))
-        return _Cloud(*(np.concatenate(pair)[rows] for pair in (*pairs, *logs)))
+        return _Particles(*(np.concatenate(pair)[rows] for pair in (*pairs, *logs)))
 
     @property
-    def rise(self) -> FloatArray:
+    def log_target_over_reference(self) -> FloatArray:
         return self.log_likelihood - self.log_reference
 
-    def tempered(self, beta: float) -> FloatArray:
+    def log_tempered_density(self, beta: float) -> FloatArray:
         return np.asarray(self.log_prior + beta * self.log_likelihood + (1.0 - beta) * self.log_reference)
 
 
-def climb(
+def run_smc(
     problem: SensorProblem,
-    reference: KnownDensity,
+    reference: StartDensity,
     rest: FloatArray,
     *,
     log_z_below: FloatArray,
@@ -190,22 +194,22 @@ def climb(
     n_more: int = _N_MORE,
     least_effective: float = _KEPT,
     at_once_from: int | None = None,
-    told: Callable[[Rung], None] | None = None,
-) -> Climb:
-    """Climb to the posterior of N Gaussians.
+    progress: Callable[[TemperatureSummary], None] | None = None,
+) -> SMCResult:
+    """Move particles from a reference density to the posterior of N Gaussians.
 
     Parameters
     ----------
     problem
-        Of N Gaussians.
+        The problem of N Gaussians.
     reference
-        What the particles are drawn from, made for N.
+        Density from which the particles are drawn, of N Gaussians.
     rest
         Samples of the posterior of N - 1, sorted by mass, (n, 6 N - 4), cloud after cloud.
     log_z_below
         Natural log of the evidence of N - 1 from each cloud, (n_clouds,); n_clouds divides n.
     error_below
-        Standard error of what the clouds have in common of it.
+        Standard error of `log_z_below` that all clouds share.
     n_calls_below
         Likelihood evaluations so far.
     rng
@@ -219,14 +223,14 @@ def climb(
     least_effective
         Least share of the particles that a change of temperature leaves effective.
     at_once_from
-        Temperature from which the posterior is taken for the next, for evidences that a bridge tells.
-    told
+        Number of temperatures, 0 included, after which the next one is 1; where a `LightIntegral` gives the evidence.
+    progress
         Called after every temperature.
     """
     space = reference.prior.coordinates if space is None else space
     n_calls = n_calls_below
 
-    def known(x: FloatArray, beta: float = 0.0) -> _Cloud:
+    def evaluate(x: FloatArray, beta: float = 0.0) -> _Particles:
         nonlocal n_calls
         theta, log_prior = space.leave(x)
         # What is impossible weighs nothing, but was drawn.
@@ -237,24 +241,30 @@ def climb(
             log_likelihood[possible] = problem.log_likelihood(theta[possible])
             if beta < 1.0:
                 n_calls += possible.size
-                log_reference[possible] = reference.log_over_prior(theta[possible])
-        return _Cloud(x, log_prior, log_likelihood, log_reference)
+                log_reference[possible] = reference.log_density_over_prior(theta[possible])
+        return _Particles(x, log_prior, log_likelihood, log_reference)
 
     n_clouds = len(log_z_below)
     n = len(rest) // n_clouds
     log_z = np.array(log_z_below)
 
-    def drawn() -> _Cloud:
+    def drawn() -> _Particles:
         with np.errstate(invalid="ignore"):
-            return known(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
+            return evaluate(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
 
     now = drawn()
-    while n_effective(now.rise) < least_effective * len(rest) and len(now.x) < _MOST_DRAWS * len(rest):
-        now = now.joined(drawn(), n_clouds)
+    while n_effective(now.log_target_over_reference) < least_effective * len(rest) and len(now.x) < _MOST_DRAWS * len(
+        rest
+    ):
+        now = now.joined_cloud_by_cloud(drawn(), n_clouds)
     temperatures, accepted, overlap = [0.0], 0.0, 1.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
-        rise = now.rise
-        beta = 1.0 if len(temperatures) == at_once_from else _next(rise, temperatures[-1], least_effective, len(rest))
+        rise = now.log_target_over_reference
+        beta = (
+            1.0
+            if len(temperatures) == at_once_from
+            else _next_temperature(rise, temperatures[-1], least_effective, len(rest))
+        )
         width = beta - temperatures[-1]
         log_weight = (width * rise).reshape(n_clouds, -1)
         if not np.isfinite(log_weight.max(axis=1)).all():
@@ -264,29 +274,31 @@ def climb(
         # Cut off (truncated importance sampling, Ionides 2008): a single particle must not take over its cloud.
         mean = logsumexp(log_weight, axis=1, keepdims=True) - math.log(here)
         weight = np.exp(np.minimum(log_weight - mean, 0.5 * math.log(here)))
-        now = now.take(np.concatenate([k * here + resampled(own, n, rng) for k, own in enumerate(weight)]))
+        now = now.take(np.concatenate([k * here + resampled_rows(own, n, rng) for k, own in enumerate(weight)]))
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):
-            now, share = _moved_along_differences(now, partial(known, beta=beta), beta, rng)
+            now, share = _moved_by_differential_evolution(now, partial(evaluate, beta=beta), beta, rng)
             shares.append(share)
-        now = _moved_afresh(now, partial(known, beta=beta), reference, space, beta, rng)
+        now = _moved_by_independent_proposals(now, partial(evaluate, beta=beta), reference, space, beta, rng)
         accepted = float(np.mean(shares))
         if beta == 1.0:
-            now = known(now.x)
-        log_ratio, share = _log_evidence_ratio(log_weight, (width * now.rise).reshape(n_clouds, n))
+            now = evaluate(now.x)
+        log_ratio, share = _log_evidence_ratio(log_weight, (width * now.log_target_over_reference).reshape(n_clouds, n))
         log_z += log_ratio
         overlap = min(overlap, share)
-        if told is not None:
-            told(Rung(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
+        if progress is not None:
+            progress(TemperatureSummary(beta, float(logsumexp(log_z)) - math.log(n_clouds), n_calls))
     kept = [now]
     if temperatures[-1] == 1.0:
         # A reference that is far from the posterior is forgotten late.
-        kept = _settled(now, partial(known, beta=1.0), reference, space, n_more * (len(temperatures) - 1), rng)
+        kept = _snapshots_of_posterior(
+            now, partial(evaluate, beta=1.0), reference, space, n_more * (len(temperatures) - 1), rng
+        )
     x = np.stack([cloud.x.reshape(n_clouds, n, -1) for cloud in kept], axis=1)
     theta, _ = space.leave(x.reshape(-1, x.shape[-1]))
     log_likelihood = np.stack([cloud.log_likelihood.reshape(n_clouds, n) for cloud in kept], axis=1)
-    return Climb(
+    return SMCResult(
         names=reference.prior.names,
         theta=theta,
         log_likelihood=log_likelihood.ravel(),
@@ -302,31 +314,31 @@ def climb(
     )
 
 
-def _settled(
-    now: _Cloud,
-    known: Callable[[FloatArray], _Cloud],
-    reference: KnownDensity,
+def _snapshots_of_posterior(
+    now: _Particles,
+    evaluate: Callable[[FloatArray], _Particles],
+    reference: StartDensity,
     space: Coordinates,
     n_more: int,
     rng: np.random.Generator,
-) -> list[_Cloud]:
-    """Move particles of the posterior so many times; keep `N_SNAPSHOTS` of the last half."""
+) -> list[_Particles]:
+    """Move particles of the posterior `n_more` times; return `N_SNAPSHOTS` states of them from the last half."""
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     kept = []
     for k in range(1, n_more + 1):
-        now, _ = _moved_along_differences(now, known, 1.0, rng)
+        now, _ = _moved_by_differential_evolution(now, evaluate, 1.0, rng)
         if k % _AFRESH == 0:
-            now = _moved_afresh(now, known, reference, space, 1.0, rng)
+            now = _moved_by_independent_proposals(now, evaluate, reference, space, 1.0, rng)
         if k in keep:
             kept.append(now)
     return kept
 
 
 def _log_evidence_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
-    """Bridge two temperatures in each cloud (Bennett 1976): log of the ratio of their evidences, (n_clouds,).
+    """Estimate by a bridge (Bennett 1976) the log ratio of two temperatures' evidences in each cloud, (n_clouds,).
 
-    `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each. Also the
-    effective share of the particles that the bridge stands on.
+    `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each. Also return
+    the effective share of the particles.
     """
     size = math.log(before.shape[1]) - math.log(after.shape[1])
     log_ratio = logsumexp(before, axis=1) - math.log(before.shape[1])
@@ -339,8 +351,8 @@ def _log_evidence_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArr
     return np.asarray(log_ratio), float(min(shares))
 
 
-def _next(rise: FloatArray, beta: float, share: float, n_particles: int) -> float:
-    """Find the next temperature: that whose weights leave such a share of the particles effective."""
+def _next_temperature(rise: FloatArray, beta: float, share: float, n_particles: int) -> float:
+    """Find the temperature after `beta`: the one whose weights leave a share `share` of the particles effective."""
     # What is impossible is lost at any temperature.
     least = share * float(min(n_particles, np.isfinite(rise).sum()))
     if n_effective((1.0 - beta) * rise) >= least:
@@ -348,12 +360,12 @@ def _next(rise: FloatArray, beta: float, share: float, n_particles: int) -> floa
     return power_bracket(lambda power: (power - beta) * rise, beta, 1.0, wanted=least, n_steps=_BISECTIONS)[1]
 
 
-def _moved_along_differences(
-    now: _Cloud, known: Callable[[FloatArray], _Cloud], beta: float, rng: np.random.Generator
-) -> tuple[_Cloud, float]:
+def _moved_by_differential_evolution(
+    now: _Particles, evaluate: Callable[[FloatArray], _Particles], beta: float, rng: np.random.Generator
+) -> tuple[_Particles, float]:
     """Move each particle once, one half after the other; return the cloud and the share of moves accepted.
 
-    Differences of two particles of one half are the directions of the other (differential evolution, ter Braak 2006).
+    A particle moves along the difference of two particles of the other half (differential evolution, ter Braak 2006).
     """
     n, d = now.x.shape
     n_gaussians = (d - 2) // 6
@@ -372,25 +384,27 @@ def _moved_along_differences(
         scale[rng.random(m) < _WHOLE_JUMP] = 1.0
         one, two = rng.choice(other, (2, m))
         step = scale[:, None] * (now.x[one] - now.x[two]) + jitter * rng.standard_normal((m, d))
-        new = known(old.x + np.where(by_block[:, None] & ~in_block, 0.0, step))
-        better = np.log(rng.random(m)) < new.tempered(beta) - old.tempered(beta)
+        new = evaluate(old.x + np.where(by_block[:, None] & ~in_block, 0.0, step))
+        better = np.log(rng.random(m)) < new.log_tempered_density(beta) - old.log_tempered_density(beta)
         n_accepted += int(better.sum())
-        now = now.put(own[better], new.take(np.flatnonzero(better)))
+        now = now.with_rows_replaced(own[better], new.take(np.flatnonzero(better)))
     return now, n_accepted / n
 
 
-def _moved_afresh(
-    now: _Cloud,
-    known: Callable[[FloatArray], _Cloud],
-    reference: KnownDensity,
+def _moved_by_independent_proposals(
+    now: _Particles,
+    evaluate: Callable[[FloatArray], _Particles],
+    reference: StartDensity,
     space: Coordinates,
     beta: float,
     rng: np.random.Generator,
-) -> _Cloud:
-    """Propose to each particle a fresh one from the reference's density: only the rest of the target counts."""
+) -> _Particles:
+    """Propose a draw from the reference to each particle, accepted by the ratio of target over reference density."""
     there, log_drawn = reference.propose(space.leave(now.x)[0], rng=rng)
     with np.errstate(invalid="ignore"):
-        new = known(space.enter(there))
-        log_accept = new.tempered(beta) - now.tempered(beta) + log_drawn + now.log_prior - new.log_prior
+        new = evaluate(space.enter(there))
+        log_accept = (
+            new.log_tempered_density(beta) - now.log_tempered_density(beta) + log_drawn + now.log_prior - new.log_prior
+        )
         better = np.flatnonzero(np.log(rng.random(len(there))) < log_accept)
-    return now.put(better, new.take(better))
+    return now.with_rows_replaced(better, new.take(better))

@@ -104,7 +104,7 @@ class PeakDensity:
         return np.asarray(np.max(each, axis=0) > self.one.log_density_around_nine_tenths)
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
-        """Log density over the prior's, (n, 6 N + 2) -> (n,)."""
+        """Return the log of this density divided by the prior's, (n, 6 N + 2) -> (n,)."""
         y = self.space.enter(theta)
         return self._log_density(y) - self.space.leave(y)[1]
 

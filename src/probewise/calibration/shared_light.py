@@ -53,7 +53,7 @@ class SharedLightDensity:
         return self.space.prior
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
-        """Log density over the prior's sorted one, (n, 6 N + 2) -> (n,)."""
+        """Return the log of this density divided by the prior's (of sorted Gaussians), (n, 6 N + 2) -> (n,)."""
         x = self.space.enter(theta)
         return np.asarray(self.one.log_density(x) - self.space.leave(x)[1])
 

@@ -269,7 +269,7 @@ def _pair_rows(done: list[Result]) -> list[Row]:
 
 
 def _each_keeps_size_beside_other(result: Result) -> bool:
-    """Return whether each of two effects keeps at least `_BESIDE` of its size when the other is in the model."""
+    """Return whether each effect of a pair keeps at least `_BESIDE` of its λ when the other is in the model."""
     return all("size_beside" in h and h["size_beside"] >= _BESIDE * h["size_lambda"] for h in result["hidden"])
 
 

@@ -69,7 +69,7 @@ class SheetCheck:
             return None
         self._reported.add((name, is_white))
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
-        return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour(is_white)}, and {wrong}"
+        return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour_in_words(is_white)}, and {wrong}"
 
     def check_levels(self, name: str, values: dict[bool, float]) -> str | None:
         """Check a sheet by its readings over white (True) and black (False); return a complaint or None.
@@ -83,7 +83,7 @@ class SheetCheck:
                 wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
         for is_white, value in values.items():
             told = self._contradiction_of_earlier(is_white, value)
-            wrong = wrong or (None if told is None else f"where it should be {_colour(is_white)} {told}")
+            wrong = wrong or (None if told is None else f"where it should be {_colour_in_words(is_white)} {told}")
         if wrong is not None:
             return f"sheet {name!r} contradicts its pattern: {wrong}"
         for is_white, value in values.items():
@@ -123,17 +123,16 @@ class SheetCheck:
         if own and other:
             level, opposite = float(np.median(own)), float(np.median(other))
             if abs(value - level) > max(_OFF * abs(opposite - level), self._least_difference(level, opposite)):
-                return (
-                    f"reads {value:g}; {_colour(is_white)} read {level:g} so far, {_colour(not is_white)} {opposite:g}"
-                )
+                colour, other_colour = _colour_in_words(is_white), _colour_in_words(not is_white)
+                return f"reads {value:g}; {colour} read {level:g} so far, {other_colour} {opposite:g}"
         elif len(own) >= _FEWEST:
             level = float(np.median(own))
             if abs(value - level) > _SPREAD_SHARE * (self._range if math.isfinite(self._range) else abs(level)):
-                return f"reads {value:g}; {_colour(is_white)} read {level:g} so far"
+                return f"reads {value:g}; {_colour_in_words(is_white)} read {level:g} so far"
         elif other and self._bright:
             opposite = float(np.median(other))
             if (value - opposite) * (1 if is_white else -1) < self._least_difference(value, opposite):
-                return f"reads {value:g}, where {_colour(not is_white)} read {opposite:g}"
+                return f"reads {value:g}, where {_colour_in_words(not is_white)} read {opposite:g}"
         return None
 
     def _least_difference(self, *levels: float) -> float:
@@ -148,5 +147,5 @@ def shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
     return np.where((low == high) & ((low >= 1) | (high <= 0)), np.clip(low, 0.0, 1.0), math.nan)
 
 
-def _colour(is_white: bool) -> str:
+def _colour_in_words(is_white: bool) -> str:
     return "white" if is_white else "black"

@@ -117,7 +117,7 @@ class RegionWithGradient:
 
 
 @seen_by_one.register
-def _(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_gradient(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate by Stein's lemma: response times field at the centre, plus a central difference of the response."""
     a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
     x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
@@ -159,7 +159,7 @@ class RegionWithPatch:
 
 
 @seen_by_one.register
-def _(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def _mean_albedo_over_patch(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate the region, then add the patch: under N(m, C) it is a bell of covariance C + r^2 about its centre."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
     from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
@@ -177,5 +177,7 @@ def _regions_under_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]
 
 @edge_distance.register(RegionWithGradient)
 @edge_distance.register(RegionWithPatch)
-def _(region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def _edge_distance_of_changed_region(
+    region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
+) -> FloatArray:
     return edge_distance(region.region, x_mm, y_mm)

@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.effects import Estimated
 from probewise.errors import ParameterError
-from probewise.experiment.pace import EffectWithSentence
+from probewise.experiment.pace import DescribedEffect
 from probewise.experiment.rivals import Rival
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import TabulatedChain
@@ -55,7 +55,7 @@ class HypothesisKind:
     likelihood: Likelihood
     to_whole_theta: Callable[[FloatArray, np.random.Generator], FloatArray]
     whole_names: tuple[str, ...]
-    effect: EffectWithSentence | None = None
+    effect: DescribedEffect | None = None
 
     def problem(self, recording: Recording) -> SensorProblem:
         """Set up the inference of this kind from a recording."""

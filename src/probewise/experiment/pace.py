@@ -53,8 +53,8 @@ def run_time_s(plan: Plan) -> FloatArray | None:
     return plan.covariates.get(_COLUMN)
 
 
-class EffectWithSentence(Effect[Any], Protocol):
-    """An effect with a sentence that describes it."""
+class DescribedEffect(Effect[Any], Protocol):
+    """An effect that writes the sentence which describes it."""
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Describe the effect, given posterior means and sds of its parameters."""
@@ -65,7 +65,7 @@ class EffectWithSentence(Effect[Any], Protocol):
 class EffectInRunTime(WrappedEffect[FloatArray]):
     """An effect whose times and rates are in the run's own time; without that column in the plan, in recorded time."""
 
-    effect: EffectWithSentence
+    effect: DescribedEffect
 
     powers: ClassVar[Mapping[str, int]] = {"at_s": 1, "tau_s": 1, "per_hour": -1}
 
@@ -88,7 +88,7 @@ class EffectInRunTime(WrappedEffect[FloatArray]):
 class FromRest(WrappedEffect[Any]):
     """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
 
-    effect: EffectWithSentence
+    effect: DescribedEffect
 
     def apply(self, value: Any, theta: FloatArray, plan: Plan) -> Any:
         """Apply the effect to all readings but the run's first."""

@@ -29,7 +29,7 @@ from probewise.effects import (
 from probewise.errors import ParameterError
 from probewise.experiment.effect_large_enough import EffectLargeEnoughForRun
 from probewise.experiment.noise_rivals import noise_likelihoods
-from probewise.experiment.pace import EACH_S, EffectInRunTime, EffectWithSentence, FromRest
+from probewise.experiment.pace import EACH_S, DescribedEffect, EffectInRunTime, FromRest
 from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import cards_of
@@ -75,7 +75,7 @@ class Rival:
     """One alternative to the sensor model: an effect on the mean, or another noise model."""
 
     name: str
-    effect: EffectWithSentence | None = None
+    effect: DescribedEffect | None = None
     likelihood: Likelihood | None = None
 
 
@@ -118,7 +118,7 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
     return tuple(found)
 
 
-def _effects_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[EffectWithSentence]:
+def _effects_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """List the forms in which an effect may act in a run: one that changes with time does so at the run's own pace."""
     if effect.name in OF_MOTION:
         return [EffectLargeEnoughForRun(effect, field_mm), FromRest(EffectLargeEnoughForRun(effect, field_mm))]

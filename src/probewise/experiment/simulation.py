@@ -21,7 +21,7 @@ from probewise.calibration.sensor_file import require_sensor
 from probewise.effects import Estimated, Known
 from probewise.errors import ParameterError
 from probewise.experiment.configuration import Experiment
-from probewise.experiment.pace import EffectWithSentence, FromRest
+from probewise.experiment.pace import DescribedEffect, FromRest
 from probewise.experiment.rivals import OF_MOTION
 from probewise.experiment.sensor_update import AdjustedMixture, sensor_prior
 from probewise.inference import Naive, Rounded
@@ -245,7 +245,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
         values = tuple(means[name] for name in names)
         samples = [sensor.samples[:, sensor.names.index(name)] for name in names]
         if estimated and all(own.std() > 0 for own in samples):
-            acting = FromRest(cast(EffectWithSentence, effect)) if effect.name in OF_MOTION else effect
+            acting = FromRest(cast(DescribedEffect, effect)) if effect.name in OF_MOTION else effect
             effects.append(Estimated(acting, values, tuple(map(_marginal_of_samples, samples))))
         else:
             effects.append(Known(effect, values))
@@ -265,9 +265,10 @@ TRUST = 0.9
 
 
 def default_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
-    """Return the default trust in a sensor.
+    """Return the default prior probability that the sensor model is complete (its trust).
 
-    It is 1 if no rivals are available, for several shapes, or with a user's own utility.
+    It is `TRUST`, or 1 where no rival is considered: for the naive model, a sensor that is learnt, several shapes, or a
+    user's own utility.
     """
     plain = model == "naive" or learn_sensor or isinstance(shape, AnyOf) or utility != Finishing()
     return 1.0 if plain else TRUST

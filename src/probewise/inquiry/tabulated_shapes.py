@@ -46,9 +46,10 @@ class _ShapesOfOneKind(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TabulatedShapes:
-    """Shapes under a footprint in the lab frame, by kind: indices of the hypotheses, and their geometry.
+    """Shapes of hypotheses, grouped by kind for fast computation of the light from a footprint.
 
-    `footprint_mm` is the largest offset of a Gaussian from the sensor, and its largest sd.
+    `parts`: indices of the hypotheses of each kind, and their geometry in the lab frame. `footprint_mm`: the largest
+    offset of a Gaussian from the sensor, and its largest sd.
     """
 
     n_shapes: int

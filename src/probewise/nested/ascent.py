@@ -82,8 +82,8 @@ def climb_to_top(
     return Top(highest, centre, root_of_covariance(wider * covariance), met)
 
 
-def top_from_live_points(run: NestedResult, evaluate: Evaluator) -> Top:
-    """Describe the last live points of a run: the highest one, their mean and a root of their covariance."""
+def start_from_live_points(run: NestedResult, evaluate: Evaluator) -> Top:
+    """Return the start of a climb: the highest of a run's last live points, their mean, a root of their covariance."""
     last = slice(-run.n_live, None)
     live = evaluate.points_from_known_values(run.theta[last], run.log_likelihood[last], run.label[last])
     return Top(live.take(live.order()[-1:]), live.u.mean(axis=0), principal_root(live.u))

@@ -21,7 +21,8 @@ _SIMULATED_AT_A_TIME = 100_000
 class Evidence:
     """log Z, the information (nats), normalised log weights and Kish's effective sample size.
 
-    `spread`: sd of log Z from the random shrinkage alone; `log_start_error`: from the prior's possible share.
+    `spread`: sd of log Z from the random shrinkage alone; `log_start_error`: standard error of the log of the share of
+    the prior with a likelihood above zero.
     """
 
     log_z: float

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise.nested.ascent import Top, climb_to_top, top_from_live_points
+from probewise.nested.ascent import Top, climb_to_top, start_from_live_points
 from probewise.nested.beyond import find_higher_peaks
 from probewise.nested.evaluate import Evaluator, Points, Samplable
 from probewise.nested.hills import (
@@ -105,7 +105,7 @@ def find_missed_hills(
     def calls_left(share: float = math.inf) -> int:
         return int(min(max_calls - evaluate.n_calls, share * run.n_calls))
 
-    top = climb_to_top(top_from_live_points(run, evaluate), evaluate, max_calls=calls_left(_ASCENT_SHARE), rng=rng)
+    top = climb_to_top(start_from_live_points(run, evaluate), evaluate, max_calls=calls_left(_ASCENT_SHARE), rng=rng)
     if lost is None:
         tops = tops_from_early_points(run, evaluate, max_calls=calls_left(), rng=rng)
         if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):

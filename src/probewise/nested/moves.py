@@ -41,7 +41,7 @@ class Move(Protocol):
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
     ) -> tuple[Points, Tally]:
-        """Return as many new points as `start` has, each distributed as the prior above `bound`.
+        """Draw as many new points as `start` has, each distributed as the prior above `bound`.
 
         Parameters
         ----------
@@ -55,6 +55,10 @@ class Move(Protocol):
             The problem.
         rng
             Source of randomness.
+
+        Returns
+        -------
+        The new points, and the move's tally.
         """
         ...
 

@@ -124,7 +124,7 @@ def comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
 
 
 def comparison_table(searches: Sequence[RobotSearch], caption: str = "") -> Markup:
-    """Build the comparison table; the default caption explains its columns."""
+    """Build the table that compares the robots' searches, a row each; the default caption explains bits and errors."""
     return table(
         HEADER,
         comparison_rows(searches),

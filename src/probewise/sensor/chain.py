@@ -46,7 +46,7 @@ _FEW = 8  # hypotheses: up to so many are computed together even where they shar
 
 
 class Levels(Protocol):
-    """The readings over black and over white."""
+    """A sensor's levels (its readings over black, I_min, and white, I_max), as a function of the parameters."""
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -52,7 +52,7 @@ def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
     Parameters
     ----------
     one
-        The paper's a, u, v, A, B, C of the Gaussian, with a for the whole mass, (n_samples, 6).
+        The paper's a, u, v, A, B, C of one Gaussian that holds the whole mass, (n_samples, 6).
     bends
         Coefficients of the basis of shares that keep mean and covariance, of either sign, (n_samples, N_BENDS).
 

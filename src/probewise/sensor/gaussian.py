@@ -475,7 +475,11 @@ def _normal_cdf_from_table(z: FloatArray) -> FloatArray:
 def _mass_along_skewed_chords(
     mean_x: FloatArray, mean_y: FloatArray, sd_y: FloatArray, per_sd: FloatArray, tilt: FloatArray, n_nodes: int
 ) -> FloatArray:
-    """Integrate along x over Gaussians whose mean in x moves by `tilt` conditional sds for each sd in y."""
+    """Return the mass of Gaussians in the unit disc.
+
+    Chords are integrated exactly along x, with Gauss-Hermite nodes in y; the mean in x moves by `tilt` conditional sds
+    for each sd in y.
+    """
     node, weight = _hermite_rule(n_nodes)
     along = node[:, None] * sd_y
     along += mean_y
@@ -549,7 +553,7 @@ def _mean_albedo_over_mixture(region: MixtureOfRegions, gaussian: LabGaussian, n
 
 @seen_by_one.register
 def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Integrate each row of pixels exactly along x, and by Gauss-Legendre across it, in panels within the footprint."""
+    """Return an image's mean albedo: exact along x in each row of pixels, by Gauss-Legendre in panels across it."""
     shape = gaussian.shape
     out = np.empty(shape)
     x, y = (

@@ -122,7 +122,7 @@ class Caller:
                 return _of_shape(readings, (n_samples, n_points), self.name)
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
-                own = {name: _value_at_row(values, k) for name, values in parameters.items()}
+                own = {name: _value_of_sample(values, k) for name, values in parameters.items()}
                 table = {
                     name: values[min(k, len(values) - 1)] if np.ndim(values) == 2 else values
                     for name, values in columns.items()
@@ -226,7 +226,8 @@ def _taken_by_row(
     return frozenset(taken)
 
 
-def _value_at_row(values: FloatArray, k: int) -> Any:
+def _value_of_sample(values: FloatArray, k: int) -> Any:
+    """Return a parameter's value in sample k, a number or one per row; the same for all if there is only one."""
     own = values[min(k, len(values) - 1)]
     return float(own[0]) if own.shape == (1,) else own
 

@@ -107,7 +107,7 @@ def gaussian_spot(blobs: Sequence[Blob], *, pixel_mm: float = 0.25) -> Spot:
     low = [min(b.center_mm[k] - 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
     high = [max(b.center_mm[k] + 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
 
-    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+    def light_density(u: FloatArray, v: FloatArray) -> FloatArray:
         out = np.zeros_like(u)
         for b in blobs:
             p, q = (u - b.center_mm[0]) / b.sd_mm[0], (v - b.center_mm[1]) / b.sd_mm[1]
@@ -121,7 +121,7 @@ def gaussian_spot(blobs: Sequence[Blob], *, pixel_mm: float = 0.25) -> Spot:
 
     center = ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
     half_width = max(high[0] - low[0], high[1] - low[1]) / 2
-    return raster_spot(density, half_width, center_mm=center, pixel_mm=pixel_mm)
+    return raster_spot(light_density, half_width, center_mm=center, pixel_mm=pixel_mm)
 
 
 def ridge_spot(
@@ -140,14 +140,14 @@ def ridge_spot(
     ridge between diode and LED takes `shadow` of the light along the line v = centre + `ridge_mm`.
     """
 
-    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+    def light_density(u: FloatArray, v: FloatArray) -> FloatArray:
         p, q = u - center_mm[0], v - center_mm[1]
         r = np.hypot(p, q)
         disc = np.where(r < radius_mm, np.cos(np.minimum(r / radius_mm, 1.0) * math.pi / 2) ** 2, 0.0)
         lobed = 1 + lobes * (p * p - q * q) / np.maximum(r * r, 1e-12)
         return np.asarray(disc * lobed * (1 - shadow / (1 + ((q - ridge_mm) / ridge_width_mm) ** 4)))
 
-    return raster_spot(density, radius_mm + pixel_mm, center_mm=center_mm, pixel_mm=pixel_mm)
+    return raster_spot(light_density, radius_mm + pixel_mm, center_mm=center_mm, pixel_mm=pixel_mm)
 
 
 def tailed_spot(
@@ -165,13 +165,13 @@ def tailed_spot(
     if not 0 <= skew < 1:
         raise ParameterError("skew", skew, "0 to below 1")
 
-    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+    def light_density(u: FloatArray, v: FloatArray) -> FloatArray:
         p, q = (u - center_mm[0]) / core_mm[0], (v - center_mm[1]) / core_mm[1]
         stretched = p / (1 + skew * np.tanh(p))
         return np.asarray(np.exp(1 - np.sqrt(1 + stretched**2 + q**2)))
 
     half_width = 14 * max(core_mm[0] * (1 + skew), core_mm[1])
-    return raster_spot(density, half_width, center_mm=center_mm, pixel_mm=pixel_mm)
+    return raster_spot(light_density, half_width, center_mm=center_mm, pixel_mm=pixel_mm)
 
 
 def ring_spot(
@@ -189,13 +189,13 @@ def ring_spot(
     if not 0 <= off_axis <= 1:
         raise ParameterError("off_axis", off_axis, "0 to 1")
 
-    def density(u: FloatArray, v: FloatArray) -> FloatArray:
+    def light_density(u: FloatArray, v: FloatArray) -> FloatArray:
         p, q = u - center_mm[0], v - center_mm[1]
         r = np.hypot(p, q)
         sided = 1 + off_axis * q / np.maximum(r, 1e-12)
         return np.asarray(sided * np.exp(-(((r - radius_mm) / width_mm) ** 2) / 2))
 
-    return raster_spot(density, radius_mm + 6 * width_mm, center_mm=center_mm, pixel_mm=pixel_mm)
+    return raster_spot(light_density, radius_mm + 6 * width_mm, center_mm=center_mm, pixel_mm=pixel_mm)
 
 
 def blurred(spot: Spot, sd_mm: float) -> Spot:

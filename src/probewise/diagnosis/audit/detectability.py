@@ -110,7 +110,7 @@ class PlanTemplates:
             settings=tuple(settings),
         )
 
-    def norms(self, columns: FloatArray) -> FloatArray:
+    def norms_of_entries(self, columns: FloatArray) -> FloatArray:
         """Return the joint norm of each entry's columns, (n_entries,)."""
         return np.asarray(np.sqrt(np.bincount(self.entry, np.einsum("ij,ij->j", columns, columns), len(self.owner))))
 
@@ -138,7 +138,14 @@ class ProjectedTemplates:
         own, _ = np.linalg.qr(np.concatenate([slopes, np.eye(n_params)]))
         left = -own @ (own[:n_points].T @ columns)
         left[:n_points] += columns
-        return cls(laid, left, _orthonormal(left, laid.entry), laid.norms(columns), laid.norms(left), n_points)
+        return cls(
+            laid,
+            left,
+            _orthonormal(left, laid.entry),
+            laid.norms_of_entries(columns),
+            laid.norms_of_entries(left),
+            n_points,
+        )
 
     def detectability(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
         """Return the detectable share of each requested effect, and its cosine to every other detectable effect.

@@ -103,7 +103,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     plain, plan = found.model, found.model.plan
     model = plain.with_effect(effect)
     n_rows = bank.shape[0] * bank.shape[1]
-    own = {e.name: effect_values(e, found.z[None, plain.columns_of(e.name)]) for e in plain.effects}
+    own = {e.name: effect_values(e, found.z[None, plain.coordinates_of(e.name)]) for e in plain.effects}
     sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
     before = np.zeros(len(plan))
     before[usable] = found.predicted

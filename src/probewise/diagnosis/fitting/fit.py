@@ -63,13 +63,13 @@ class Model:
         """Number of coordinates."""
         return self.sensor.n_params + sum(len(effect.prior.names) for effect in self.effects)
 
-    def columns_of(self, name: str) -> slice:
-        """Coordinates of one effect."""
+    def coordinates_of(self, name: str) -> slice:
+        """Return the slice of one effect's coordinates."""
         return {effect.name: own for effect, own in columns_of_effects(self.effects, self.sensor.n_params)}[name]
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to the chain's parameters."""
-        own = {effect.name: effect_values(effect, z[:, self.columns_of(effect.name)]) for effect in self.effects}
+        own = {effect.name: effect_values(effect, z[:, self.coordinates_of(effect.name)]) for effect in self.effects}
         return self.theta_of(self.sensor.theta(z[:, : self.sensor.n_params]), own)
 
     def theta_of(self, sensor: FloatArray, own: Mapping[str, FloatArray]) -> FloatArray:
@@ -92,7 +92,7 @@ class Model:
     def without(self, name: str) -> tuple[Model, BoolArray]:
         """Return the model without an effect, and the mask of the remaining coordinates, (n_params,)."""
         stay = np.ones(self.n_params, dtype=np.bool_)
-        stay[self.columns_of(name)] = False
+        stay[self.coordinates_of(name)] = False
         return Model(self.sensor, tuple(e for e in self.effects if e.name != name), self.plan), stay
 
     def coordinates_of_last_effect(self, values: FloatArray) -> FloatArray:

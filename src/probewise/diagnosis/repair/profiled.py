@@ -210,7 +210,7 @@ def _nonlinear_coordinates(found: Fit) -> list[int]:
     """List the coordinates of effects that are no amplitudes."""
     out = []
     for effect in found.model.effects:
-        first = found.model.columns_of(effect.name).start
+        first = found.model.coordinates_of(effect.name).start
         out += [first + k for k in range(len(effect.prior.names)) if k not in effect.amplitudes]
     return out
 

@@ -145,7 +145,7 @@ def sample_model(
     chain = null.chain(recording.plan, effects, n_nodes=ACCURATE_NODES)
     own = {
         effect.name: effect.spread(
-            effect_values(effect, z[:, found.model.columns_of(effect.name)]), weights[effect.name], rng=rng
+            effect_values(effect, z[:, found.model.coordinates_of(effect.name)]), weights[effect.name], rng=rng
         )
         for effect in found.model.effects
     }

@@ -162,7 +162,10 @@ def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
 
 
 def _end_transients(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
-    """Yield decays from the start, and growths to the end, of a scan: common to all scans, and for each."""
+    """Yield columns that decay exponentially from a scan's start and that grow towards its end, over 2 and 8 readings.
+
+    They are the same for all scans; for few scans there is also one pair for each.
+    """
     first = np.repeat(starts, np.diff(starts, append=n_points))
     last = np.repeat(np.append(starts[1:], n_points) - 1, np.diff(starts, append=n_points))
     rows = np.arange(n_points)

@@ -231,5 +231,8 @@ class SearchState:
 
 
 def rivals_of(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
-    """List the candidates that a combination competes with: named ones do not compete with unnamed ones."""
+    """List the candidates with which a combination competes.
+
+    These are all candidates if it has an effect outside the vocabulary, otherwise only those without one.
+    """
     return [c for c in among if out_of_vocabulary(names) or not out_of_vocabulary(c.names)]

@@ -55,7 +55,7 @@ class Swap:
         at, variant = pair
         held, effects[at] = effects[at], self.of_twin.variants[variant]
         model = replace(found.model, effects=tuple(effects))
-        amplitudes = np.array(held.amplitudes, dtype=np.int64) + found.model.columns_of(held.name).start
+        amplitudes = np.array(held.amplitudes, dtype=np.int64) + found.model.coordinates_of(held.name).start
         for sign in (1.0, -1.0):
             z, slopes = found.z.copy(), found.slopes.copy()
             z[amplitudes] *= sign

@@ -36,8 +36,8 @@ MOST_READINGS = 100
 def calibrated() -> FittedSensor:
     """Return the study's sensor as a calibration would leave it: right, and known to about a percent."""
     mixture = experiment_of(REFERENCE).model.ssf
-    precision = np.linalg.inv(mixture.covs_mm2[0])
-    truth = np.array([1.0, *mixture.means_mm[0], precision[0, 0], precision[1, 1], precision[0, 1], DARK, BRIGHT])
+    (a, c), (_, b) = 0.5 * np.linalg.inv(mixture.covs_mm2[0])  # paper, eq. Ssf
+    truth = np.array([1.0, *mixture.means_mm[0], a, b, c, DARK, BRIGHT])
     sd = np.array([0.0, 0.02, 0.02, *(0.01 * np.abs(truth[3:6])), 0.05, 0.05])
     samples = truth + sd * np.random.default_rng(11).standard_normal((500, len(truth)))
     return FittedSensor(

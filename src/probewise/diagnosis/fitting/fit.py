@@ -34,7 +34,8 @@ def _points_about(z: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def _value_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Convert predictions at these points (n_params + 1, n_points) to the one at z and slopes (n_points, n_params)."""
-    return batch[0], (batch[1:] - batch[0]).T / steps
+    with np.errstate(invalid="ignore"):  # of a start from which the model diverges: not finite, and not taken
+        return batch[0], (batch[1:] - batch[0]).T / steps
 
 
 @dataclass(frozen=True, eq=False)

@@ -117,7 +117,8 @@ class About:
 
     def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the rms change of the readings by each setting (n_settings, n_params), in sds; NaN if not finite."""
-        return np.asarray(np.sqrt(np.mean(self.change(stage, act, settings) ** 2, axis=1)) / self.sd)
+        with np.errstate(over="ignore", invalid="ignore"):  # a setting may carry a law away: it is not finite
+            return np.asarray(np.sqrt(np.mean(self.change(stage, act, settings) ** 2, axis=1)) / self.sd)
 
     def change(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the change of the readings by each setting (n_settings, n_params): (n_settings, n_points)."""

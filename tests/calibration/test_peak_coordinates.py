@@ -42,7 +42,7 @@ def test_a_change_of_labels_changes_neither_density_nor_readings(recording: Reco
     theta, log_density = space.leave(y)
     assert len(space.label_permutations) == 6
     for change in space.label_permutations:
-        other, log_other = space.leave(space.relabel(y, change))
+        other, log_other = space.leave(space.permute_labels(y, change))
         np.testing.assert_allclose(log_other, log_density, rtol=1e-9)
         np.testing.assert_allclose(np.sort(other[:, 1:-2:6]), np.sort(theta[:, 1:-2:6]), rtol=1e-9)
         np.testing.assert_allclose(np.sort(other[:, :-2:6]), np.sort(theta[:, :-2:6]), rtol=1e-9)

@@ -10,11 +10,11 @@ import pytest
 from probewise._arrays import FloatArray
 from probewise.calibration import SSFPrior
 from probewise.calibration.shared_light import SharedLightDensity
-from probewise.calibration.whole_coordinates import FAINT, WholeCoordinates, count_bright
+from probewise.calibration.whole_coordinates import FAINT, WholeFootprintCoordinates, count_bright
 from probewise.priors import LogUniform, Uniform
 
 
-def space(n_gaussians: int, *, n_bright: int | None = None) -> WholeCoordinates:
+def space(n_gaussians: int, *, n_bright: int | None = None) -> WholeFootprintCoordinates:
     prior = SSFPrior(
         n_gaussians,
         offset_mm=Uniform(-10, 10),
@@ -23,10 +23,10 @@ def space(n_gaussians: int, *, n_bright: int | None = None) -> WholeCoordinates:
         i_max=Uniform(40, 80),
         unit_mass_mm2=20.0,
     )
-    return WholeCoordinates(prior, (1.0, 0.5), 20.0, n_bright)
+    return WholeFootprintCoordinates(prior, (1.0, 0.5), 20.0, n_bright)
 
 
-def drawn(asked: WholeCoordinates, n: int, seed: int) -> FloatArray:
+def drawn(asked: WholeFootprintCoordinates, n: int, seed: int) -> FloatArray:
     return asked.prior.from_unit_cube(np.random.default_rng(seed).random((n, len(asked.prior.names))))
 
 

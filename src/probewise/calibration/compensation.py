@@ -18,7 +18,7 @@ from scipy.special import log_ndtr, logsumexp, ndtri_exp
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
 from probewise.calibration.gaussian_responses import SingleGaussianResponses, light_by_gaussian
-from probewise.calibration.whole_coordinates import WholeCoordinates
+from probewise.calibration.whole_coordinates import WholeFootprintCoordinates
 from probewise.effects.density import log_mass_between
 from probewise.inference import SensorProblem, sd_floor
 from probewise.nested.weights import n_effective, resampled_rows
@@ -118,7 +118,7 @@ class _LinearisedPosterior:
     def from_samples(
         cls,
         below: SensorProblem,
-        coordinates: MomentCoordinates | WholeCoordinates,
+        coordinates: MomentCoordinates | WholeFootprintCoordinates,
         alone: SensorProblem,
         theta: FloatArray,
     ) -> _LinearisedPosterior:
@@ -189,7 +189,7 @@ class Compensation:
         Log of the mean of their power 0.8 over the pool.
     """
 
-    coordinates: MomentCoordinates | WholeCoordinates
+    coordinates: MomentCoordinates | WholeFootprintCoordinates
     linear: _LinearisedPosterior
     pool: FloatArray
     answers: CompensatingShift
@@ -200,7 +200,7 @@ class Compensation:
     def from_samples(
         cls,
         below: SensorProblem,
-        coordinates: MomentCoordinates | WholeCoordinates,
+        coordinates: MomentCoordinates | WholeFootprintCoordinates,
         alone: SensorProblem,
         theta: FloatArray,
         *,

@@ -72,7 +72,7 @@ class LightIntegral:
         for at in range(0, len(rest), at_once):
             part = rest[at : at + at_once]
             seen, light = self._responses(part)
-            one = self._single_responses.responses_to(gaussian[at : at + at_once])
+            one = self._response_model.responses_to(gaussian[at : at + at_once])
             found.append(self._log_ratio(_mixture_response(seen, light), one, light, part[:, -2:]))
         return np.concatenate(found)
 
@@ -89,7 +89,7 @@ class LightIntegral:
 
     def _responses(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Responses of the readings to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
-        return self._single_responses.responses_by_gaussian(theta), light_by_gaussian(theta)
+        return self._response_model.responses_by_gaussian(theta), light_by_gaussian(theta)
 
     def _log_ratio(self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray) -> FloatArray:
         """Log of the ratio for one Gaussian with responses `one` beside `others`, which have `light`.
@@ -122,7 +122,7 @@ class LightIntegral:
         `whole`: light of all others over that of the brightest.
         """
         n = self.prior.n_gaussians
-        low, high = self._bounds_of_share(square, both, own, FAINT / (FAINT + whole))
+        low, high = self._integration_limits(square, both, own, FAINT / (FAINT + whole))
         place, weight = _NODES
         share = (low[..., None] + (high - low)[..., None] * 0.5 * (place + 1.0)).clip(1e-14, 1.0 - 1e-12)
         log_density = self._log_likelihood_times_prior(square, both, own, whole, share)
@@ -139,7 +139,7 @@ class LightIntegral:
         log_measure = np.log(whole[..., None]) - 2.0 * np.log1p(-share)
         return np.asarray(self._log_likelihood(left) + log_measure)
 
-    def _bounds_of_share(
+    def _integration_limits(
         self, square: FloatArray, both: FloatArray, own: FloatArray, most: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Least and greatest share of the light at which the likelihood is not negligible, (...,) each."""
@@ -188,7 +188,7 @@ class LightIntegral:
         return low[of], ((_N_TABLE - 1) / (high - low))[of], values[of].ravel()
 
     @property
-    def _single_responses(self) -> SingleGaussianResponses:
+    def _response_model(self) -> SingleGaussianResponses:
         return SingleGaussianResponses(self.alone)
 
     @cached_property

@@ -47,7 +47,7 @@ class PeakCoordinates:
             found.append((columns, c[:, np.argsort(order)] @ c.T))
         return tuple(found)
 
-    def relabel(self, y: FloatArray, change: tuple[IntArray, FloatArray]) -> FloatArray:
+    def permute_labels(self, y: FloatArray, change: tuple[IntArray, FloatArray]) -> FloatArray:
         """Permute the labels of the Gaussians in coordinates, (n, 6 N + 1) -> (n, 6 N + 1)."""
         columns, matrix = change
         k = self.prior.n_gaussians - 1

@@ -92,7 +92,7 @@ class PeakDensity:
     def fitted_to(self, theta: FloatArray) -> PeakDensity:
         """Fit a density to samples, (n, 6 N + 2), each with the labels that are most probable under this one."""
         y = self.space.enter(theta)
-        labelled = np.stack([self.space.relabel(y, change) for change in self.space.label_permutations])
+        labelled = np.stack([self.space.permute_labels(y, change) for change in self.space.label_permutations])
         best = np.argmax([self.one.log_density(each) for each in labelled], axis=0)
         own = labelled[best, np.arange(len(y))]
         root = np.linalg.cholesky(_WIDENED**2 * np.cov(own, rowvar=False))
@@ -100,7 +100,7 @@ class PeakDensity:
 
     def is_near_peak(self, y: FloatArray) -> BoolArray:
         """Mark coordinates that, with any labels, lie in the densest region of nine tenths of draws, (n, d) -> (n,)."""
-        each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.label_permutations]
+        each = [self.one.log_density(self.space.permute_labels(y, change)) for change in self.space.label_permutations]
         return np.asarray(np.max(each, axis=0) > self.one.log_density_around_nine_tenths)
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
@@ -113,7 +113,7 @@ class PeakDensity:
         return propose_independently(self, here, rng=rng)
 
     def _log_density(self, y: FloatArray) -> FloatArray:
-        each = [self.one.log_density(self.space.relabel(y, change)) for change in self.space.label_permutations]
+        each = [self.one.log_density(self.space.permute_labels(y, change)) for change in self.space.label_permutations]
         return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
 
 

@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray
 from probewise.calibration.fields import sorted_by_mass
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.smc import N_CLOUDS, N_SNAPSHOTS, SMCResult
-from probewise.calibration.whole_coordinates import WholeCoordinates, count_bright
+from probewise.calibration.whole_coordinates import WholeFootprintCoordinates, count_bright
 from probewise.nested import NestedResult, Weighted
 
 _N_SAMPLES = 4000
@@ -40,9 +40,9 @@ class FootprintPlaceAndSize:
         _, u, v, a, b, c = theta[:6]
         return cls((float(u), float(v)), float(0.5 * (a + b) / (a * b - c * c)))
 
-    def coordinates(self, prior: SSFPrior, n_bright: int) -> WholeCoordinates:
+    def coordinates(self, prior: SSFPrior, n_bright: int) -> WholeFootprintCoordinates:
         """Return the coordinates of mixtures of which `n_bright` Gaussians are bright."""
-        return WholeCoordinates(prior, self.centre_mm, self.size_mm2, n_bright)
+        return WholeFootprintCoordinates(prior, self.centre_mm, self.size_mm2, n_bright)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ _UNIT = np.array([[1.0], [1.0], [0.0]])
 
 
 @dataclass(frozen=True)
-class WholeCoordinates:
+class WholeFootprintCoordinates:
     """`MomentCoordinates` but for the first Gaussian's centre, log variances and correlation: those of the whole.
 
     The readings do not depend on light far out. So a Gaussian that is k times as wide, or as far out, as the sensor

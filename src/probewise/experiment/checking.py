@@ -131,10 +131,10 @@ class Outline:
         diameter = float(np.linalg.norm(edge[:, None] - edge, axis=2).max())
         unread = cls(edge, nearest, np.full(len(edge), np.inf), spacing, diameter)
         taken = np.array([[r.pose.x_mm, r.pose.y_mm] for r in readings]).reshape(-1, 2)
-        apart = unread.distances_with_reading(taken).min(axis=1, initial=np.inf)
+        apart = unread.nearest_reading_distances_if_read_at(taken).min(axis=1, initial=np.inf)
         return cls(edge, nearest, apart, spacing, diameter)
 
-    def distances_with_reading(self, places_mm: FloatArray) -> FloatArray:
+    def nearest_reading_distances_if_read_at(self, places_mm: FloatArray) -> FloatArray:
         """Return `apart_mm` with one more reading at each of these places, (n_places, 2) -> (n, n_places)."""
         apart = np.linalg.norm(self.edge_mm[:, None] - places_mm, axis=2)
         at_edge = apart.min(axis=0) <= _AT_EDGE * self.spacing_mm
@@ -148,7 +148,7 @@ class Outline:
 
     def leaves_no_far_side(self, places_mm: FloatArray) -> BoolArray:
         """Return whether one more reading at each place leaves no far side, (n_places, 2) -> (n_places,)."""
-        return np.asarray(self.distances_with_reading(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
+        return np.asarray(self.nearest_reading_distances_if_read_at(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
 
 
 def places_of_designs(utility_input: UtilityInput) -> FloatArray:

@@ -118,11 +118,11 @@ class CrossedEllipses:
         for share, slope, base, axes in zip(self.share, self.slope, self.base, self.axes, strict=True):
             p, q = (np.abs(s.take(crossing) * x_mm + b.take(crossing)) for s, b in zip(slope, base, strict=True))
             a, b = (axis.take(crossing) for axis in axes)
-            cosine, sine = _unit_vector(p / a, q / b)
+            cosine, sine = _normalised(p / a, q / b)
             bent = a * a - b * b
             u, v = bent / a * (cosine * cosine * cosine), -bent / b * (sine * sine * sine)  # the centre of curvature
             ratio = _vector_length(a * cosine - u, b * sine - v) / np.maximum(_vector_length(p - u, q - v), _TINY)
-            cosine, sine = _unit_vector(
+            cosine, sine = _normalised(
                 np.maximum((p - u) * ratio + u, 0.0) / a, np.maximum((q - v) * ratio + v, 0.0) / b
             )
             steep_p, steep_q = cosine / a, sine / b
@@ -137,6 +137,7 @@ def _vector_length(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.sqrt(x * x + y * y)
 
 
-def _unit_vector(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _normalised(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the vectors (x, y) at unit length."""
     length = np.maximum(_vector_length(x, y), _TINY)
     return x / length, y / length

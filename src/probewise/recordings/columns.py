@@ -150,7 +150,7 @@ def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[Int
     The number of each reading's scan, (n_points,), and the scans' names.
     """
     if names is None or isinstance(names, str):
-        return np.zeros(n_points, dtype=np.int64), (_printable_name("scan", names or "scan"),)
+        return np.zeros(n_points, dtype=np.int64), (_checked_name("scan", names or "scan"),)
     cells = _names_per_reading("scan", names, n_points)
     starts = [k for k in range(n_points) if k == 0 or cells[k] != cells[k - 1]]
     begins = np.zeros(n_points, dtype=np.int64)
@@ -216,10 +216,10 @@ def _names_per_reading(name: str, values: Iterable[object], n_points: int) -> li
     for k, cell in enumerate(cells):
         if _is_missing(cell):
             raise ParameterError(f"{name}[{k}]", cell, f"a name in every row; leave out rows without a {name}")
-    return [_printable_name(name, str(cell)) for cell in cells]
+    return [_checked_name(name, str(cell)) for cell in cells]
 
 
-def _printable_name(what: str, text: str) -> str:
+def _checked_name(what: str, text: str) -> str:
     """Return a name as a file would hold it: without surrounding blanks."""
     if not text.strip().isprintable():
         raise ParameterError(what, text, "a printable text, without line ends")

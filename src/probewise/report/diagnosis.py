@@ -162,7 +162,7 @@ def _simulator_facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 def _formula_in_words(formula: Formula) -> str:
-    """Write a formula with its estimated parameters."""
+    """Write what a formula is added to, its parameters, and its gain in log evidence and per held-out reading."""
     numbers = ", ".join(f"{p.name} = {value_with_sd(p.mean, p.sd)}" for p in formula.parameters)
     of = f"the rate of {formula.target}" if formula.side == "rate" else formula.target
     held_out = f"{formula.heldout_log_density_per_reading:+.3f} nats per held-out reading"

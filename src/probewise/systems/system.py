@@ -275,17 +275,18 @@ class System:
             moved = float(np.sqrt(np.mean((coarse - fine)[there] ** 2))) if there.any() else np.inf
             if moved <= tolerance:
                 return now
-            if or_finest and moved < before / _CONVERGING and not finer._is_within_reach(places):
+            if or_finest and moved < before / _CONVERGING and not finer._has_affordable_steps(places):
                 return now
             now, coarse, before = finer, fine, moved
-            if not now._is_within_reach(places):
+            if not now._has_affordable_steps(places):
                 raise ParameterError(
                     "rates",
                     f"readings still move by {moved:.3g} rms {self.simulator.unit} when the step is halved",
                     "a law that some thousand steps integrate: set max_step_s, or bring simulate with an integrator",
                 )
 
-    def _is_within_reach(self, places: RowsInRuns) -> bool:
+    def _has_affordable_steps(self, places: RowsInRuns) -> bool:
+        """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
         return bool(places.stepping(self.max_step).in_gap.sum() <= _MOST_STEPS + len(places.row_at_place))
 
 

@@ -73,7 +73,7 @@ class RunTable:
 
     @property
     def has_time(self) -> bool:
-        """Whether a time was recorded, and increases."""
+        """Whether a time was recorded that is not the same in all rows."""
         return self.time is not None and float(np.ptp(self.time_s)) > 0
 
     @cached_property

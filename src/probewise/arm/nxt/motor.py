@@ -204,7 +204,7 @@ class Motor:
         if self._target is None:
             here = self._synchronise()
         target = goal - side * self._coast_counts(self.drive.fast_power, side)
-        if min(side * (target - here), side * (target - self._known_target)) > 0:
+        if min(side * (target - here), side * (target - self._require_target)) > 0:
             here = self._limited_move(target, side, self.drive.fast_power, here)
         return here
 
@@ -242,7 +242,7 @@ class Motor:
         return here
 
     @property
-    def _known_target(self) -> int:
+    def _require_target(self) -> int:
         if self._target is None:
             raise MotorError(f"motor {self.letter}: its counters jumped; did a program start on the brick?")
         return self._target
@@ -251,9 +251,9 @@ class Motor:
         """Move towards the goal: fast to well short of it, or slowly all the way."""
         fast, slow = self.drive.fast_power, self.drive.slow_power
         target = goal - side * self._coast_counts(slow, side)
-        if side * self._known_target >= side * target:
+        if side * self._require_target >= side * target:
             here = self._synchronise()  # a target left by a move in the other direction would lead beyond the goal
-        least = max(side * here, side * self._known_target) + 1  # a target behind this position causes no motion
+        least = max(side * here, side * self._require_target) + 1  # a target behind this position causes no motion
         short = goal - side * (2 * self.drive.lead_counts + self._coast_counts(fast, side))
         if side * short > least + self.drive.lead_counts:
             return self._limited_move(short, side, fast, here)
@@ -264,7 +264,7 @@ class Motor:
         back: Side = 1 if side == -1 else -1
         fast, slow = self.drive.fast_power, self.drive.slow_power
         behind = goal - side * (self._coast_counts(slow, side) + 2 * self.drive.lead_counts)
-        least = max(back * here, back * self._known_target) + 1
+        least = max(back * here, back * self._require_target) + 1
         short = behind + side * self._coast_counts(fast, back)
         if back * short > least + self.drive.lead_counts:
             return self._limited_move(short, back, fast, here)
@@ -279,7 +279,7 @@ class Motor:
         stop = target + side * self._coast_counts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
-        if not self._start(target, side, self._command(side * power, side * (target - self._known_target))):
+        if not self._start(target, side, self._command(side * power, side * (target - self._require_target))):
             return self.stop_and_settle()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
         trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here, target)

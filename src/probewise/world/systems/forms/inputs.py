@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
-from probewise.world.systems.forms.modulations import join_sine_and_cosine, join_single_member, wave_bank
+from probewise.world.systems.forms.modulations import join_sine_and_cosine, scale_single_member, wave_bank
 from probewise.world.systems.forms.readings import delayed
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.rows import SystemRows
@@ -43,7 +43,7 @@ def _linear_form(
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": first}]],
-        join_single_member,
+        scale_single_member,
         {"a": first},
         first,
         limit,

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form
-from probewise.world.systems.forms.modulations import Modulation, join_single_member
+from probewise.world.systems.forms.modulations import Modulation, scale_single_member
 from probewise.world.systems.forms.true_system import TrueSystem
 
 _N_WAVES = 20
@@ -74,7 +74,7 @@ def term_in_rate(
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": 0.1 * first}]],
-        join_single_member,
+        scale_single_member,
         {"a": first},
         first,
         300 * first,

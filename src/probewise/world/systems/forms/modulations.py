@@ -34,7 +34,7 @@ def _no_values(rng: np.random.Generator) -> dict[str, float]:
     return {}
 
 
-def join_single_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+def scale_single_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
     """Scale the amplitude of a group's only member."""
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
@@ -47,7 +47,7 @@ def _of_amplitude_alone(
         lambda a, drawn: {"a": a},
         _no_values,
         lambda a: [[{"a": a}]],
-        join_single_member,
+        scale_single_member,
         lambda a: {"a": a},
         covariates,
         reach,
@@ -82,7 +82,7 @@ def step(true: TrueSystem) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {at: true.random_time(rng)},
         lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
-        join_single_member,
+        scale_single_member,
         lambda a: {"a": a, at: 0.0},
         ("time", str(true.rows.time)) if timed else ("row",),
         1.0,
@@ -152,7 +152,7 @@ def settling(true: TrueSystem) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.rows.median_gap, 0.4 * longest)},
         lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
-        join_single_member,
+        scale_single_member,
         lambda a: {"a": a, "tau_s": 0.05 * longest},
         ("time", "run", str(true.rows.time)),
         1.0,

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Instants, Numbers
 from probewise.world.systems.forms.inside import term_in_rate
-from probewise.world.systems.forms.modulations import join_single_member
+from probewise.world.systems.forms.modulations import scale_single_member
 from probewise.world.systems.forms.readings import OFFSET
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.rows import SystemRows
@@ -67,7 +67,7 @@ def _added_to_reading(
         lambda a, more: {"a": a, **more},
         lambda rng: dict(drawn or {}),
         [[{"a": sd}]],
-        join_single_member,
+        scale_single_member,
         {"a": sd},
         sd,
         1e4 * sd,

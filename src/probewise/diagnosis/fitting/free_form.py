@@ -43,7 +43,7 @@ class FreeForm(CalibratedSensor):
         return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
 
     def start_from(self, one: FloatArray) -> FloatArray:
-        """Return a start of a fit: coordinates of one Gaussian, (7,), with the free form's bends zero: (1, n_params)."""
+        """Return a start of a fit: one Gaussian's coordinates, (7,), the free form's bends zero: (1, n_params)."""
         return np.pad(one, (0, N_BENDS))[None, :]
 
     @property

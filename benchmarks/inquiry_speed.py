@@ -40,6 +40,7 @@ from probewise.study import REFERENCE, Trial, arm_of, experiment_of
 
 FIRST_CIRCLE = 2000  # the study looks for the first thousand at most
 SOME_HYPOTHESES = 20
+N_LIVE = 200  # live points of nested sampling, the robot's default
 EVERY = 4  # steps between those that are also done the plain way
 
 
@@ -67,9 +68,10 @@ def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str
     for number, (before, after) in enumerate(pairwise(steps)):
         problem = experiment.problem([step.reading for step in steps[: number + 2]])
         rng = np.random.default_rng([run, number])
-        scratch = partial(nested_sampling_from_scratch, problem, experiment, rng)
-        ask = partial(predict_and_rate_readings, experiment, after.posterior, field, at=after.reading, rng=rng)
-        before_it = Particles(before.posterior, np.arange(len(before.posterior.theta)))
+        scratch = partial(nested_sampling_from_scratch, problem, N_LIVE, rng)
+        drawn = after.posterior.samples(experiment.n_samples, rng=rng)
+        ask = partial(predict_and_rate_readings, experiment, after.posterior, drawn, field, at=after.reading)
+        before_it = Particles(before.posterior, np.arange(len(before.posterior.theta)), 0.0)
         infer = partial(update, before_it, problem, rng=rng, fall_back=scratch)
         row = {"map_s": seconds(ask), "inference_s": seconds(infer)}
         if number % EVERY == 0:

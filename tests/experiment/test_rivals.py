@@ -460,7 +460,7 @@ def test_a_rival_whose_samples_went_astray_is_found_from_what_others_believe(dou
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     lost = replace(prior_posterior([kind], 500, rng=rng).particles[0].weighted, log_z=-1000.0)
     fitted = fit_kind(kind, problem, [donor], noise_sd=1.0, rng=rng)
-    found = sampled_about_fits(fitted, problem, lost, n_draws=2000, with_own=False, rng=rng)
+    found = sampled_about_fits(fitted, kind, problem, lost, n_draws=2000, with_own=False, rng=rng)
     assert found is not None
     assert found.log_z == pytest.approx(right.log_z, abs=4 * math.hypot(found.log_z_error, right.log_z_error))
     assert found.mean()[3] == pytest.approx(6.0, abs=4 * found.sd()[3])
@@ -511,8 +511,8 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
         solved.append(problem)
         return nested_sampling_from_scratch(problem, 100, rng)
 
-    def by_few(found, problem, own, *, n_draws, with_own, rng):
-        weighted = sampled_about_fits(found, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
+    def by_few(found, kind, problem, own, *, n_draws, with_own, rng):
+        weighted = sampled_about_fits(found, kind, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
         return replace(weighted, n_eff=7.0)
 
     monkeypatch.setattr(posterior, "sampled_about_fits", by_few)
@@ -588,3 +588,32 @@ def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
             now, recording, 3000, rng=rng, from_scratch=lambda problem: nested_sampling_from_scratch(problem, 100, rng)
         )
     assert now.left_out["ambient_step"] > 0.97
+
+
+# Readings (x_mm, y_mm, value) on black; after the sixth the light rises by 16 units. The circle may be wherever nothing
+# was read. With a white that saturates at 26 it would hold the last ten places.
+_AFTER_A_STEP = (
+    (443, 260, 9.8), (782, 252, 11.5), (226, 244, 12.9), (218, 244, 10.2), (637, 260, 10.9), (274, 341, 8.6),
+    (355, 171, 25.5), (355, 162, 26.2), (298, 106, 26.7), (242, 98, 25.8), (218, 228, 25.7), (242, 252, 27.0),
+    (193, 179, 25.1), (435, 211, 26.3), (443, 65, 25.9), (306, 203, 26.0),
+)  # fmt: skip
+
+
+def test_a_rival_that_leaves_the_shape_open_has_the_evidence_of_nested_sampling(doubting):
+    """It was 12 nats lower, and a run with these readings sure of a circle half a metre away."""
+    poses = [(Pose(float(x), float(y)), value) for x, y, value in _AFTER_A_STEP]
+    readings = [Reading(value, pose, 8.0 * k) for k, (pose, value) in enumerate(poses, 1)]
+    recording = doubting.problem(readings).recording
+    kinds = {kind.left_out: kind for kind in doubting.kinds}
+    rng = np.random.default_rng(12)
+    saturated, stepped_light = kinds["saturation"], kinds["ambient_step"]
+    donor = nested_sampling_from_scratch(saturated.problem(recording), 200, rng)
+    before = nested_sampling_from_scratch(stepped_light.problem(doubting.problem(readings[:9]).recording), 200, rng)
+    problem = stepped_light.problem(recording)
+    truth = nested_sampling_from_scratch(problem, 400, rng)
+    fits = fit_kind(stepped_light, problem, [donor, before], noise_sd=1.0, rng=rng)
+    found = sampled_about_fits(fits, stepped_light, problem, before, n_draws=2000, with_own=False, rng=rng)
+    assert truth.log_z > donor.log_z + 1.0
+    # Five sds of both: one false alarm in two million.
+    assert found.log_z == pytest.approx(truth.log_z, abs=5 * math.hypot(found.log_z_error, truth.log_z_error))
+    assert found.n_eff > 50

@@ -316,7 +316,8 @@ def _sample_near_other_kinds(
             return _SamplesNearOtherKinds(None, found.highest_log_z)
         with_own = own.log_z > hopeless
         return _SamplesNearOtherKinds(
-            sampled_about_fits(found, problem, own, n_draws=2 * n, with_own=with_own, rng=rng), found.highest_log_z
+            sampled_about_fits(found, kind, problem, own, n_draws=2 * n, with_own=with_own, rng=rng),
+            found.highest_log_z,
         )
     n_own = len(kind.prior.names)
     points = [donor.samples(n // 2, rng=rng)[:, :n_own] for donor in donors]

@@ -24,6 +24,7 @@ from probewise.experiment.pace import EACH_S, run_time_s
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.weights import resampled_rows
+from probewise.priors import Prior
 
 _STARTS = 90
 _STEPS = 8
@@ -172,8 +173,43 @@ def _prediction_slopes(
     return np.ascontiguousarray(((there - at_theta) / nudge[:, None, None]).transpose(1, 2, 0))
 
 
+@dataclass(frozen=True, eq=False)
+class _AnyShape:
+    """A density over a kind's parameters: the shape's prior, and kernels about the effect's parameters of fits.
+
+    Where the readings leave the shape open (a step of the light, and no white yet), Gaussians about fits cover little
+    of the posterior.
+    """
+
+    prior: Prior
+    effect_prior: Prior
+    of_effect: LocalKernels
+
+    @classmethod
+    def about(cls, kind: HypothesisKind, found: Fits, rows: IntArray) -> _AnyShape | None:
+        """Build from some fits of a kind; None for a kind without an effect on the mean."""
+        if kind.effect is None:
+            return None
+        n = len(kind.effect.prior.names)
+        covariance = _WIDER**2 * _inverse_precision(found.precision[rows])[:, -n:, -n:]
+        return cls(kind.prior, kind.effect.prior, LocalKernels.from_moments(found.theta[rows, -n:], covariance))
+
+    def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw points, (n, n_params)."""
+        out = self.prior.from_unit_cube(rng.random((n, len(self.prior.names))))
+        out[:, -len(self.effect_prior.names) :] = self.of_effect.draw(n, rng=rng)
+        return out
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return the natural log of the density at possible points, (n, n_params) -> (n,)."""
+        own = points[:, -len(self.effect_prior.names) :]
+        of_shape = self.prior.log_prob(points) - self.effect_prior.log_prob(own)
+        return np.asarray(of_shape + self.of_effect.log_density(own))
+
+
 def sampled_about_fits(
     found: Fits,
+    kind: HypothesisKind,
     problem: SensorProblem,
     own: Weighted,
     *,
@@ -187,8 +223,8 @@ def sampled_about_fits(
     ----------
     found
         Fits of the kind, at least one of them good.
-    problem
-        The kind's problem.
+    kind, problem
+        The kind and its problem.
     own
         The kind's own samples.
     n_draws
@@ -204,7 +240,11 @@ def sampled_about_fits(
     """
     n_params = found.theta.shape[1]
     best = found.good_rows[np.argsort(-found.log_z)][:_KEPT]
-    densities = [LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse_precision(found.precision[best]))]
+    densities: list[_Density] = [
+        LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse_precision(found.precision[best]))
+    ]
+    if (open_shape := _AnyShape.about(kind, found, best)) is not None:
+        densities.append(open_shape)
     if with_own and len(rows := _resampled_rows(own, n_params, rng)):
         densities.append(LocalKernels.fitted_to(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
     first = _importance_sampled(own, problem, densities, n_draws // 2, rng)
@@ -214,6 +254,9 @@ def sampled_about_fits(
     near = LocalKernels.fitted_to(first.theta[rows], rng=rng, most=_KERNELS)
     far = LocalKernels.fitted_to(first.theta[rows], rng=rng, widened=_FAR, most=_KERNELS)
     return _importance_sampled(first, problem, [near, near, far, *densities], n_draws, rng) or first
+
+
+_Density = LocalKernels | _AnyShape
 
 
 def _inverse_precision(precision: FloatArray) -> FloatArray:
@@ -230,7 +273,7 @@ def _resampled_rows(posterior: Weighted, n_params: int, rng: np.random.Generator
 
 
 def _importance_sampled(
-    own: Weighted, problem: SensorProblem, densities: list[LocalKernels], n: int, rng: np.random.Generator
+    own: Weighted, problem: SensorProblem, densities: Sequence[_Density], n: int, rng: np.random.Generator
 ) -> Weighted | None:
     """Sample by importance sampling from an even mixture of densities; None where hardly a draw is possible."""
     shares = np.bincount(rng.permutation(n) % len(densities), minlength=len(densities))

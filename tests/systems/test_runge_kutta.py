@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from probewise.systems.motion import Motion, Stepper
-from probewise.systems.runge_kutta import EIGHTH_ORDER, FOURTH_ORDER, Stepping
+from probewise.systems.motion import Limit, Motion, Stepper
+from probewise.systems.runge_kutta import FOURTH_ORDER, Stepping, eighth_order
 from probewise.systems.simulator import Law
 
+EIGHTH_ORDER = eighth_order()
 SWINGS = Motion(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -s["x"] + 0 * u["t"]}))
 
 
@@ -49,3 +50,14 @@ def test_the_method_is_the_one_whose_accuracy_costs_least(in_gap, method, steps)
     stepping = Stepping.of(np.array(in_gap))
     assert stepping.method is method
     np.testing.assert_array_equal(stepping.in_gap, steps)
+
+
+def test_a_state_that_meets_its_bound_within_a_step_of_eighth_order_stays_there():
+    """A filling of rate 1 with a bound at 2.5: what an eighth-order step weighs negatively must not take it back."""
+    fills = Motion(Law({"x": 0.0}, lambda s, p, u: {"x": 1.0 + 0 * s["x"]})).with_limit(Limit("x", np.array([[2.5]])))
+    stepper = Stepper(fills, EIGHTH_ORDER, lambda share: ({}, {}), np.array([[1.0]]))
+    s, found = {"x": np.zeros((1, 1))}, []
+    for _ in range(4):
+        s = stepper.step(s, 0.0, 1.0)
+        found.append(float(s["x"][0, 0]))
+    assert found == pytest.approx([1.0, 2.0, 2.5, 2.5])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.systems.runge_kutta import RungeKutta, Stepping, Terms
+from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, Stepping, Terms
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
 
@@ -275,8 +275,16 @@ class Stepper:
     gap: FloatArray
 
     def step(self, s: dict[str, Any], begin: Any, length: Any) -> dict[str, Any]:
-        """Advance by a share of a gap; split the step where friction brings a state to rest or lets it go."""
+        """Advance by a share of a gap; split the step where friction brings a state to rest or lets it go.
+
+        A motion that may come to a halt within a step takes one of eighth order as several of fourth order.
+        """
         motion, between = self.motion, self.between
+        if self.method is not FOURTH_ORDER and (motion.limits or motion.friction):
+            shorter, part = replace(self, method=FOURTH_ORDER), length / N_LONGER
+            for k in range(N_LONGER):
+                s = shorter.step(s, begin + k * part, part)
+            return s
         ways = motion.ways(s, *between(begin))
         after = self._unsplit(s, begin, length, ways)
         for state, way in ways.items():

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
-from scipy.integrate import DOP853
 
 from probewise._arrays import IntArray
 
@@ -48,10 +47,17 @@ def _terms(weights: tuple[float, ...]) -> Terms:
 
 FOURTH_ORDER = RungeKutta(((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)), (1 / 6, 1 / 3, 1 / 3, 1 / 6), (0.0, 0.5, 0.5, 1.0))
 
-EIGHTH_ORDER = RungeKutta(
-    tuple(tuple(row[:k].tolist()) for k, row in enumerate(DOP853.A)), tuple(DOP853.B.tolist()), tuple(DOP853.C.tolist())
-)
-"""Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I (1993), section II.10."""
+N_LONGER = 3
+"""Steps of fourth order that have as many evaluations as one of eighth order."""
+
+
+@cache
+def eighth_order() -> RungeKutta:
+    """Return the method (Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 1993, section II.10)."""
+    from scipy.integrate import DOP853  # takes long, and laws alone need it
+
+    a = tuple(tuple(row[:k].tolist()) for k, row in enumerate(DOP853.A))
+    return RungeKutta(a, tuple(DOP853.B.tolist()), tuple(DOP853.C.tolist()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,8 +73,7 @@ class Stepping:
 
         In gaps that need a single step, fourth order suffices.
         """
-        longer = EIGHTH_ORDER.n_stages // FOURTH_ORDER.n_stages
-        fewer = np.asarray(-(-in_gap // longer), dtype=np.int64)
-        if longer * fewer.sum() <= _DEARER * in_gap.sum():
-            return cls(fewer, EIGHTH_ORDER)
+        fewer = np.asarray(-(-in_gap // N_LONGER), dtype=np.int64)
+        if N_LONGER * fewer.sum() <= _DEARER * in_gap.sum():
+            return cls(fewer, eighth_order())
         return cls(in_gap, FOURTH_ORDER)

@@ -53,9 +53,10 @@ def select_forward(state: SearchState, *, depth: int) -> None:
         for k, proposal in enumerate(asked):
             state.progress(f"refitting effects, {size} at a time", k, len(asked))
             parent = state.candidates[proposal.parent.n_gaussians, ()] if proposal.parent is null else proposal.parent
-            refitted.append(state.refit(parent, proposal.added))
-            if size == 1 and refitted[-1] is not None:
-                state.improve_null(refitted[-1])
+            found = state.refit(parent, proposal.added)
+            refitted.append(found)
+            if size == 1 and found is not None and state.refits.sensor is not None:
+                state.refit_without(found, proposal.added)
         state.share = 1.0
         kept = list({c.names: c for c in refitted if c is not None}.values())
         if not kept:

@@ -159,16 +159,6 @@ class SearchState:
         self.undetected.add(names)
         return None
 
-    def improve_null(self, candidate: WeighedFit) -> None:
-        """Refit a given null from its coordinates in a fit with one more effect, if it fits better there."""
-        null = self.candidates[candidate.n_gaussians, ()]
-        start = candidate.found.z[: null.found.model.n_params]
-        if self.refits.sensor is None or not self.refits.is_better_at(null.found.model, start, null):
-            return
-        again = self.refits.weighed(null.found.model, start[None, :], candidate.law)
-        if again.log_z > null.log_z + SAME_MODE:
-            self.keep(again)
-
     def refit_without(self, candidate: WeighedFit, left_out: str) -> None:
         """Refit a combination from its coordinates in a fit with one more effect, if it fits better there.
 

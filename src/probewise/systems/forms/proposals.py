@@ -63,9 +63,10 @@ class _Term:
 def proposals(about: About) -> Iterator[Form]:
     """Yield the terms that could be added to the reading, and to the rate of each state."""
     yield from _of_reading(about)
-    for name in _columns(about):
+    columns = _columns(about)
+    for name in columns:
         yield from _switch(about, name)
-    yield from proposals_of_columns(about, _columns(about))
+    yield from proposals_of_columns(about, columns)
     if about.table.has_time:
         yield from proposals_in_time(about)
     for state in about.states:

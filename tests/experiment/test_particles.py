@@ -241,6 +241,16 @@ def test_kernels_follow_a_bent_shell():
     assert np.quantile(np.abs(away), 0.9) < 0.8
 
 
+def test_samples_that_have_collapsed_on_a_point_still_have_kernels_about_it():
+    """Samples that differ by rounding error alone, one coordinate not at all, had a covariance without a root."""
+    exact = np.array([577.0, 357.0, 97.0, 0.0354365305, 0.0])
+    points = exact + 1e-16 * exact * rng().integers(-20, 20, size=(500, 5))
+    kernels = LocalKernels.fitted_to(points, rng=rng(1))
+    drawn = kernels.draw(100, rng=rng(2))
+    np.testing.assert_allclose(drawn, np.broadcast_to(exact, drawn.shape), rtol=1e-6, atol=1e-90)
+    assert np.isfinite(kernels.log_density(drawn)).all()
+
+
 def test_samples_that_all_descend_from_one_are_moved_as_one_part():
     """Copies of one sample are in one part; a part with hardly any would have no kernels."""
     alike = _partition_rows(np.zeros(40, dtype=np.int64))

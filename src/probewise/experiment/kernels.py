@@ -19,6 +19,8 @@ from probewise._arrays import FloatArray, IntArray
 MOST_KERNELS = 250
 _NEIGHBOURS = 10  # neighbours per parameter, enough for a covariance
 _RIDGE = 1e-6  # of the overall covariance, to avoid singular ones
+_RESOLUTION = 1e-9  # of a coordinate's mean, below which a spread is rounding error
+_SMALLEST = 1e-100  # spread of a coordinate that is zero in all points, whose square is still a number
 _BLOCK = 256  # points per batch, to fit the cache
 _FEW = 600  # points up to which all distances are faster than a tree
 
@@ -44,7 +46,7 @@ class LocalKernels:
         n_samples, n_params = points.shape
         origin = points.mean(axis=0)
         away = points - origin
-        scale = np.maximum(points.std(axis=0), 1e-300)
+        scale = np.maximum(points.std(axis=0), np.maximum(_RESOLUTION * np.abs(origin), _SMALLEST))
         rows = rng.permutation(n_samples)[: min(most, (n_samples + 1) // 2)]
         n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
         near = _nearest_points(away / scale, rows, n_near)

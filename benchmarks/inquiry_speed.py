@@ -63,7 +63,7 @@ def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str
     """Run once, and time every step again by itself."""
     rows = []
     with arm:
-        field = ArmOverGrid.of(arm, experiment.grid)
+        field = ArmOverGrid.from_instrument(arm, experiment.grid)
         steps = list(explore(arm, experiment, rng=np.random.default_rng(run)))
     for number, (before, after) in enumerate(pairwise(steps)):
         problem = experiment.problem([step.reading for step in steps[: number + 2]])

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from probewise.calibration import FittedSensor, mean_field
-from probewise.experiment import TRUST, experiment_for, explore, left_out_of, repaired_sensor
+from probewise.experiment import TRUST, experiment_for, explore, left_out_after_step, repaired_sensor
 from probewise.recordings import Instrumentation
 from probewise.scene import Field
 from probewise.sensor import mixture_names
@@ -61,7 +61,7 @@ def run(sensor: FittedSensor, trial: ConcealedTrial) -> tuple[FittedSensor, dict
         *_, last = explore(
             arm, experiment, rng=np.random.default_rng([trial.seed, trial.circle]), max_readings=MOST_READINGS
         )
-    found = left_out_of(last, TRUST)
+    found = left_out_after_step(last, TRUST)
     figures = {
         "known": has_reached_target(last, experiment),
         "readings": last.number,

@@ -20,7 +20,7 @@ import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
 from probewise.errors import DoubtfulResultWarning
-from probewise.experiment import Experiment, HiddenShape, RandomStreams, explore, members_of, shape_named
+from probewise.experiment import Experiment, HiddenShape, RandomStreams, explore, possible_shapes_by_name, shape_named
 from probewise.inference import GaussianKnown
 from probewise.inquiry import Grid
 from probewise.nested import refine
@@ -61,7 +61,7 @@ def follow(number: int) -> dict:
     field = Field()
     experiment = experiment_of(field)
     streams = RandomStreams.of(np.random.default_rng(number))
-    hidden = HiddenShape.of(None, members_of(experiment.shape), field, rng=streams.truth)
+    hidden = HiddenShape.given_or_drawn(None, possible_shapes_by_name(experiment.shape), field, rng=streams.truth)
     spot = gaussian_spot([Blob(1.0, (0.0, 1.5), (4.0, 2.5), 0.2)])
     world = World(spot, black=10.0, white=60.0, noise_sd=1.0)
     noise = np.random.default_rng(streams.noise)

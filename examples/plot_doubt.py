@@ -11,7 +11,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from probewise.arm import SimulatedArm
-from probewise.experiment import Experiment, left_out_of, run
+from probewise.experiment import Experiment, left_out_after_step, run
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc
 from probewise.report import exploration, plots
@@ -65,6 +65,6 @@ for ax, (trust, (experiment, found)) in zip(axes, runs.items(), strict=True):
 # %%
 # What the second robot believes about its sensor, reading by reading.
 _, doubting = runs[0.9]
-beliefs = [left_out_of(step, 0.9).probability for step in doubting.steps]
+beliefs = [left_out_after_step(step, 0.9).probability for step in doubting.steps]
 plots.effect_probabilities_by_reading(beliefs)
 plt.show()

@@ -6,7 +6,7 @@
 import numpy as np
 
 from probewise.arm import SimulatedArm
-from probewise.experiment import Experiment, left_out_of, run
+from probewise.experiment import Experiment, left_out_after_step, run
 from probewise.inference import GaussianKnown
 from probewise.recordings import Disc
 from probewise.report import exploration, plots
@@ -64,9 +64,9 @@ plots.field_legend(axes)
 # %%
 # What the second robot believes about its sensor after each reading. A dashed line marks a reading that changed the
 # most probable effect.
-beliefs = [left_out_of(step, 0.9).probability for step in doubting.steps]
+beliefs = [left_out_after_step(step, 0.9).probability for step in doubting.steps]
 plots.effect_probabilities_by_reading(beliefs)
 
 # %%
 # The same in a sentence, with the size of the effect.
-left_out_of(doubting.last, 0.9).sentence
+left_out_after_step(doubting.last, 0.9).sentence

@@ -330,13 +330,15 @@ def explore(
         cards=tuple(cards),
     )
     if isinstance(arm, LegoArm) and arm.geometry.accuracy is not None:
-        asked = replace(asked, fitted_arm=posing.FittedArm.of(arm.geometry, sensor))
+        asked = replace(asked, fitted_arm=posing.FittedArm.from_geometry_and_sensor(arm.geometry, sensor))
     path = None if journal is None else require_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
     about = {**posing.sensor_entry(sensor), "arm": "simulated" if arm is None else type(arm).__name__}
     taken = () if before is None else before.readings
     if arm is None:
-        hidden = posing.HiddenShape.of(truth, posing.members_of(asked.shape), field, rng=streams.truth)
+        hidden = posing.HiddenShape.given_or_drawn(
+            truth, posing.possible_shapes_by_name(asked.shape), field, rng=streams.truth
+        )
         world, scale = posing.world_like(sensor), posing.scale_of(sensor.instrumentation)
         arm = posing.arm_over(
             world, posing.with_cards(hidden.surface, asked.cards), field, seed=streams.noise, taken=taken, scale=scale
@@ -348,7 +350,7 @@ def explore(
         told("taking the first readings")
 
         def show(step: Step) -> None:
-            believed = f"widest sd {step.widest_mm:.1f} mm, {step.bits:.1f} bits"
+            believed = f"widest sd {step.largest_sd_mm:.1f} mm, {step.bits:.1f} bits"
             told(f"reading {step.number} of at most {max_readings}", note=believed)
 
         return posing.run(

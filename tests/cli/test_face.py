@@ -197,10 +197,12 @@ def test_an_arm_of_ones_own_is_entered_measured_with_and_left(sensor):
     ],
 )
 def test_what_is_hidden_is_the_truth_that_was_given(shape, truth, name, theta):
-    from probewise.experiment import HiddenShape, members_of, shape_of
+    from probewise.experiment import HiddenShape, possible_shapes_by_name, shape_of
 
     field = Field()
-    hidden = HiddenShape.of(truth, members_of(shape_of(shape, field)), field, rng=np.random.default_rng(0))
+    hidden = HiddenShape.given_or_drawn(
+        truth, possible_shapes_by_name(shape_of(shape, field)), field, rng=np.random.default_rng(0)
+    )
     assert (hidden.name, hidden.theta.tolist()) == (name, theta)
 
 

@@ -248,6 +248,6 @@ def test_the_clock_of_ones_own_instrument_goes_on_where_an_earlier_run_ended(sma
 )
 def test_what_lies_there_may_be_said_in_order_or_by_name(truth, name, theta):
     members = {"circle": Circle()}
-    hidden = HiddenShape.of(truth, members, Circle().field, rng=np.random.default_rng(0))
+    hidden = HiddenShape.given_or_drawn(truth, members, Circle().field, rng=np.random.default_rng(0))
     assert (hidden.name, hidden.theta.tolist()) == (name, theta)
     assert hidden.journal_entry["shape"] == name

@@ -63,7 +63,7 @@ def test_each_step_holds_what_its_reading_taught(found):
 
 def test_the_next_place_is_one_of_the_best_of_the_map(found):
     for info in found[0].steps[:-1]:
-        best = info.map.grid.places_mm[info.map.best]
+        best = info.map.grid.places_mm[info.map.best_mask]
         assert [info.next_pose.x_mm, info.next_pose.y_mm] in best.tolist()
 
 

@@ -35,16 +35,16 @@ def test_a_fast_instrument_drifts_over_as_many_readings_as_a_slow_one(name):
 
 def test_parameters_are_told_by_the_clock():
     (step,) = rivals("ambient_step")
-    pace = Pace.of(readings(2.0))
+    pace = Pace.from_readings(readings(2.0))
     assert pace.each_s == pytest.approx(2.0)
-    np.testing.assert_allclose(step.parameters_in_seconds(np.array([5.0, 4 * EACH_S]), pace), [5.0, 8.0])
+    np.testing.assert_allclose(step.theta_in_seconds(np.array([5.0, 4 * EACH_S]), pace), [5.0, 8.0])
     (drift,) = rivals("offset_drift")
-    np.testing.assert_allclose(drift.parameters_in_seconds(np.array([1.0]), pace), [4.0])
+    np.testing.assert_allclose(drift.theta_in_seconds(np.array([1.0]), pace), [4.0])
 
 
 def test_one_reading_has_the_usual_pace():
-    assert Pace.of(readings(2.0)[:1]).each_s == EACH_S
-    assert Pace.of([]) == Pace()
+    assert Pace.from_readings(readings(2.0)[:1]).each_s == EACH_S
+    assert Pace.from_readings([]) == Pace()
 
 
 def test_a_lamp_that_begins_as_calibrated_may_fade():

@@ -21,7 +21,7 @@ from probewise.experiment import (
     paper_experiment,
     read_journal,
     run,
-    student_t_bounds,
+    student_t_likelihood,
 )
 from probewise.inference import Naive
 from probewise.inquiry import InformationGain, ReadingEntropy
@@ -117,7 +117,7 @@ def test_the_robot_asks_fifty_circles_and_goes_where_their_answers_differ_most(s
             counts = np.unique(answers[:, place], return_counts=True)[1] / 50
             assert step.map.values[place] == pytest.approx(-(counts * np.log2(counts)).sum())
     chosen = steps[0].next_pose
-    assert [chosen.x_mm, chosen.y_mm] in places[steps[0].map.best].tolist()
+    assert [chosen.x_mm, chosen.y_mm] in places[steps[0].map.best_mask].tolist()
 
 
 def same(a, b):
@@ -267,8 +267,8 @@ def test_a_simulated_sensor_reads_its_levels_on_its_own_scale():
 
 
 def test_the_student_ts_sd_lies_between_rounding_and_the_levels():
-    assert student_t_bounds(FixedLevels(60.0, 10.0), 1.0) == OneScan(1 / math.sqrt(12), 50.0)
-    assert student_t_bounds(FixedLevels(0.0, 5.0), None) == OneScan(0.005, 5.0)
+    assert student_t_likelihood(FixedLevels(60.0, 10.0), 1.0) == OneScan(1 / math.sqrt(12), 50.0)
+    assert student_t_likelihood(FixedLevels(0.0, 5.0), None) == OneScan(0.005, 5.0)
 
 
 def test_what_a_run_wrote_can_be_read(small, tmp_path):

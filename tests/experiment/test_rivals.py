@@ -22,16 +22,16 @@ from probewise.experiment import (
     FittedArm,
     begin,
     experiment_for,
-    left_out_of,
+    left_out_after_step,
     posterior,
     repaired_sensor,
     result_json,
+    run_with_arm_error,
     step,
-    with_arm_error,
 )
 from probewise.experiment.acquisition import ArmOverGrid, predict_and_rate_readings
-from probewise.experiment.arm_error import arm_error
-from probewise.experiment.checking import ENOUGH_BITS, NAMES, Outline, bits_about_name
+from probewise.experiment.arm_error import arm_error_in_posterior
+from probewise.experiment.checking import ENOUGH_BITS, NAMES, OutlineCoverage, bits_about_left_out
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.noise_rivals import (
     CorrelatedLikelihood,
@@ -41,7 +41,7 @@ from probewise.experiment.noise_rivals import (
     OutlierLikelihood,
     SignalDependentLikelihood,
 )
-from probewise.experiment.posterior import prior_posterior, reconsidered, updated
+from probewise.experiment.posterior import prior_posterior, updated, with_rivals_sampled_again
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
@@ -64,7 +64,7 @@ def stepped(doubting):
     """Two steps of a run that doubts, both of the prior's first places."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmOverGrid.of(arm, doubting.grid)
+        field = ArmOverGrid.from_instrument(arm, doubting.grid)
         state = begin(doubting, field, rng=rng)
         prior_bits = prior_entropy(doubting.prior, rng=rng)
         found = []
@@ -193,7 +193,7 @@ def leading(info, name):
 
 
 def test_what_leads_is_said_with_its_numbers(stepped):
-    said = left_out_of(leading(stepped[-1], "backlash"), 0.9)
+    said = left_out_after_step(leading(stepped[-1], "backlash"), 0.9)
     assert said.leading == "backlash"
     assert said.credible_set == ("backlash",)
     assert "gear play of" in said.sentence
@@ -211,7 +211,7 @@ def test_a_name_that_the_warier_odds_leave_open_is_in_the_credible_set(stepped):
     last = replace(last, left_out=last.kinds.left_out)
     share = 0.1 / (len({kind.left_out for kind in last.kinds.kinds}) - 1)
     plain, wary = share / (0.9 + share), 12.0 * share / (0.9 + 12.0 * share)
-    said = left_out_of(last, 0.9)
+    said = left_out_after_step(last, 0.9)
     assert said.probability["dropouts"] == pytest.approx(plain, rel=0.01)
     assert plain < 0.05 < wary
     assert said.credible_set == (CLEAN, "dropouts")
@@ -224,7 +224,7 @@ def test_a_reading_tells_names_by_what_they_predict():
     alike = np.tile(20.0 + 3.0 * even, 2)
     apart = np.concatenate([20.0 + 3.0 * even, 90.0 + 3.0 * even])
     near = np.concatenate([20.0 + 0.5 * even, 23.0 + 2.0 * even])
-    bits = bits_about_name(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
+    bits = bits_about_left_out(weight, np.stack([alike, apart, near], axis=1), names, Readout(1.0))
     at = np.linspace(-20.0, 60.0, 20_001)
     given = [norm.pdf(at, mean, math.hypot(sd, 1.0)) for mean, sd in ((20.0, 0.5), (23.0, 2.0))]
     both = 0.5 * (given[0] + given[1])
@@ -240,7 +240,7 @@ def test_a_few_stragglers_of_a_name_promise_nothing():
     even = 20.0 + 0.5 * norm.ppf((np.arange(n) + 0.5) / n)
     weight, names = np.full(2 * n, 0.5 / n), np.repeat(["", "halo"], n)
     straggling = np.concatenate([even, np.append(even[:-1], 60.0)])
-    bits = bits_about_name(weight, straggling[:, None], names, Readout(1.0))
+    bits = bits_about_left_out(weight, straggling[:, None], names, Readout(1.0))
     at = np.linspace(0.0, 80.0, 20_001)
     given = [norm.pdf(at[:, None], own, 1.0).mean(axis=1) for own in np.split(straggling, 2)]
     both = np.maximum(0.5 * (given[0] + given[1]), 1e-300)
@@ -253,7 +253,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
     """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as simulated:
-        field = ArmOverGrid.of(simulated, doubting.grid)
+        field = ArmOverGrid.from_instrument(simulated, doubting.grid)
     state, found = begin(doubting, field, rng=rng), []
     for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
         reading = Reading(value, Pose(x, y), 8.0 * k)
@@ -268,10 +268,10 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
     def slopes(kinds):
         of = (doubting, FittedArm(geometry, (10.0, 60.0)), state.readings, last.posterior, kinds)
         named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
-        return arm_error(*of, **named, rng=np.random.default_rng(1)).slopes
+        return arm_error_in_posterior(*of, **named, rng=np.random.default_rng(1)).slopes
 
     run = Exploration(doubting, tuple(found))
-    claimed = with_arm_error(run, geometry, levels=(10.0, 60.0), rng=np.random.default_rng(1)).arm.slopes
+    claimed = run_with_arm_error(run, geometry, levels=(10.0, 60.0), rng=np.random.default_rng(1)).arm.slopes
     np.testing.assert_allclose(claimed, slopes(last.kinds.with_warier_odds))
     assert not np.allclose(claimed, slopes(last.kinds))
 
@@ -286,14 +286,16 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     inside = Reading(60.0, Pose(x - 0.6 * radius, y), 0.0)
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmOverGrid.of(arm, doubting.grid)
+        field = ArmOverGrid.from_instrument(arm, doubting.grid)
     utility_input, _ = predict_and_rate_readings(doubting, joined, joined.theta[:20], field, at=inside)
-    outline = Outline.of(utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
+    outline = OutlineCoverage.of(utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
     assert outline is not None
-    far = outline.far_side
+    far = outline.far_side_design
     opposite = np.array([[x + radius * math.cos(a), y + radius * math.sin(a)] for a in np.radians([200.0, 60.0])])
     tried = np.concatenate([opposite, [[x, y]]])
-    assert outline.leaves_no_far_side(tried).tolist() == ([True, False, False] if asked_deg else [True, True, True])
+    assert outline.leaves_no_far_side_mask(tried).tolist() == (
+        [True, False, False] if asked_deg else [True, True, True]
+    )
     if asked_deg is None:
         assert far is None
         return
@@ -341,11 +343,11 @@ def test_a_run_that_knows_the_shape_asks_what_the_sensor_leaves_out():
     steps = [
         s for s, _ in timed_steps(_arm_in_concealed_world(trial), experiment, seed=8101, circle=0, max_readings=40)
     ]
-    known = [step.number for step in steps if step.widest_mm < 4.0 and step.chance_off < 0.01]
+    known = [step.number for step in steps if step.largest_sd_mm < 4.0 and step.chance_off < 0.01]
     assert known[0] < steps[-1].number
     assert steps[-1].map.label == NAMES
     assert steps[-1].map.highest < ENOUGH_BITS
-    assert left_out_of(steps[-1], 0.9).credible_set == ("ambient_step",)
+    assert left_out_after_step(steps[-1], 0.9).credible_set == ("ambient_step",)
     assert np.abs(steps[-1].mean - trial.truth).max() < 2.0
 
 
@@ -484,7 +486,7 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
     solved = partial(nested_sampling_from_scratch, n_live=100, rng=rng)
     for n in range(1, len(recording) + 1):
         now = updated(now, recording.take(np.arange(n)), 3000, rng=rng, from_scratch=solved)
-    once = reconsidered(now, recording, 3000, rng=rng, from_scratch=solved)
+    once = with_rivals_sampled_again(now, recording, 3000, rng=rng, from_scratch=solved)
     done = [kind for kind, p in zip(kinds, once.particles, strict=True) if p.refitted]
     ruled_out = {kind: p for kind, p in zip(kinds, once.particles, strict=True) if math.isfinite(p.log_z_limit)}
     assert done
@@ -497,7 +499,7 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
         return fit_kind(kind, *args, **options)
 
     monkeypatch.setattr(posterior, "fit_kind", fitted)
-    reconsidered(once, recording, 3000, rng=rng, from_scratch=solved)
+    with_rivals_sampled_again(once, recording, 3000, rng=rng, from_scratch=solved)
 
 
 def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch(doubting, monkeypatch):
@@ -518,7 +520,7 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
     monkeypatch.setattr(posterior, "sampled_about_fits", by_few)
     plain, lost = (replace(p, weighted=replace(p.weighted, log_z=-1000.0)) for p in now.particles)
     now = replace(now, particles=(plain, lost))
-    found = reconsidered(now, recording, 3000, rng=rng, from_scratch=from_nothing)
+    found = with_rivals_sampled_again(now, recording, 3000, rng=rng, from_scratch=from_nothing)
     assert len(solved) >= 1
     assert solved[0].prior.names == kinds[1].prior.names
     assert not found.particles[1].strained

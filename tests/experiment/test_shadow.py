@@ -14,7 +14,7 @@ def steps_of(small, **options):
 
 
 def watched(small, other):
-    field = ArmOverGrid.of(small.arm(), COARSE)
+    field = ArmOverGrid.from_instrument(small.arm(), COARSE)
     return list(shadow_run(steps_of(small), other, field, rng=np.random.default_rng(2)))
 
 

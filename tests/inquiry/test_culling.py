@@ -42,7 +42,7 @@ def test_what_is_not_asked_is_what_would_be_answered(shape):
 def test_most_hypotheses_are_not_asked_about_most_places():
     shape = SHAPES[2]
     sight = CullingBounds.of(chain(shape), hypotheses(shape), PLAN)
-    parts = list(sight.tiles(PLAN))
+    parts = list(sight.visible_hypotheses_by_tile(PLAN))
     assert np.sort(np.concatenate([rows for rows, _ in parts])).tolist() == list(range(len(PLAN)))
     assert sum(rows.size * shown.size for rows, shown in parts) < 0.6 * 40 * len(PLAN)
 

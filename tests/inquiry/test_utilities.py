@@ -137,8 +137,8 @@ def test_a_single_reading_chosen_together_is_the_best_one(made):
 
 
 def test_a_flat_map_says_so(made):
-    assert utility_map(made.listed([[3.0, 3.0], [3.0, 3.0]]), InformationGain()).flat
-    assert not utility_map(made.listed(APART), InformationGain()).flat
+    assert utility_map(made.listed([[3.0, 3.0], [3.0, 3.0]]), InformationGain()).is_flat
+    assert not utility_map(made.listed(APART), InformationGain()).is_flat
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ def test_the_loop_of_the_readme_is_the_one_that_the_robot_runs(monkeypatch):
     again = {}
     exec(compile(setup, "README.md", "exec"), again)
     rng = eval(rest.splitlines()[0], again)
-    monkeypatch.setattr(loop, "_rng_of", lambda seed, number: rng)
+    monkeypatch.setattr(loop, "_rng_of_reading", lambda seed, number: rng)
     found = experiment.run(again["robot"], printed["asked"], rng=rng, max_readings=4)
     taken = [(r.pose, r.value) for r in printed["state"].readings]
     assert [(r.pose, r.value) for r in found.readings] == taken[:4]

@@ -61,5 +61,5 @@ def open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tup
             workspace=geometry,
             scale=posing.scale_of(inputs.sensor.instrumentation),
         )
-    known = hidden.parameters_by_names(inputs.experiment.names)
+    known = hidden.parameters_by_hypothesis_name(inputs.experiment.names)
     return ArmAndTruth(arm, hidden.outline_mm, known, {"hidden": hidden.journal_entry})

@@ -94,7 +94,9 @@ def checked_inputs(arguments: argparse.Namespace) -> Inputs:
         trust=arguments.trust,
     )
     if chosen.may_differ_from_geometry and geometry is not None and geometry.accuracy is not None:
-        experiment = dataclasses.replace(experiment, fitted_arm=posing.FittedArm.of(geometry, sensor))
+        experiment = dataclasses.replace(
+            experiment, fitted_arm=posing.FittedArm.from_geometry_and_sensor(geometry, sensor)
+        )
     other, other_model = None, _model_to_compare_with(arguments.model)
     if arguments.both_models:
         other = pose(model=other_model, naive=levels if other_model == "naive" else None, trust=1.0)

@@ -183,7 +183,7 @@ def run(arguments: argparse.Namespace) -> int:
         return message_of_kept_results(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
 
     def tell(doing: str) -> None:
-        believed = f"; widest sd {steps[-1].widest_mm:.1f} mm" if steps else ""
+        believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
         progress("exploring", note=f"reading {len(steps) + 1}, {doing}{believed}")
 
     with (
@@ -213,7 +213,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
-            under = posing.ArmOverGrid.of(site.arm, inputs.other.grid)
+            under = posing.ArmOverGrid.from_instrument(site.arm, inputs.other.grid)
             pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.add(step, shadow)
@@ -237,7 +237,7 @@ def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journ
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry and inputs.geometry.accuracy is None:
         yield "arm          nobody has fitted its geometry: its own error is not in these sds"
     trust = inputs.experiment.trust
-    missing = posing.left_out_of(result.last, trust)
+    missing = posing.left_out_after_step(result.last, trust)
     if trust < 1:
         yield missing.sentence
     if missing.leading != posing.CLEAN:

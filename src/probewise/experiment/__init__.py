@@ -1,13 +1,13 @@
 """The autonomous experiment: measure, infer, inquire, with a journal of measurements (paper, sections 2.2, 2.3)."""
 
 from probewise.experiment.acquisition import ArmOverGrid
-from probewise.experiment.arm_error import with_arm_error
+from probewise.experiment.arm_error import run_with_arm_error
 from probewise.experiment.configuration import Experiment, OneScan
 from probewise.experiment.digest import value_digest
 from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.found import OFF_MM, FoundParameter, FoundShape, found_shape, result_json, samples_csv
 from probewise.experiment.from_names import MethodName, experiment_from_names
-from probewise.experiment.hidden import HiddenShape, Truth, members_of
+from probewise.experiment.hidden import HiddenShape, Truth, possible_shapes_by_name
 from probewise.experiment.journal import (
     Entry,
     Journal,
@@ -17,7 +17,7 @@ from probewise.experiment.journal import (
     recording_of,
     require_same_settings,
 )
-from probewise.experiment.left_out import CLEAN, LeftOut, left_out_of, repaired_sensor
+from probewise.experiment.left_out import CLEAN, LeftOut, left_out_after_step, repaired_sensor
 from probewise.experiment.limit import least_readings
 from probewise.experiment.loop import begin, explore, run, step
 from probewise.experiment.method import Method, SequentialMonteCarlo
@@ -26,7 +26,7 @@ from probewise.experiment.paper import (
     naive_levels_from_recording,
     naive_levels_from_world,
     paper_experiment,
-    student_t_bounds,
+    student_t_likelihood,
 )
 from probewise.experiment.sensor_update import AdjustedMixture, SensorChangeSds, sensor_prior
 from probewise.experiment.shadow import shadow_run
@@ -87,11 +87,11 @@ __all__ = [
     "explore",
     "found_shape",
     "least_readings",
-    "left_out_of",
-    "members_of",
+    "left_out_after_step",
     "naive_levels_from_recording",
     "naive_levels_from_world",
     "paper_experiment",
+    "possible_shapes_by_name",
     "probability_of_length_off",
     "read_journal",
     "recording_of",
@@ -100,6 +100,7 @@ __all__ = [
     "result_json",
     "run",
     "run_from_place",
+    "run_with_arm_error",
     "samples_csv",
     "scale_of",
     "sensor_entry",
@@ -108,10 +109,9 @@ __all__ = [
     "shape_named",
     "shape_of",
     "step",
-    "student_t_bounds",
+    "student_t_likelihood",
     "surface_of",
     "value_digest",
-    "with_arm_error",
     "with_cards",
     "world_like",
 ]
@@ -130,6 +130,18 @@ Belief = PosteriorSummary
 
 Hidden = HiddenShape
 """The old name of `HiddenShape`."""
+
+with_arm_error = run_with_arm_error
+"""The old name of `run_with_arm_error`."""
+
+members_of = possible_shapes_by_name
+"""The old name of `possible_shapes_by_name`."""
+
+left_out_of = left_out_after_step
+"""The old name of `left_out_after_step`."""
+
+student_t_bounds = student_t_likelihood
+"""The old name of `student_t_likelihood`."""
 
 levels_from = naive_levels_from_recording
 """The old name of `naive_levels_from_recording`."""

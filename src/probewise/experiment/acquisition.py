@@ -14,15 +14,17 @@ from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.journal import PATTERN
 from probewise.inquiry import Goal, Grid, UtilityInput, UtilityMap, choose, choose_several, reachable_rows, utility_map
-from probewise.inquiry.forecast import resampled_hypotheses
+from probewise.inquiry.forecast import resampled_rows_and_weights
 from probewise.nested.importance import Weighted
 
 
 @dataclass(frozen=True, eq=False)
 class ArmOverGrid:
-    """The arm over a grid: places it reaches, the sensor's orientation there, seconds from a pose to a reading there.
+    """Reach, orientation of the sensor and travel time of an arm at the places of a grid.
 
-    `reachable` and `orientation_rad` have shape (n_places,); a design's own orientation is added to the latter.
+    `reachable` marks the places within reach, `orientation_rad` is the sensor's orientation there, to which that of a
+    design is added; both (n_places,). `travel_s(pose, places_mm)` returns the seconds from a pose to the end of a
+    reading at each place.
     """
 
     reachable: BoolArray
@@ -30,16 +32,16 @@ class ArmOverGrid:
     travel_s: Callable[[Pose, FloatArray], FloatArray]
 
     @classmethod
-    def of(cls, instrument: Instrument, grid: Grid) -> Self:
-        """Build from an instrument."""
+    def from_instrument(cls, instrument: Instrument, grid: Grid) -> Self:
+        """Build from an instrument and the grid of places."""
         return cls(
             np.asarray(instrument.reachable(grid.places_mm), dtype=np.bool_),
             np.asarray(instrument.orientation_rad(grid.places_mm), dtype=np.float64),
             instrument.travel_s,
         )
 
-    under = of
-    """The old name of `of`."""
+    of = under = from_instrument
+    """The old names of `from_instrument`."""
 
 
 def predict_and_rate_readings(
@@ -87,7 +89,7 @@ def predict_and_rate_readings(
     drawn.flags.writeable = False
     theta, weight = posterior.theta, posterior.weight
     if experiment.trust < 1:  # samples of several kinds: use no more than for one
-        some, share = resampled_hypotheses(weight, experiment.n_particles)
+        some, share = resampled_rows_and_weights(weight, experiment.n_particles)
         theta, weight = theta[some], share / share.sum()
     utility_input = UtilityInput(
         experiment.forecast,
@@ -107,7 +109,7 @@ def predict_and_rate_readings(
 def next_poses(
     experiment: Experiment, utility_input: UtilityInput, utilities: UtilityMap, *, rng: np.random.Generator
 ) -> tuple[Pose, ...]:
-    """Choose the next pose, or a batch of poses, each repeated as its design says."""
+    """Choose the next pose, or the experiment's batch of poses; each comes as often as its design repeats it."""
     if experiment.batch > 1:
         rows = choose_several(utility_input, experiment.batch, rng=rng)
     else:

@@ -7,7 +7,7 @@ the samples at the end of a run suffice, without another inference.
 
 If the log likelihood is quadratic, its slope by the error is a linear function of its slopes by the shape's parameters,
 and the coefficients are the answer, however few the samples. So these slopes serve as control variates: their
-covariance with the parameters is known, minus one each (Stein's identity), and the samples only estimate the rest.
+covariance with the parameters is known, minus the identity matrix (Stein), and the samples only estimate the rest.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are
 _LEAST = 1e-3  # probability of a kind of hypotheses that is asked
 
 
-def with_arm_error(
+def run_with_arm_error(
     run: Exploration,
     geometry: Geometry,
     *,
@@ -45,7 +45,7 @@ def with_arm_error(
     calibrated_mm: tuple[float, float] | None = None,
     rng: np.random.Generator,
 ) -> Exploration:
-    """Widen the posterior of a run that has ended by the error of the arm's geometry.
+    """Return a run that has ended, with the error of the arm's geometry added to its posterior.
 
     If the run's experiment has a `fitted_arm`, its posterior and stopping rule include that error already.
 
@@ -68,7 +68,7 @@ def with_arm_error(
         If the geometry has no accuracy, or does not reach a place of a reading.
     """
     last, arm = run.last, FittedArm(geometry, levels, calibrated_mm)
-    found = arm_error(
+    found = arm_error_in_posterior(
         run.experiment,
         arm,
         run.readings,
@@ -82,7 +82,7 @@ def with_arm_error(
     return replace(run, steps=(*run.steps[:-1], replace(last, arm=found)))
 
 
-def arm_error(
+def arm_error_in_posterior(
     experiment: Experiment,
     arm: FittedArm,
     readings: Sequence[Reading],
@@ -118,7 +118,7 @@ def arm_error(
     width_mm, height_mm = geometry.field_mm
     middle = (width_mm / 2, height_mm / 2) if arm.calibrated_mm is None else arm.calibrated_mm
     places = np.stack([recording.plan.x_mm, recording.plan.y_mm], axis=-1)
-    off = _pose_changes_by_errors(geometry, np.concatenate([places, [middle]]), accuracy)
+    off = _pose_changes_per_error_sd(geometry, np.concatenate([places, [middle]]), accuracy)
     off[:, 2] -= off[-1, 2]
     off = off[:-1]
     dark, white = arm.levels
@@ -131,22 +131,29 @@ def arm_error(
         experiment, kinds, recording, off, dark, mean=mean, sd=sd, likely_shape=likely_shape
     )
     theta = posterior.theta[:, experiment.shape_columns]
-    return ArmError(slopes, shifts_by_arm_error(experiment, slopes, theta, likely_shape, rng=rng))
+    return ArmError(slopes, draw_arm_error_shifts(experiment, slopes, theta, likely_shape, rng=rng))
 
 
-def shifts_by_arm_error(
+def draw_arm_error_shifts(
     experiment: Experiment, slopes: FloatArray, theta: FloatArray, likely_shape: str, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw an error of the arm for each sample, theta (n_samples, n_params), and return its shift, of the same form."""
+    """Draw an error of the arm for each sample of the shape's parameters, and return the shift that it causes.
+
+    `theta` and the shifts are (n_samples, n_params), `slopes` (n_params, n_errors) those of `ArmError`. Samples of
+    other shapes than `likely_shape` are not shifted.
+    """
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     if isinstance(experiment.shape, AnyOf):
         moved[experiment.shape.shape_index(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
     return np.asarray(moved)
 
 
-def _pose_changes_by_errors(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
-    """Return the change of x, y, height and orientation at places by each error of one sd: (n_points, 4, n_errors)."""
-    root = _matrix_root(np.array(accuracy.covariance))
+def _pose_changes_per_error_sd(geometry: Geometry, places_mm: FloatArray, accuracy: Accuracy) -> FloatArray:
+    """Return the change of x, y, height and orientation at places, (n_points, 2), by each error of one sd.
+
+    The result is (n_points, 4, n_errors). Raises ParameterError for a place out of the arm's reach.
+    """
+    root = _covariance_factor(np.array(accuracy.covariance))
     place = slopes_mm(geometry, places_mm) @ root
     if not np.isfinite(place).all():
         raise ParameterError("readings", "a place out of the arm's reach", "readings of this arm")
@@ -154,8 +161,8 @@ def _pose_changes_by_errors(geometry: Geometry, places_mm: FloatArray, accuracy:
     return np.concatenate([place, turned], axis=1)
 
 
-def _matrix_root(covariance: FloatArray) -> FloatArray:
-    """Return a matrix, (n, n_errors), whose product with its transpose is the covariance."""
+def _covariance_factor(covariance: FloatArray) -> FloatArray:
+    """Factorise a covariance: return the matrix, (n, n), whose product with its transpose it is."""
     scale = np.sqrt(np.diagonal(covariance))
     scale = np.where(scale > 0, scale, 1.0)  # radians and mm: the numbers differ by orders of magnitude
     values, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
@@ -192,7 +199,7 @@ def _posterior_mean_shifts(
         by_shape.append(_log_likelihood_slopes_by_shape(kind, theta, recording, own, _STEP_SD * sd[columns]))
     weight = np.concatenate(weights)
     weight /= weight.sum()
-    theta, slope, known = (_centred_columns(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
+    theta, slope, known = (_minus_weighted_mean(np.concatenate(each), weight) for each in (thetas, by_error, by_shape))
     root = np.sqrt(weight)[:, None]
     coefficients = np.linalg.lstsq(root * known, root * slope, rcond=None)[0]
     out = np.zeros((len(mean), off.shape[2]))
@@ -200,8 +207,8 @@ def _posterior_mean_shifts(
     return out
 
 
-def _centred_columns(columns: FloatArray, weight: FloatArray) -> FloatArray:
-    """Subtract the weighted mean of each column, (n_samples, n_columns) with weights (n_samples,)."""
+def _minus_weighted_mean(columns: FloatArray, weight: FloatArray) -> FloatArray:
+    """Subtract its weighted mean from each column, (n_samples, n_columns); weights (n_samples,) sum to one."""
     return columns - weight @ columns
 
 
@@ -221,20 +228,24 @@ def _log_likelihood_slopes_by_shape(
 def _log_likelihood_slopes_by_error(
     kind: HypothesisKind, theta: FloatArray, recording: Recording, off: FloatArray, dark: float
 ) -> FloatArray:
-    """Differentiate each hypothesis's log likelihood by each independent error: (n_samples, n_errors)."""
+    """Differentiate each hypothesis's log likelihood by each independent error in its sds: (n_samples, n_errors).
+
+    `off` (n_points, 4, n_errors) are the changes of the pose by each error of one sd, with light in place of height.
+    """
     plan, usable = recording.plan, recording.usable
     predicted = kind.model.predict(theta, plan)
 
-    def slope_by(name: str, step: float) -> FloatArray:
+    def prediction_slope_by(name: str, step: float) -> FloatArray:
+        """Differentiate the predictions by a column of the plan: (n_samples, n_points)."""
         ends = [kind.model.predict(theta, replace(plan, **{name: getattr(plan, name) + way * step})) for way in (1, -1)]
         return np.asarray((ends[0] - ends[1]) / (2 * step))
 
     by_pose = np.stack(
         [
-            slope_by("x_mm", _STEP_MM),
-            slope_by("y_mm", _STEP_MM),
+            prediction_slope_by("x_mm", _STEP_MM),
+            prediction_slope_by("y_mm", _STEP_MM),
             predicted - dark,
-            slope_by("orientation_rad", _STEP_RAD),
+            prediction_slope_by("orientation_rad", _STEP_RAD),
         ],
         axis=-1,
     )

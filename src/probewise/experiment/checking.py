@@ -34,11 +34,14 @@ _FAR = 0.75  # of the shape's diameter: two opposite readings at the edge of a c
 _AT_EDGE = 1.0  # spacings of the grid within which a reading is at the edge
 
 
-def bits_about_name(weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout) -> FloatArray:
-    """Return the expected information of a reading about the name alone: the smaller of two estimates.
+def bits_about_left_out(
+    weight: FloatArray, answers: FloatArray, names: NDArray[np.str_], readout: Readout
+) -> FloatArray:
+    """Return the expected information of a reading about the name of what is left out: the smaller of two estimates.
 
-    Both err upwards. The estimate by a Gaussian for each name does so where a few predictions lie far from the others.
-    The estimate by the cells of the reading does so where a name has few hypotheses.
+    Parameters of the shape and the effect do not count. Both estimates err upwards. The estimate by a Gaussian for each
+    name does so where a few predictions lie far from the others; that by the cells of the reading, where a name has few
+    hypotheses.
 
     Parameters
     ----------
@@ -61,7 +64,10 @@ def bits_about_name(weight: FloatArray, answers: FloatArray, names: NDArray[np.s
 def _bits_by_gaussians(
     weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], noise_sd: float
 ) -> FloatArray:
-    """Return the information from the mean and sd of each name's predictions; `each` marks its hypotheses, (n,)."""
+    """Return bits about the name, (n_designs,), if the predictions of each name are Gaussian.
+
+    `each` holds the mask of each name's hypotheses, (n,).
+    """
     share, mean, sd = [], [], []
     for own in each:
         part = float(weight[own].sum())
@@ -84,7 +90,7 @@ def _bits_by_gaussians(
 
 
 def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolArray], readout: Readout) -> FloatArray:
-    """Return the information from the distribution of the reading over its cells, of all hypotheses and each name's."""
+    """Return bits about the name, (n_designs,): entropy of the reading's cell minus its mean entropy given the name."""
     given = GivenReading(answers, weight, readout, fine=_CELL)
     told = entropy_bits(given.weight_by_cell)
     for own in each:
@@ -94,8 +100,8 @@ def _bits_by_cells(weight: FloatArray, answers: FloatArray, each: Sequence[BoolA
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
-    """The outline of a probable shape within reach, and how far it is from the readings at it.
+class OutlineCoverage:
+    """The part of a probable shape's outline within reach, and its distances from the readings taken near it.
 
     Attributes
     ----------
@@ -117,13 +123,13 @@ class Outline:
 
     @classmethod
     def of(cls, utility_input: UtilityInput, region: Region, readings: Sequence[Reading]) -> Self | None:
-        """Lay out the outline of one region; None if it is neither an ellipse nor a polygon, or out of reach."""
+        """Build from one region and the readings so far; None if it is no ellipse or polygon, or out of reach."""
         if not isinstance(region, EllipseRegion | PolygonRegion):
             return None
         edge = outlines(region)[0]
         grid = utility_input.designs.grid
         spacing = max(grid.width_mm / (grid.n_x - 1), grid.height_mm / (grid.n_y - 1))
-        away = np.linalg.norm(edge[:, None] - places_of_designs(utility_input), axis=2)
+        away = np.linalg.norm(edge[:, None] - available_places_mm(utility_input), axis=2)
         within = away.min(axis=1) <= spacing
         if not within.any():
             return None
@@ -141,16 +147,19 @@ class Outline:
         return np.asarray(np.minimum(np.where(at_edge, apart, np.inf), self.apart_mm[:, None]))
 
     @property
-    def far_side(self) -> int | None:
-        """Design at the part farthest from every reading at the outline; None if none is farther than `_FAR`."""
+    def far_side_design(self) -> int | None:
+        """Index of the available design at the place on the outline farthest from the readings near it.
+
+        None if that place is within `_FAR` of the diameter from a reading.
+        """
         farthest = int(self.apart_mm.argmax())
         return int(self.nearest[farthest]) if self.apart_mm[farthest] > _FAR * self.diameter_mm else None
 
-    def leaves_no_far_side(self, places_mm: FloatArray) -> BoolArray:
-        """Return whether one more reading at each place leaves no far side, (n_places, 2) -> (n_places,)."""
+    def leaves_no_far_side_mask(self, places_mm: FloatArray) -> BoolArray:
+        """Mark the places at which one more reading leaves no far side, (n_places, 2) -> (n_places,)."""
         return np.asarray(self.nearest_reading_distances_if_read_at(places_mm).max(axis=0) <= _FAR * self.diameter_mm)
 
 
-def places_of_designs(utility_input: UtilityInput) -> FloatArray:
-    """Return the places of the available designs, (n, 2)."""
+def available_places_mm(utility_input: UtilityInput) -> FloatArray:
+    """Return x and y of the available designs, (n, 2)."""
     return np.stack([utility_input.plan.x_mm[utility_input.rows], utility_input.plan.y_mm[utility_input.rows]], axis=1)

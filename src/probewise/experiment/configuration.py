@@ -21,7 +21,7 @@ from probewise.experiment.journal import recording_of
 from probewise.experiment.kinds import HypothesisKind, kinds_of
 from probewise.experiment.method import Method, SequentialMonteCarlo
 from probewise.experiment.pace import Pace
-from probewise.experiment.rivals import Rival, rivals_of
+from probewise.experiment.rivals import SensorModelRival, rivals_of
 from probewise.inference.problem import Likelihood, SensorProblem, require_likelihood, require_model
 from probewise.inference.student_t import StudentT
 from probewise.inquiry import (
@@ -52,7 +52,7 @@ MOST_OFF = 0.01
 
 @dataclass(frozen=True)
 class OneScan:
-    """Likelihood of a growing number of readings with one unknown sd: Student-t, one data set (paper, SSF likelihood).
+    """Student-t likelihood of any number of readings that share one unknown noise sd (paper, SSF likelihood).
 
     `sd_floor` and `sd_ceiling` bound the sd, in the sensor's unit; its prior is 1/sigma between them.
     """
@@ -159,7 +159,7 @@ class Experiment:
         require_number("noise_sd", self.noise_sd)
         require_callable("utility", self.utility, "a utility of probewise.inquiry, such as InformationGain()")
         self._require_stopping_rule()
-        self._require_sizes()
+        self._require_counts()
         self._require_heights()
         if self.model.names != self.prior.names:
             raise ParameterError(
@@ -174,7 +174,7 @@ class Experiment:
         _ = self.readout, self.designs  # their constructors check the values
 
     def _require_stopping_rule(self) -> None:
-        """Check target sd and probabilities of the stopping rule, trust, and the p-value of doubt."""
+        """Raise ParameterError unless target sd and probability of the stopping rule, trust and doubt are in range."""
         if not 0 < self.stop_sd_mm < math.inf:
             raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")
         if not 0 < self.stop_probability < 1:
@@ -184,8 +184,8 @@ class Experiment:
         if not 0 <= self.doubt_p < 1:
             raise ParameterError("doubt_p", self.doubt_p, "0 or more, below 1")
 
-    def _require_sizes(self) -> None:
-        """Check the numbers of samples, and of readings chosen together."""
+    def _require_counts(self) -> None:
+        """Raise ParameterError unless the numbers of samples, and of readings chosen together, are allowed."""
         if self.n_samples < 2:
             raise ParameterError("n_samples", self.n_samples, "2 or more: one hypothesis leaves nothing to ask")
         if self.n_particles < max(self.n_samples, 100):
@@ -194,7 +194,7 @@ class Experiment:
             raise ParameterError("batch", self.batch, "1, or more with the utility Finishing() or InformationGain()")
 
     def _require_heights(self) -> None:
-        """Check the heights: positive, and near enough to that of the calibration, which they need."""
+        """Raise ParameterError unless the heights are positive and within a factor of ten of the calibration's."""
         if bool(self.heights_mm) != (self.calibrated_height_mm is not None):
             raise ParameterError(
                 "calibrated_height_mm", self.calibrated_height_mm, "a height where heights_mm may be chosen, else None"
@@ -259,7 +259,7 @@ class Experiment:
 
     @cached_property
     def forecast(self) -> Forecast:
-        """Predictor of readings for many hypotheses at many designs, by tables where possible; built once."""
+        """Predictions of readings for many hypotheses at many designs, by tables where possible; built once."""
         if self.calibrated_height_mm is None:
             return forecast_of(self.model)
         return forecast_of(self.model, highest=max(self.heights_mm) / self.calibrated_height_mm)
@@ -268,13 +268,13 @@ class Experiment:
         """Return the inference problem for these readings."""
         recording = recording_of(readings, instrumentation=self.instrumentation)
         if self.trust < 1:
-            recording = Pace.of(readings).recording_with_run_time(recording)
+            recording = Pace.from_readings(readings).recording_with_run_time(recording)
         return SensorProblem(self.prior, self.forecast.model, self.likelihood, recording)
 
     @cached_property
     def kinds(self) -> tuple[HypothesisKind, ...]:
         """The competing kinds of hypotheses."""
-        rivals: tuple[Rival, ...] = ()
+        rivals: tuple[SensorModelRival, ...] = ()
         if self.trust < 1:
             rivals = rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
         models = self.forecast.model, self.model
@@ -296,7 +296,7 @@ class Experiment:
         """
         likely = max(shapes.values(), default=1.0)
         sure = self.trust == 1 or chance_off < MOST_OFF
-        return widest_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability and sure
+        return largest_sd_mm(self.shape.prior.names, sd) < self.stop_sd_mm and likely >= self.stop_probability and sure
 
     is_known = may_stop
     """The old name of `may_stop`."""
@@ -343,7 +343,7 @@ class Experiment:
         }
 
 
-def widest_mm(names: tuple[str, ...], sd: FloatArray) -> float:
+def largest_sd_mm(names: tuple[str, ...], sd: FloatArray) -> float:
     """Return the largest sd among the parameters in mm (by name); NaN is ignored."""
     return float(np.nanmax([value for name, value in zip(names, sd, strict=True) if name.endswith("_mm")]))
 

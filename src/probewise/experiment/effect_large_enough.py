@@ -26,7 +26,10 @@ _SMALLEST = 4.0
 
 @dataclass(frozen=True, eq=False)
 class EffectLargeEnoughForRun(WrappedEffect[Any]):
-    """An effect whose prior excludes sizes too small to show in a run on a field of this width and height, mm."""
+    """An effect with the prior for a run: no sizes too small to show, change points within the run.
+
+    `field_mm` holds width and height of the field, on which a patch may lie anywhere.
+    """
 
     effect: NamedEffect[Any]
     field_mm: tuple[float, float]
@@ -35,7 +38,7 @@ class EffectLargeEnoughForRun(WrappedEffect[Any]):
 
     @cached_property
     def prior(self) -> Prior:
-        """The effect's prior without its small sizes."""
+        """The effect's prior for a run."""
         own = self.effect.prior
         if isinstance(own, PatchPrior):
             size = HeavyTailedPrior(own.typical, smallest=_SMALLEST)
@@ -43,11 +46,10 @@ class EffectLargeEnoughForRun(WrappedEffect[Any]):
             return Product({own.size: size, "x": x, "y": y, "r": own.radius})
         if not isinstance(own, Product):
             return own
-        return Product(
-            {name: self._marginal_without_small_sizes(name, marginal) for name, marginal in own.marginals.items()}
-        )
+        return Product({name: self._marginal_for_run(name, marginal) for name, marginal in own.marginals.items()})
 
-    def _marginal_without_small_sizes(self, name: str, marginal: Any) -> Any:
+    def _marginal_for_run(self, name: str, marginal: Any) -> Any:
+        """Return a parameter's marginal without small sizes, or that of a change point within the run."""
         if isinstance(marginal, HeavyTailedPrior | LogHeavyTailedPrior):
             return replace(marginal, smallest=_SMALLEST)
         return self.within_run.get(name, marginal)

@@ -56,8 +56,8 @@ def bridged_evidence(
 
     Returns
     -------
-    Bridged
-        The mean of the two halves' estimates; the error is their standard error, or their difference if larger.
+    The mean of the two halves' evidences; its error is their standard error, or half their difference if larger. If too
+    few samples are distinct to fit kernels: the posterior's own evidence, with an error of 2 nats or more.
     """
     n = len(posterior.theta) // 2 * 2
     rows = resampled_rows(posterior.weight, n, rng)
@@ -78,14 +78,14 @@ def bridged_evidence(
         theta = posterior.theta[own]
         at_samples = problem.prior.log_prob(theta) + posterior.log_likelihood[own] - density.log_density(theta)
         n_distinct = len(np.unique(own))
-        found.append(_bridge_estimate(log_ratio, at_samples, n_distinct))
+        found.append(_bridged_log_z_and_error(log_ratio, at_samples, n_distinct))
     (one, e1), (other_z, e2) = found
     log_z = float(logsumexp([one, other_z])) - math.log(2.0)
     error = max(0.5 * math.hypot(e1, e2), 0.5 * abs(one - other_z))
     return BridgedEvidence(log_z, error, n_draws)
 
 
-def importance_resampled(
+def importance_sampled_about_points(
     points: FloatArray, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
 ) -> Weighted:
     """Sample the posterior by importance sampling from kernels about points.
@@ -103,16 +103,19 @@ def importance_resampled(
         If no draw could have given the readings.
     """
     density = _KernelDensity.fitted_to(points, rng=rng)
-    found = weighted_draws(density.draw(n_draws, rng=rng), density.log_density, problem)
+    found = importance_weighted_draws(density.draw(n_draws, rng=rng), density.log_density, problem)
     if found is None:
         raise NotConvergedError("no hypothesis near the samples could have given the readings")
     return found
 
 
-def weighted_draws(
+def importance_weighted_draws(
     draws: FloatArray, log_density: Callable[[FloatArray], FloatArray], problem: SensorProblem, *, least: int = 1
 ) -> Weighted | None:
-    """Weigh draws from a density, (n_draws, n_params), by prior and likelihood; None if fewer than `least` are left."""
+    """Weigh draws from a density, (n_draws, n_params), by prior times likelihood over that density.
+
+    None if fewer than `least` of them are possible.
+    """
     theta = draws[np.isfinite(problem.prior.log_prob(draws))]
     log_likelihood = problem.log_likelihood(theta) if len(theta) else np.empty(0)
     alive = np.isfinite(log_likelihood)
@@ -148,8 +151,8 @@ class _KernelDensity:
         return np.asarray(np.logaddexp(near + math.log1p(-_OF_WIDE), far + math.log(_OF_WIDE)))
 
 
-def _bridge_estimate(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> tuple[float, float]:
-    """Return the log evidence and its error from log ratios of target to density at draws and samples."""
+def _bridged_log_z_and_error(at_draws: FloatArray, at_samples: FloatArray, n_samples: float) -> tuple[float, float]:
+    """Return log evidence and error, from log ratios of prior times likelihood to density at draws and samples."""
     n_draws = len(at_draws)
     if not np.isfinite(at_draws).any():
         return -math.inf, math.inf

@@ -37,7 +37,10 @@ class FittedArm:
             raise ParameterError("geometry", "one without [accuracy]", "one that was fitted to marks")
 
     @classmethod
-    def of(cls, geometry: Geometry, sensor: FittedSensor) -> Self:
-        """Take the levels from a sensor's posterior mean."""
+    def from_geometry_and_sensor(cls, geometry: Geometry, sensor: FittedSensor) -> Self:
+        """Build from a fitted geometry, with the sensor's posterior mean levels."""
         means = sensor.mean()
         return cls(geometry, (means["I_min"], means["I_max"]))
+
+    of = from_geometry_and_sensor
+    """The old name of `from_geometry_and_sensor`."""

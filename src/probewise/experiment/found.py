@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from probewise.experiment.left_out import left_out_of
+from probewise.experiment.left_out import left_out_after_step
 from probewise.experiment.state import Exploration, require_exploration
 from probewise.experiment.stopping_rule import probability_of_length_off
 from probewise.nested.weights import weighted_quantiles
@@ -79,7 +79,7 @@ def result_json(run: Exploration) -> str:
         "known": run.reached,
         "shape": asdict(found_shape(run)),
         "chance_off_12mm": probability_of_length_off(run.experiment, run.posterior, OFF_MM),
-        "left_out": left_out_of(run.last, run.experiment.trust).as_json(),
+        "left_out": left_out_after_step(run.last, run.experiment.trust).as_json(),
         "bits": run.last.bits,
         "seconds": run.seconds,
     }

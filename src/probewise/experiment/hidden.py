@@ -44,7 +44,7 @@ class HiddenShape:
         if values.shape != (len(prior.names),):
             raise ParameterError(called, theta, f"{len(prior.names)} numbers, {', '.join(prior.names)}")
         for parameter, value, low, high in zip(
-            prior.names, values.tolist(), *_parameter_ranges(prior, values), strict=True
+            prior.names, values.tolist(), *_conditional_lows_and_highs(prior, values), strict=True
         ):
             if not low <= value <= high:
                 option = called.partition(" ")[0]
@@ -64,7 +64,7 @@ class HiddenShape:
         return cls(name, members[name], prior.from_unit_cube(rng.random((1, len(prior.names))))[0])
 
     @classmethod
-    def of(
+    def given_or_drawn(
         cls, truth: Truth | None, members: Mapping[str, Shape], field: Field, *, rng: np.random.Generator
     ) -> HiddenShape:
         """Build from given parameters, of the first member or as {shape: parameters}; if `truth` is None, draw a shape.
@@ -80,10 +80,13 @@ class HiddenShape:
         known = {**{name: make(field) for name, make in SHAPES.items()}, **members}
         if isinstance(truth, Mapping) and len(truth) == 1 and set(truth) <= set(known):
             ((name, values),) = truth.items()
-            return cls.from_parameters(name, known[name], _theta_by_name(known[name].prior.names, values))
+            return cls.from_parameters(name, known[name], _theta_in_prior_order(known[name].prior.names, values))
         if isinstance(truth, Mapping) and not set(truth) & set(members[first].prior.names):
             raise ParameterError("truth", truth, f"one shape of {', '.join(known)} with its parameters")
-        return cls.from_parameters(first, members[first], _theta_by_name(members[first].prior.names, truth))
+        return cls.from_parameters(first, members[first], _theta_in_prior_order(members[first].prior.names, truth))
+
+    of = given_or_drawn
+    """The old name of `given_or_drawn`."""
 
     @property
     def journal_entry(self) -> dict[str, str | float]:
@@ -105,19 +108,28 @@ class HiddenShape:
         """Its parameters by name."""
         return dict(zip(self.shape.prior.names, self.theta.tolist(), strict=True))
 
-    def parameters_by_names(self, names: Sequence[str]) -> dict[str, float]:
-        """Return its parameters by the hypothesis' names: in a set, "rectangle.width_mm", with shared centre."""
+    def parameters_by_hypothesis_name(self, names: Sequence[str]) -> dict[str, float]:
+        """Return its parameters under the names of a hypothesis, such as "rectangle.width_mm" in a set of shapes.
+
+        Names of parameters that it does not have are left out.
+        """
         known, prefix = self.parameters, f"{self.name}."
         return {name: known[name.removeprefix(prefix)] for name in names if name.removeprefix(prefix) in known}
 
+    parameters_by_names = parameters_by_hypothesis_name
+    """The old name of `parameters_by_hypothesis_name`."""
 
-def members_of(shape: Shape) -> dict[str, Shape]:
+
+def possible_shapes_by_name(shape: Shape) -> dict[str, Shape]:
     """Return the possible shapes by name: those of a set, or the single one."""
     return dict(shape.shapes) if isinstance(shape, AnyOf) else {type(shape).__name__.lower(): shape}
 
 
-def _theta_by_name(names: Sequence[str], values: object) -> FloatArray:
-    """Convert parameters given by name to the shape's order, (n_params,)."""
+def _theta_in_prior_order(names: Sequence[str], values: object) -> FloatArray:
+    """Convert parameters, given by name or already in order, to an array in the order of `names`, (n_params,).
+
+    Raises ParameterError for other names than these.
+    """
     if not isinstance(values, Mapping):
         return floats(values, "truth")  # type: ignore[arg-type]
     if set(values) != set(names):
@@ -125,8 +137,8 @@ def _theta_by_name(names: Sequence[str], values: object) -> FloatArray:
     return np.array([require_finite_number(f"truth[{name!r}]", values[name]) for name in names])
 
 
-def _parameter_ranges(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the range of each parameter given the others, all (n_params,)."""
+def _conditional_lows_and_highs(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the least and greatest value that the prior allows each parameter, given the others, (n_params,) each."""
     own = np.eye(len(theta), dtype=np.bool_)
     with np.errstate(invalid="ignore"):  # of a ratio of infinities
         given = prior.to_unit_cube(theta[None])

@@ -117,24 +117,25 @@ def recording_of(
     names = sorted({name for reading in readings for name in reading.covariates})
     zeros = np.zeros(n, dtype=np.int64)
     plan = Plan(
-        x_mm=_covariate_column(readings, lambda r: r.pose.x_mm),
-        y_mm=_covariate_column(readings, lambda r: r.pose.y_mm),
-        orientation_rad=_covariate_column(readings, lambda r: r.pose.orientation_rad),
-        time_s=_covariate_column(readings, lambda r: r.time_s),
+        x_mm=_value_per_reading(readings, lambda r: r.pose.x_mm),
+        y_mm=_value_per_reading(readings, lambda r: r.pose.y_mm),
+        orientation_rad=_value_per_reading(readings, lambda r: r.pose.orientation_rad),
+        time_s=_value_per_reading(readings, lambda r: r.time_s),
         scan=zeros,
         scan_names=(PATTERN,),
         pattern=zeros,
         pattern_names=(PATTERN,),
         patterns={} if patterns is None else patterns,
         covariates={
-            name: _covariate_column(readings, lambda r, name=name: r.covariates.get(name, math.nan)) for name in names
+            name: _value_per_reading(readings, lambda r, name=name: r.covariates.get(name, math.nan)) for name in names
         },
         instrumentation=Instrumentation() if instrumentation is None else instrumentation,
     )
-    return Recording(plan, _covariate_column(readings, lambda r: r.value), source)
+    return Recording(plan, _value_per_reading(readings, lambda r: r.value), source)
 
 
-def _covariate_column(readings: Sequence[Reading], value: Any) -> FloatArray:
+def _value_per_reading(readings: Sequence[Reading], value: Any) -> FloatArray:
+    """Collect what the function `value` returns for each reading, (n_points,)."""
     return np.array([value(reading) for reading in readings], dtype=np.float64)
 
 
@@ -165,7 +166,7 @@ def read_journal(path: str | Path) -> Journal:
     n_torn = 0
     if tail:
         head = _part_up_to_reading(tail)
-        saved = _entry_without_summary(path, head, len(entries) + 1)
+        saved = _parse_entry_without_summary(path, head, len(entries) + 1)
         if saved is None:
             head = b""
             notes.append(f"the last line of {path} was torn while it was written and is dropped")
@@ -184,15 +185,15 @@ def _parse_line(path: str | Path, line: bytes, row: int) -> dict[str, Any]:
 
 
 def _part_up_to_reading(tail: bytes) -> bytes:
-    """Return the part of an incomplete line up to its reading, without the summary."""
+    """Return an incomplete line without the posterior summary, of which a part may be written."""
     mark = _SUMMARY_KEY.encode()
     head = tail.split(mark)[0]
     torn = next((k for k in range(len(mark) - 1, 0, -1) if head.endswith(mark[:k])), 0)
     return head[: len(head) - torn]
 
 
-def _entry_without_summary(path: str | Path, head: bytes, index: int) -> Entry | None:
-    """Recover the reading from the first part of a line; None if the reading itself is incomplete."""
+def _parse_entry_without_summary(path: str | Path, head: bytes, index: int) -> Entry | None:
+    """Parse the first part of a line, up to its reading; None if the reading itself is incomplete."""
     # The covariates come last and are an object: only a complete first part becomes valid with one more brace.
     try:
         entry = _parse_entry(path, _parse_line(path, head + b"}", index + 1), index + 1)
@@ -229,7 +230,7 @@ def _parse_summary(line: Mapping[str, Any]) -> PosteriorSummary:
 
 
 def _null_if_nan(value: float) -> float | None:
-    """Convert NaN, a missing reading or covariate, to null, since JSON has no NaN."""
+    """Return None for NaN (a missing reading or covariate) and infinities, which JSON has not; else the value."""
     return value if math.isfinite(value) else None
 
 
@@ -238,7 +239,7 @@ def _nan_if_null(value: float | None) -> float:
 
 
 def _parse_number(value: object) -> float:
-    """Return a JSON number as a float; texts are refused."""
+    """Return a JSON number as a float; raise TypeError for anything else, such as a text or a boolean."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise TypeError(f"{shown(value)} is no number")
     return float(value)

@@ -49,7 +49,7 @@ class LocalKernels:
         scale = np.maximum(points.std(axis=0), np.maximum(_RESOLUTION * np.abs(origin), _SMALLEST))
         rows = rng.permutation(n_samples)[: min(most, (n_samples + 1) // 2)]
         n_near = min(max(_NEIGHBOURS * n_params, 2 * n_samples // len(rows)), n_samples)
-        near = _nearest_points(away / scale, rows, n_near)
+        near = _nearest_rows(away / scale, rows, n_near)
         centre = away[rows]
         spread = away[near] - away[near].mean(axis=1, keepdims=True)
         overall = np.atleast_2d(np.cov(points, rowvar=False))
@@ -60,7 +60,10 @@ class LocalKernels:
 
     @classmethod
     def from_moments(cls, centre: FloatArray, covariance: FloatArray, *, origin: FloatArray | None = None) -> Self:
-        """Build from centres about `origin`, (n_kernels, n_params), and the covariance of each kernel."""
+        """Build from centres, (n_kernels, n_params), and covariances, (n_kernels, n_params, n_params).
+
+        The centres are relative to `origin`; without it, absolute.
+        """
         if origin is None:
             origin = np.asarray(centre.mean(axis=0))
             centre = centre - origin
@@ -70,7 +73,7 @@ class LocalKernels:
         log_det = 2.0 * np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         pull = np.einsum("kij,kj->ki", precision, centre)
         constant = -0.5 * (np.einsum("ki,ki->k", pull, centre) + log_det + n_params * math.log(2 * math.pi))
-        upper = _upper_triangle(n_params)
+        upper = _upper_triangle_indices(n_params)
         product = -np.where(upper[0] == upper[1], 0.5, 1.0) * precision[:, upper[0], upper[1]]
         form = np.concatenate([constant[:, None], pull, product], axis=1).T
         return cls(origin, centre, root, form)
@@ -83,7 +86,7 @@ class LocalKernels:
 
     def log_density(self, points: FloatArray) -> FloatArray:
         """Return the natural log of the density, (n, n_params) -> (n,)."""
-        upper = _upper_triangle(points.shape[1])
+        upper = _upper_triangle_indices(points.shape[1])
         out = np.empty(len(points))
         for start in range(0, len(points), _BLOCK):
             away = points[start : start + _BLOCK] - self.origin
@@ -96,8 +99,8 @@ class LocalKernels:
         return out - math.log(len(self.centre))
 
 
-def _nearest_points(points: FloatArray, rows: IntArray, n: int) -> IntArray:
-    """Return the `n` nearest points to each of some points, themselves included, (n_rows, n)."""
+def _nearest_rows(points: FloatArray, rows: IntArray, n: int) -> IntArray:
+    """Return the indices of the `n` points nearest to each point of `rows`, itself included, (n_rows, n), unordered."""
     if len(points) > _FEW:
         return np.asarray(cKDTree(points).query(points[rows], k=n)[1].reshape(len(rows), n))
     square = (points**2).sum(axis=1)
@@ -106,6 +109,6 @@ def _nearest_points(points: FloatArray, rows: IntArray, n: int) -> IntArray:
 
 
 @cache
-def _upper_triangle(n_params: int) -> tuple[IntArray, IntArray]:
-    """Return the indices of the upper triangle of a matrix."""
+def _upper_triangle_indices(n_params: int) -> tuple[IntArray, IntArray]:
+    """Return row and column indices of the upper triangle of a matrix, diagonal included."""
     return np.triu_indices(n_params)

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray, IntArray, frozen
 from probewise.effects import Estimated
 from probewise.errors import ParameterError
 from probewise.experiment.pace import DescribedEffect
-from probewise.experiment.rivals import Rival
+from probewise.experiment.rivals import SensorModelRival
 from probewise.inference.problem import Likelihood, SensorProblem
 from probewise.inquiry import TabulatedChain
 from probewise.priors import Joint, Prior
@@ -70,9 +70,9 @@ def kinds_of(
     likelihood: Likelihood,
     *,
     trust: float = 1.0,
-    rivals: Sequence[Rival] = (),
+    rivals: Sequence[SensorModelRival] = (),
 ) -> tuple[HypothesisKind, ...]:
-    """Return the kinds of an experiment.
+    """Return the kinds of hypotheses of an experiment: every shape without effects and with each rival.
 
     Parameters
     ----------
@@ -95,16 +95,16 @@ def kinds_of(
     for part in _parts_of_shape(shape, sensor_prior, prior):
         own, log_prior = part.prior, math.log(part.share)
         plain = log_prior + math.log(trust)
-        whole, model = _with_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
+        whole, model = _add_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
         kinds.append(
             HypothesisKind(
-                part.label, "", plain, whole, part.model(model), likelihood, part.to_whole_theta, prior.names
+                part.label, "", plain, whole, part.restrict_model(model), likelihood, part.to_whole_theta, prior.names
             )
         )
         for rival in rivals:
             log_p = log_prior + math.log((1.0 - trust) / (len(ways) * ways[rival.name]))
             if rival.effect is None:
-                model, law = part.model(quick), rival.likelihood or likelihood
+                model, law = part.restrict_model(quick), rival.likelihood or likelihood
                 kinds.append(
                     HypothesisKind(part.label, rival.name, log_p, own, model, law, part.to_whole_theta, prior.names)
                 )
@@ -113,7 +113,7 @@ def kinds_of(
                 raise ParameterError("rivals", rival.name, "none beside a sensor model that is no Chain")
             both = Joint((own, _PrefixedPrior(rival.name, rival.effect.prior)))
             acting = chain.with_effects(rival.effect)
-            model = part.model(TabulatedChain.of(acting, quick) or acting)
+            model = part.restrict_model(TabulatedChain.of(acting, quick) or acting)
             kinds.append(
                 HypothesisKind(
                     part.label,
@@ -130,8 +130,8 @@ def kinds_of(
     return tuple(kinds)
 
 
-def _with_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior, SensorModel]:
-    """Add the effects that a repair estimated to prior and model, as parameters with the priors that it found."""
+def _add_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) -> tuple[Prior, SensorModel]:
+    """Return prior and model with the parameters of effects that a repair estimated; unchanged if there are none."""
     estimated = [e for e in chain.effects if isinstance(e, Estimated)] if isinstance(chain, Chain) else []
     if not estimated or not isinstance(chain, Chain):
         return own, quick
@@ -167,7 +167,7 @@ class _ShapePart:
         full[:, self.columns] = theta[:, : len(self.columns)]
         return np.asarray(full)
 
-    def model(self, whole: SensorModel) -> SensorModel:
+    def restrict_model(self, whole: SensorModel) -> SensorModel:
         """Restrict a model of all parameters, followed by those of an effect, to this shape."""
         if self.number is None:
             return whole

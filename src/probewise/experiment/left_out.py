@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise.calibration import FittedSensor
 from probewise.effects import AmbientStep, GainDrift, OffsetDrift, spoken_name
-from probewise.experiment.pace import parameters_in_seconds_of
+from probewise.experiment.pace import theta_in_seconds_of
 from probewise.experiment.rivals import WITH_CARDS
 from probewise.experiment.state import Step
 
@@ -60,8 +60,8 @@ class LeftOut:
         return {"hypotheses": hypotheses, "credible_set": list(self.credible_set), "sentence": self.sentence}
 
 
-def left_out_of(last: Step, trust: float) -> LeftOut:
-    """Summarise the probabilities after a step, in a run with this prior trust in its sensor."""
+def left_out_after_step(last: Step, trust: float) -> LeftOut:
+    """Summarise the probabilities of left-out effects after a step, in a run with this prior trust in its sensor."""
     shares = sorted(((p, name or CLEAN) for name, p in last.left_out.items()), reverse=True)
     probability = {name: p for p, name in shares}
     wary = {name or CLEAN: p for name, p in last.kinds.with_warier_odds.left_out.items()}
@@ -80,11 +80,11 @@ def left_out_of(last: Step, trust: float) -> LeftOut:
     if p < _NAMED:
         said = f"Something may be left out, most probably {spoken_name(name)} (probability {p:.3g})."
     else:
-        said = f"The sensor model leaves something out: {_sentence_of(last, name)} (probability {p:.3g})."
+        said = f"The sensor model leaves something out: {_effect_sentence(last, name)} (probability {p:.3g})."
     return LeftOut(probability, wary, f"{said}{beside} {aliases}".strip())
 
 
-def _sentence_of(last: Step, name: str) -> str:
+def _effect_sentence(last: Step, name: str) -> str:
     """Describe an effect, with its numbers if it has any."""
     best = max(
         (k for k, kind in enumerate(last.kinds.kinds) if kind.left_out == name), key=lambda k: last.kinds.log_odds[k]
@@ -95,7 +95,7 @@ def _sentence_of(last: Step, name: str) -> str:
     own = slice(-len(kind.effect.prior.names), None)
     posterior = last.kinds.particles[best].weighted
     mean, sd = (
-        parameters_in_seconds_of(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd())
+        theta_in_seconds_of(kind.effect, moment[own], last.pace) for moment in (posterior.mean(), posterior.sd())
     )
     return kind.effect.sentence(mean, sd)
 
@@ -103,7 +103,8 @@ def _sentence_of(last: Step, name: str) -> str:
 def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generator) -> FittedSensor:
     """Return the sensor with the effect that a run found, and with its remaining uncertainty.
 
-    A noise effect, or one in the time of the run, is only mentioned in a note.
+    If no effect has a probability of one half or more, the sensor is returned as it is. A noise effect, one in the time
+    of the run, or one that the sensor has already, is only mentioned in a note.
     """
     name, p = max(last.left_out.items(), key=lambda item: item[1])
     if not name or p < _NAMED:
@@ -115,9 +116,7 @@ def repaired_sensor(sensor: FittedSensor, last: Step, *, rng: np.random.Generato
     if effect is None or name in _OF_THE_RUN or name in sensor.effects:
         return replace(sensor, notes=(*sensor.notes, f"{note}, which the model does not hold"))
     n_own, n = len(effect.prior.names), len(sensor.samples)
-    own = parameters_in_seconds_of(
-        effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace
-    )
+    own = theta_in_seconds_of(effect, last.kinds.particles[best].weighted.samples(n, rng=rng)[:, -n_own:], last.pace)
     return replace(
         sensor,
         names=(*sensor.names, *(f"{name}.{parameter}" for parameter in effect.prior.names)),

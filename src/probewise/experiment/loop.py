@@ -21,8 +21,8 @@ from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
 from probewise.experiment.acquisition import ArmOverGrid, next_poses, predict_and_rate_readings
-from probewise.experiment.arm_error import arm_error, shifts_by_arm_error
-from probewise.experiment.configuration import Experiment, widest_mm
+from probewise.experiment.arm_error import arm_error_in_posterior, draw_arm_error_shifts
+from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.experiment.hidden import HiddenShape
 from probewise.experiment.journal import (
     Journal,
@@ -37,14 +37,14 @@ from probewise.experiment.state import ArmError, Exploration, ExplorationState, 
 from probewise.experiment.stopping_rule import (
     OFF_SDS,
     doubt_message,
-    goodness_of_fit,
     information_nats,
+    p_value_and_worst_reading,
     probability_of_length_off,
     sensor_moments,
-    shape_moments,
+    shape_moments_and_probabilities,
     stop_reason,
 )
-from probewise.experiment.utility_near_end import utility_near_end
+from probewise.experiment.utility_near_end import utility_map_and_must_continue
 from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
@@ -72,7 +72,7 @@ def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generato
     joined = posterior.joined(rng=rng)
     drawn = joined.samples(experiment.n_samples, rng=rng)
     utility_input, utilities = predict_and_rate_readings(experiment, joined, drawn, field, at=None)
-    if utilities.flat:
+    if utilities.is_flat:
         raise ParameterError(
             "utility",
             f"{utilities.highest:g} everywhere",
@@ -110,6 +110,10 @@ def step(
     max_readings
         Limit of readings at which the run ends.
 
+    Returns
+    -------
+    The state after the reading, with the next pose; and the result of this step.
+
     Raises
     ------
     ParameterError
@@ -126,13 +130,13 @@ def step(
         carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
     wary = carried.with_warier_odds
     posterior = wary.joined(rng=rng)
-    if experiment.trust < 1 and _stopping_rule_met(experiment, posterior, None, "", rng)[0]:
+    if experiment.trust < 1 and _may_stop_and_chance_off(experiment, posterior, None, "", rng)[0]:
         carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
         wary = carried.with_warier_odds
         posterior = wary.joined(rng=rng)
-    mean, sd, shapes = shape_moments(experiment, posterior)
+    mean, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     leader = carried.kinds[carried.leader]
-    p_value, worst = goodness_of_fit(
+    p_value, worst = p_value_and_worst_reading(
         experiment, carried.particles[carried.leader].weighted, leader.problem(problem.recording)
     )
     if leader.likelihood is not experiment.likelihood:
@@ -147,20 +151,22 @@ def step(
         if experiment.fitted_arm is None:
             return None
         of = (experiment, experiment.fitted_arm, readings, posterior, wary)
-        return arm_error(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
+        return arm_error_in_posterior(*of, mean=mean, sd=sd, likely_shape=likely, rng=rng)
 
-    arm = error_of_arm() if widest_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
-    known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
+    arm = error_of_arm() if largest_sd_mm(experiment.shape.prior.names, sd) < experiment.stop_sd_mm else None
+    known, off = _may_stop_and_chance_off(experiment, posterior, arm, likely, rng)
     utility_input, utilities = predict_and_rate_readings(
-        experiment, posterior, drawn, field, at=reading, goal=_remaining_goal(experiment, arm)
+        experiment, posterior, drawn, field, at=reading, goal=_goal_less_arm_error(experiment, arm)
     )
     asks = False
     if experiment.trust < 1:
-        utilities, asks = utility_near_end(experiment, wary, utility_input, utilities, readings, rng=rng, known=known)
+        utilities, asks = utility_map_and_must_continue(
+            experiment, wary, utility_input, utilities, readings, rng=rng, known=known
+        )
         asks = asks and (max_readings is None or len(readings) < max_readings)
-    if arm is None and (utilities.flat or (max_readings is not None and len(readings) >= max_readings)):
+    if arm is None and (utilities.is_flat or (max_readings is not None and len(readings) >= max_readings)):
         arm = error_of_arm()
-        known, off = _stopping_rule_met(experiment, posterior, arm, likely, rng)
+        known, off = _may_stop_and_chance_off(experiment, posterior, arm, likely, rng)
     arm_sd = None if arm is None else arm.sd
     reason = stop_reason(experiment, sd, known and not asks, p_value, utilities, len(readings), max_readings, arm_sd)
     pose, *planned = state.planned or next_poses(experiment, utility_input, utilities, rng=rng)
@@ -185,14 +191,14 @@ def step(
         chance_off=off,
         stop_reason=reason,
         notes=notes,
-        pace=Pace.of(readings),
+        pace=Pace.from_readings(readings),
         arm=arm,
     )
     return ExplorationState(readings, carried, pose, tuple(planned)), info
 
 
-def _remaining_goal(experiment: Experiment, arm: ArmError | None) -> Goal | None:
-    """Return the goal that the arm's own error leaves to the readings; None: the experiment's own."""
+def _goal_less_arm_error(experiment: Experiment, arm: ArmError | None) -> Goal | None:
+    """Return the goal for the readings alone: the target variance less the arm's; None: the experiment's own goal."""
     goal = experiment.goal
     if arm is None or goal is None:
         return None
@@ -201,16 +207,16 @@ def _remaining_goal(experiment: Experiment, arm: ArmError | None) -> Goal | None
     return dataclasses.replace(goal, sd=math.sqrt(left)) if left > 0 else None
 
 
-def _stopping_rule_met(
+def _may_stop_and_chance_off(
     experiment: Experiment, posterior: Weighted, arm: ArmError | None, likely: str, rng: np.random.Generator
 ) -> tuple[bool, float]:
-    """Return whether a posterior meets the stopping rule, arm included, and the chance that a length is off."""
-    _, sd, shapes = shape_moments(experiment, posterior)
+    """Return whether a posterior meets the stopping rule, arm included, and the probability that a length is off."""
+    _, sd, shapes = shape_moments_and_probabilities(experiment, posterior)
     if arm is not None:
         sd = np.hypot(sd, arm.sd)
         theta = posterior.theta.copy()
         own = theta[:, experiment.shape_columns]
-        theta[:, experiment.shape_columns] = own + shifts_by_arm_error(experiment, arm.slopes, own, likely, rng=rng)
+        theta[:, experiment.shape_columns] = own + draw_arm_error_shifts(experiment, arm.slopes, own, likely, rng=rng)
         posterior = dataclasses.replace(posterior, theta=theta)
     off = probability_of_length_off(experiment, posterior, OFF_SDS * experiment.stop_sd_mm)
     return experiment.may_stop(sd, shapes, off), off
@@ -280,7 +286,7 @@ def explore(
             )
     start_s = before.readings[-1].time_s if before is not None and before.entries else 0.0
     instrument = instrument_of(instrument, start_s=start_s)
-    return _steps(instrument, experiment, seed, max_readings, path, before, settings)
+    return _yield_steps(instrument, experiment, seed, max_readings, path, before, settings)
 
 
 def run(
@@ -311,7 +317,7 @@ def run(
     return Exploration(experiment, tuple(steps), hidden)
 
 
-def _steps(
+def _yield_steps(
     instrument: Instrument,
     experiment: Experiment,
     seed: np.random.SeedSequence,
@@ -322,8 +328,8 @@ def _steps(
 ) -> Generator[Step, None, None]:
     """Yield the steps: those of the journal `before`, then those of new readings, written to `path`."""
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
-    field = ArmOverGrid.of(instrument, experiment.grid)
-    first = _rng_of(seed, 0)
+    field = ArmOverGrid.from_instrument(instrument, experiment.grid)
+    first = _rng_of_reading(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
     state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
     with _journal_writer(path, before, settings) as writer:
@@ -341,11 +347,11 @@ def _steps(
                 experiment,
                 field,
                 prior_bits=prior_bits,
-                rng=_rng_of(seed, number),
+                rng=_rng_of_reading(seed, number),
                 max_readings=max_readings,
             )
             if writer is not None and (entry is None or entry.summary is None):
-                writer.write_summary(_journal_summary(info, state))
+                writer.write_summary(_posterior_summary(info, state))
             if entry is not None:
                 info = dataclasses.replace(info, replayed=True)
                 # The journal's pose is used, even if another machine's arithmetic would choose another.
@@ -381,12 +387,12 @@ def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
     return seed.spawn(1)[0]
 
 
-def _rng_of(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
+def _rng_of_reading(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
     """Return the generator of one reading, independent of draws for earlier readings."""
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
 
 
-def _journal_summary(info: Step, state: ExplorationState) -> PosteriorSummary:
+def _posterior_summary(info: Step, state: ExplorationState) -> PosteriorSummary:
     known = [(n, float(m), float(s)) for n, m, s in zip(info.names, info.mean, info.sd, strict=True) if np.isfinite(m)]
     known += [(name, mean, sd) for name, (mean, sd) in info.sensor.items()]
     return PosteriorSummary({n: m for n, m, _ in known}, {n: s for n, _, s in known}, info.bits, state.next_pose)

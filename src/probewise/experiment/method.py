@@ -9,7 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.experiment.posterior import Posterior, reconsidered, updated
+from probewise.experiment.posterior import Posterior, updated, with_rivals_sampled_again
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.kernels import KernelMove
@@ -41,13 +41,16 @@ class Method(Protocol):
         ...
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Sample rivals again whose samples may have lost the truth; called before a run with doubt ends."""
+        """Return the posterior with rivals sampled again whose samples may have lost the truth.
+
+        It is called before a run that doubts its sensor ends.
+        """
         ...
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
     ) -> FloatArray:
-        """Draw the few hypotheses that are drawn in figures and used by the paper's utility, (n, n_params).
+        """Draw the few hypotheses that figures show and the paper's utility uses, (n, n_params).
 
         `joined` is the posterior over all kinds of hypotheses, given the recording.
         """
@@ -76,13 +79,16 @@ class SequentialMonteCarlo:
 
     def updated(self, previous: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
         """Reweight, resample and move the samples of every kind by the last reading."""
-        return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._nested_solver(rng))
+        return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng))
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Sample rivals again whose samples may have lost the truth."""
-        return reconsidered(posterior, recording, self.n_particles, rng=rng, from_scratch=self._nested_solver(rng))
+        """Return the posterior with rivals sampled again whose samples may have lost the truth."""
+        return with_rivals_sampled_again(
+            posterior, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng)
+        )
 
-    def _nested_solver(self, rng: np.random.Generator) -> Callable[[SensorProblem], NestedResult]:
+    def _solver_from_scratch(self, rng: np.random.Generator) -> Callable[[SensorProblem], NestedResult]:
+        """Return the function that solves a problem by nested sampling."""
         return lambda problem: nested_sampling_from_scratch(problem, self.n_live, rng)
 
     def drawn(

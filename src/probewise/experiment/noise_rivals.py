@@ -1,4 +1,4 @@
-"""Alternative noise models to the declared one, as rivals with the same mean.
+"""Alternatives to the declared noise model, as rivals that predict the same noise-free readings.
 
 Each likelihood is marginalised over equally weighted nodes of its prior.
 """
@@ -60,11 +60,11 @@ class OutlierLikelihood:
     sizes: FloatArray
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
-        narrow = _log_density_of_each(readings, predicted, self.sd, self.step)
+        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
+        narrow = _log_density_per_reading(readings, predicted, self.sd, self.step)
         nodes = []
         for share, size in zip(self.shares, self.sizes, strict=True):
-            wide = _log_density_if_wide(readings, predicted, self.sd * size, self.step)
+            wide = _quick_log_density_per_reading(readings, predicted, self.sd * size, self.step)
             nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
         return _log_mean_over_nodes(nodes)
 
@@ -73,7 +73,8 @@ class OutlierLikelihood:
 class LostReadingLikelihood:
     """Likelihood with lost readings, independent of the target.
 
-    Lost readings are black, exactly or within the noise, or anything in the range.
+    Lost readings are `black`, exactly or within the noise, or anything between `low` and `high`. `sd` and `step` are
+    those of the declared noise, here and in the likelihoods below.
     """
 
     sd: float
@@ -83,10 +84,10 @@ class LostReadingLikelihood:
     high: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
-        kept = _log_density_of_each(readings, predicted, self.sd, self.step)
-        to_black = _log_density_of_each(readings, np.array([[self.black]]), self.sd, self.step)
-        exactly = _log_density_of_each(readings, np.array([[self.black]]), self.sd * _EXACT, self.step)
+        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
+        kept = _log_density_per_reading(readings, predicted, self.sd, self.step)
+        to_black = _log_density_per_reading(readings, np.array([[self.black]]), self.sd, self.step)
+        exactly = _log_density_per_reading(readings, np.array([[self.black]]), self.sd * _EXACT, self.step)
         low, high = min(self.low - _REACH * self.sd, 0.0), self.high + _REACH * self.sd
         within = (readings >= low) & (readings <= high)
         anywhere = np.where(within, math.log((self.step or 1.0) / (high - low)), -np.inf)
@@ -104,21 +105,24 @@ class CorrelatedLikelihood:
     step: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
         before = np.zeros_like(predicted)
         before[:, 1:] = (readings - predicted)[:, :-1]
-        first = _log_density_of_each(readings[:1], predicted[:, :1], self.sd, self.step)[:, 0]
+        first = _log_density_per_reading(readings[:1], predicted[:, :1], self.sd, self.step)[:, 0]
         nodes = []
         for rho in CorrelatedNoise().prior.from_unit_cube(_NODES)[:, 0].tolist():
             sd = self.sd * math.sqrt(1.0 - rho**2)
-            later = _log_density_of_each(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
+            later = _log_density_per_reading(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
             nodes.append(first + later.sum(axis=1))
         return _log_mean_over_nodes(nodes)
 
 
 @dataclass(frozen=True, eq=False)
 class SignalDependentLikelihood:
-    """Likelihood with noise that grows with the signal, marginalised over the ratio."""
+    """Likelihood with noise that grows with the signal, marginalised over the growth of its variance.
+
+    The signal runs from 0 at `dark` to 1 at `bright`.
+    """
 
     sd: float
     step: float
@@ -126,11 +130,13 @@ class SignalDependentLikelihood:
     bright: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
         seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
         return _log_mean_over_nodes(
             [
-                _log_density_of_each(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(axis=1)
+                _log_density_per_reading(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(
+                    axis=1
+                )
                 for ratio in SignalDependentNoise().prior.from_unit_cube(_NODES)[:, 0].tolist()
             ]
         )
@@ -148,13 +154,14 @@ class FlickerLikelihood:
     amplitudes: tuple[float, ...]
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
         sines = np.cos((np.arange(_PHASES) + 0.5) / _PHASES * np.pi)
         nodes = []
         for amplitude in self.amplitudes:
             sd = math.hypot(self.sd, _PER_PHASE * amplitude)
             phases = [
-                _log_density_if_wide(readings, predicted + amplitude * sine, sd, self.step) for sine in sines.tolist()
+                _quick_log_density_per_reading(readings, predicted + amplitude * sine, sd, self.step)
+                for sine in sines.tolist()
             ]
             nodes.append(_log_mean_over_nodes(phases).sum(axis=1))
         return _log_mean_over_nodes(nodes)
@@ -162,7 +169,7 @@ class FlickerLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class LatticeLikelihood:
-    """Likelihood with coarser rounding than declared; without a lattice, the same as the declared noise.
+    """Likelihood with coarser rounding than declared; if the readings show none, that of the declared noise.
 
     A lattice is the set of multiples of the coarser step. Three different values or more determine it. If the declared
     noise is not rounded, two values that recur determine it too. One value that recurs shows that there is a lattice;
@@ -173,17 +180,17 @@ class LatticeLikelihood:
     step: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Log likelihood of the readings given predictions, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
         least = max(_COARSE * self.sd, 1.5 * self.step)
-        steps, n_free = self._possible_steps(readings)
+        steps, n_free = self._lattice_steps_and_n_free(readings)
         nodes = [
             self._log_prob_if_rounded_to(coarse, n_free, readings, predicted) for coarse in steps if coarse > least
         ]
         if not nodes:
-            return np.asarray(_log_density_of_each(readings, predicted, self.sd, self.step).sum(axis=1))
+            return np.asarray(_log_density_per_reading(readings, predicted, self.sd, self.step).sum(axis=1))
         return _log_mean_over_nodes(nodes)
 
-    def _possible_steps(self, readings: FloatArray) -> tuple[list[float], int]:
+    def _lattice_steps_and_n_free(self, readings: FloatArray) -> tuple[list[float], int]:
         """Return possible steps of a lattice, equally weighted, and how many readings determine it."""
         values = np.unique(readings)
         recur = not self.step and len(values) < len(readings)
@@ -196,9 +203,10 @@ class LatticeLikelihood:
     def _log_prob_if_rounded_to(
         self, coarse: float, n_free: int, readings: FloatArray, predicted: FloatArray
     ) -> FloatArray:
+        """Return the log likelihood under rounding to `coarse`, (n_samples,)."""
         fine = self.step or _EXACT * self.sd
         surprise = (len(readings) - n_free) * math.log(coarse / fine)
-        density = _log_density_of_each(readings, predicted, self.sd, coarse) - math.log(coarse)
+        density = _log_density_per_reading(readings, predicted, self.sd, coarse) - math.log(coarse)
         return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(self.step) if self.step else 0.0))
 
 
@@ -236,7 +244,7 @@ def noise_likelihoods(sd: float, step: float, ends: tuple[float, float]) -> dict
     }
 
 
-def _log_density_of_each(
+def _log_density_per_reading(
     readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, step: float
 ) -> FloatArray:
     """Return the log density of each reading, or log probability of its cell, (n_samples, n_points)."""
@@ -246,12 +254,12 @@ def _log_density_of_each(
     return np.asarray(log_density(level, readings, predicted) + math.log(step))
 
 
-def _log_density_if_wide(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
-    """Return what `_log_density_of_each` does, quickly if the noise is wider than the cell.
+def _quick_log_density_per_reading(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
+    """Return the same as `_log_density_per_reading`, faster if the noise is wider than the cell.
 
     Then the density at the middle of the cell is used, with the variance of a uniform cell added.
     """
     if sd < step:
-        return _log_density_of_each(readings, predicted, sd, step)
+        return _log_density_per_reading(readings, predicted, sd, step)
     wide = math.hypot(sd, step / math.sqrt(12.0))
     return log_gaussian_density(readings, predicted, wide) + (math.log(step) if step else 0.0)

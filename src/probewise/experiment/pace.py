@@ -1,7 +1,7 @@
 """A run's own time, counted in readings, so that priors of drifts do not depend on the speed of the instrument.
 
 Priors of effects in time are set before the speed of the instrument is known. So these effects use the run's own time,
-of eight seconds per reading.
+in which each reading takes eight seconds on average.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Pace:
     each_s: float = EACH_S
 
     @classmethod
-    def of(cls, readings: Sequence[Reading]) -> Self:
-        """Estimate start and pace from readings."""
+    def from_readings(cls, readings: Sequence[Reading]) -> Self:
+        """Take the start and the mean seconds per reading of some readings; the default pace for fewer than two."""
         if len(readings) < 2 or readings[-1].time_s <= readings[0].time_s:
             return cls(readings[0].time_s if readings else 0.0)
         return cls(readings[0].time_s, (readings[-1].time_s - readings[0].time_s) / (len(readings) - 1))
@@ -54,7 +54,7 @@ def run_time_s(plan: Plan) -> FloatArray | None:
 
 
 class DescribedEffect(Effect[Any], Protocol):
-    """An effect that writes the sentence which describes it."""
+    """An effect that can describe itself in a sentence."""
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         """Describe the effect, given posterior means and sds of its parameters."""
@@ -74,7 +74,7 @@ class EffectInRunTime(WrappedEffect[FloatArray]):
         own = run_time_s(plan)
         return np.asarray(self.effect.apply(value, theta, plan if own is None else replace(plan, time_s=own)))
 
-    def parameters_in_seconds(self, theta: FloatArray, pace: Pace) -> FloatArray:
+    def theta_in_seconds(self, theta: FloatArray, pace: Pace) -> FloatArray:
         """Convert parameters from the run's own time to seconds, any shape (..., n_params)."""
         powers = np.array([self.powers.get(name, 0) for name in self.prior.names])
         return np.asarray(theta * (pace.each_s / EACH_S) ** powers)
@@ -86,7 +86,7 @@ class EffectInRunTime(WrappedEffect[FloatArray]):
 
 @dataclass(frozen=True, eq=False)
 class FromRest(WrappedEffect[Any]):
-    """An effect of the direction of motion that spares a run's first reading, before which the arm may have rested."""
+    """An effect of the direction of motion that spares a run's first reading: before it, the arm may have rested."""
 
     effect: DescribedEffect
 
@@ -109,6 +109,6 @@ class FromRest(WrappedEffect[Any]):
         return self.effect.sentence(mean, sd)
 
 
-def parameters_in_seconds_of(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
+def theta_in_seconds_of(effect: Any, theta: FloatArray, pace: Pace) -> FloatArray:
     """Return an effect's parameters in seconds: converted if it is an `EffectInRunTime`, else as they are."""
-    return effect.parameters_in_seconds(theta, pace) if isinstance(effect, EffectInRunTime) else theta
+    return effect.theta_in_seconds(theta, pace) if isinstance(effect, EffectInRunTime) else theta

@@ -204,7 +204,7 @@ def paper_experiment(
         method=NestedSampling(stop=NESTED_STOP[nested_stop]),
     )
     if model != "naive":
-        return pose(chain_of(sensor, scene), student_t_bounds(levels_of(sensor), scale.step))
+        return pose(chain_of(sensor, scene), student_t_likelihood(levels_of(sensor), scale.step))
     if naive is None:
         raise ParameterError(
             "naive", None, 'levels and sds with the model "naive", from repeated readings over black and white'
@@ -213,8 +213,11 @@ def paper_experiment(
     return pose(NaiveSensor(FixedLevels(naive.mu_black, naive.mu_white), scene), naive, doubt_p=0.0)
 
 
-def student_t_bounds(levels: FixedLevels, step: float | None) -> OneScan:
-    """Bound the sd of the likelihood: from rounding, or 0.001 of the levels' difference, to that difference."""
+def student_t_likelihood(levels: FixedLevels, step: float | None) -> OneScan:
+    """Return the Student-t likelihood with its noise sd bounded for these levels.
+
+    The sd is at least that of rounding or 0.001 of the levels' difference, the larger; at most that difference.
+    """
     span = abs(levels.i_max - levels.i_min)
     floor = _least_sd(span, step)
     return OneScan(floor, max(span, 10.0 * floor))

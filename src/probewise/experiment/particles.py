@@ -34,8 +34,8 @@ _LEAST_PART = 0.05  # least share of the samples in a part, to fit kernels
 
 
 @dataclass(frozen=True)
-class MoveEffort:
-    """Effort of an update by one reading.
+class UpdateSettings:
+    """Settings of an update by one reading: how thoroughly samples are resampled and moved.
 
     Attributes
     ----------
@@ -55,9 +55,9 @@ class MoveEffort:
     most_temperatures: float = math.inf
 
 
-THOROUGH = MoveEffort(1.5, MOST_KERNELS)
-STEADY = MoveEffort(1.2, 120, 0.4, 12)
-BRIEF = MoveEffort(1.0, 75, 0.3, 10)
+THOROUGH = UpdateSettings(1.5, MOST_KERNELS)
+STEADY = UpdateSettings(1.2, 120, 0.4, 12)
+BRIEF = UpdateSettings(1.0, 75, 0.3, 10)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ def update(
     *,
     rng: np.random.Generator,
     fall_back: Callable[[], NestedResult] | None = None,
-    effort: MoveEffort | None = None,
+    effort: UpdateSettings | None = None,
 ) -> Particles:
     """Update the samples with the last reading of a problem.
 
@@ -153,13 +153,13 @@ def update(
         Solves the whole problem from scratch, if no sample predicts the reading or they cannot be moved. Without it,
         the samples continue and are marked as strained.
     effort
-        MoveEffort of moves; by default that for a probable kind of hypotheses.
+        How thoroughly samples are moved; by default `THOROUGH`, for a probable kind of hypotheses.
 
     Returns
     -------
     Particles
-        As many samples as before; `run` is the run from scratch, if one was needed. If no sample could have given the
-        reading, the evidence is zero and the samples are unchanged.
+        As many samples as before; `weighted.run` is the run from scratch, if one was needed. If no sample could have
+        given the reading and there is no `fall_back`, the evidence is zero and the samples are unchanged.
     """
     last = _LastReading(problem)
     previous = replace(previous, log_z_limit=previous.log_z_limit + last.perfect_log_likelihood)
@@ -171,11 +171,13 @@ def update(
         return previous
     predicted = problem.model.predict(before.theta, problem.recording.plan)
     strained, ancestor, n_resampled = previous.strained, previous.ancestor, previous.n_resampled
-    if last.misfit_nats(predicted) > _SURPRISED:
+    if last.least_misfit_nats(predicted) > _SURPRISED:
         if fall_back is not None:
             return _particles_from_run(fall_back(), n, last, n, rng)
         strained = True
-    now = _EvaluatedSamples(before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods(predicted))
+    now = _EvaluatedSamples(
+        before.theta, problem.prior.log_prob(before.theta), *last.log_likelihoods_without_and_with(predicted)
+    )
     log_weight, base = before.log_weight, before.log_likelihood
     log_z, variance, n_calls, share = before.log_z, before.log_z_error**2, n, 0.0
     while True:
@@ -233,7 +235,12 @@ def update(
 
 
 def resample_and_move(
-    particles: Particles, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: MoveEffort | None = None
+    particles: Particles,
+    n: int,
+    problem: SensorProblem,
+    *,
+    rng: np.random.Generator,
+    effort: UpdateSettings | None = None,
 ) -> Particles:
     """Resample to another number of samples, and move them apart.
 
@@ -251,22 +258,23 @@ def resample_and_move(
         if len(problem.recording)
         else (start, _MoveCounts(0.0, 0))
     )
-    found = replace(_equally_weighted(moved, had), n_calls=had.n_calls + moves.n_calls)
+    found = replace(_equally_weighted_posterior(moved, had), n_calls=had.n_calls + moves.n_calls)
     return replace(particles, weighted=found, ancestor=particles.ancestor[rows], n_resampled=particles.n_resampled + 1)
 
 
 def particles_from_posterior(
-    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: MoveEffort | None = None
+    found: Weighted, n: int, problem: SensorProblem, *, rng: np.random.Generator, effort: UpdateSettings | None = None
 ) -> Particles:
     """Restart with `n` samples resampled from a posterior and moved apart, with that posterior's evidence."""
     last = _LastReading(problem)
     cloud = last.evaluate_samples(found.theta[resampled_rows(found.weight, n, rng)])
     moved, moves = _move_by_metropolis(cloud, 1.0, last, rng, effort=effort)
-    drawn = replace(_equally_weighted(moved, found), n_calls=found.n_calls + n + moves.n_calls)
+    drawn = replace(_equally_weighted_posterior(moved, found), n_calls=found.n_calls + n + moves.n_calls)
     return Particles(drawn, np.arange(n), found.log_z_error**2)
 
 
-def _equally_weighted(cloud: _EvaluatedSamples, of: Weighted) -> Weighted:
+def _equally_weighted_posterior(cloud: _EvaluatedSamples, of: Weighted) -> Weighted:
+    """Return a posterior with the evidence of `of` and equally weighted samples in place of its own."""
     n = len(cloud.theta)
     even = np.full(n, -math.log(n))
     return replace(
@@ -306,8 +314,8 @@ class _LastReading:
 
     problem: SensorProblem
 
-    def misfit_nats(self, predicted: FloatArray) -> float:
-        """Return by how many nats the best prediction of the last reading falls short of a perfect one.
+    def least_misfit_nats(self, predicted: FloatArray) -> float:
+        """Return by how many nats the best of the predictions falls short of a perfect one at the last reading.
 
         It is 0 if the reading is missing.
         """
@@ -326,7 +334,7 @@ class _LastReading:
             float(checked_log_prob(self.problem.likelihood, reading, reading[None])[0]) if recording.usable[-1] else 0.0
         )
 
-    def log_likelihoods(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def log_likelihoods_without_and_with(self, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return log likelihoods without and with the last reading, (n_samples, n_points) -> (n_samples,) each."""
         usable = self.problem.recording.usable
         earlier = usable.copy()
@@ -347,7 +355,7 @@ class _LastReading:
         possible = np.isfinite(log_prior)
         if possible.any():
             predicted = problem.model.predict(theta[possible], problem.recording.plan)
-            before[possible], after[possible] = self.log_likelihoods(predicted)
+            before[possible], after[possible] = self.log_likelihoods_without_and_with(predicted)
         return _EvaluatedSamples(theta, log_prior, before, after)
 
 
@@ -365,7 +373,7 @@ def _move_by_metropolis(
     last: _LastReading,
     rng: np.random.Generator,
     parts: Sequence[IntArray] | None = None,
-    effort: MoveEffort | None = None,
+    effort: UpdateSettings | None = None,
 ) -> tuple[_EvaluatedSamples, _MoveCounts]:
     """Move equally weighted samples by Metropolis-Hastings steps that leave their density invariant.
 
@@ -451,7 +459,7 @@ def _particles_from_run(
     n_calls: int,
     rng: np.random.Generator,
 ) -> Particles:
-    """Resample as many samples as before from a run, and move them apart."""
+    """Start from a nested sampling run: resample `n` samples from it, and move them apart."""
     found = last.evaluate_samples(run.samples(n, rng=rng))
     moved, moves = _move_by_metropolis(found, 1.0, last, rng)
     even = np.full(n, -math.log(n))

@@ -17,14 +17,14 @@ from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.experiment.evidence import BridgedEvidence, bridged_evidence, importance_resampled
+from probewise.experiment.evidence import BridgedEvidence, bridged_evidence, importance_sampled_about_points
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import (
     BRIEF,
     STEADY,
     THOROUGH,
-    MoveEffort,
     Particles,
+    UpdateSettings,
     particles_from_posterior,
     prior_particles,
     resample_and_move,
@@ -81,7 +81,7 @@ class Posterior:
     @property
     def probability(self) -> FloatArray:
         """Probability of each kind, (n_kinds,), summing to one."""
-        return _normalised_odds(self.log_odds)
+        return _probabilities_of_log_odds(self.log_odds)
 
     @property
     def log_z(self) -> float:
@@ -184,7 +184,7 @@ def updated(
     particles = _update_every_kind(previous, problems, STEADY if doubted else THOROUGH, rng)
     now = replace(previous, particles=tuple(particles))
     if doubted:
-        particles = _with_rivals_sampled_again(now, problems, n_particles, rng)
+        particles = _sample_rivals_again(now, problems, n_particles, rng)
         now = replace(previous, particles=tuple(particles))
         particles = [
             _with_bridged_evidence(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
@@ -208,7 +208,7 @@ def updated(
 
 
 def _update_every_kind(
-    previous: Posterior, problems: list[SensorProblem], usual: MoveEffort, rng: np.random.Generator
+    previous: Posterior, problems: list[SensorProblem], usual: UpdateSettings, rng: np.random.Generator
 ) -> list[Particles]:
     """Update every kind with the last reading, improbable rivals with less effort."""
     return [
@@ -219,7 +219,7 @@ def _update_every_kind(
     ]
 
 
-def reconsidered(
+def with_rivals_sampled_again(
     posterior: Posterior,
     recording: Recording,
     n_particles: int,
@@ -227,24 +227,24 @@ def reconsidered(
     rng: np.random.Generator,
     from_scratch: FromScratch,
 ) -> Posterior:
-    """Return the posterior with rivals sampled again; called before a run ends.
+    """Return the posterior with rivals sampled again and doubtful evidences re-estimated; called before a run ends.
 
     Left as they are: rivals that were sampled in this way before and have followed the readings since, and rivals that
     are hopelessly improbable.
     """
     problems = [kind.problem(recording) for kind in posterior.kinds]
-    now = replace(
-        posterior, particles=tuple(_with_rivals_sampled_again(posterior, problems, n_particles, rng, each=True))
-    )
+    now = replace(posterior, particles=tuple(_sample_rivals_again(posterior, problems, n_particles, rng, each=True)))
     return _reestimated_where_doubtful(
         now, problems, min(n_particles, _MOST_DRAWS), from_scratch, rng, most_off=_OFF_AT_THE_END
     )
 
 
-def _with_rivals_sampled_again(
+def _sample_rivals_again(
     now: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator, *, each: bool = False
 ) -> list[Particles]:
-    """Sample rivals anew from the samples of other kinds, where their own samples may have lost the truth.
+    """Sample rivals anew from samples of other kinds, where their own may have lost the truth.
+
+    Return the particles of every kind.
 
     That can happen after a reading that few of them predict. And a rival whose effect can be negligible cannot be much
     less likely than the plain model: if it seems to be, its samples are in the wrong place. With `each`, every rival is
@@ -278,7 +278,7 @@ def _with_rivals_sampled_again(
         if found.log_z < own.log_z + (_TOLD_APART if found.n_eff < _LEAST_FOUND else -_CARRIED):
             continue
         fresh = particles_from_posterior(found, n, problem, rng=rng, effort=BRIEF)
-        fresh = _as_independent_start(
+        fresh = _independent_start_with_evidence(
             fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS))
         )
         particles[k] = replace(fresh, refitted=found.n_eff >= _WELL_FOUND, strained=found.n_eff < _LEAST_FOUND)
@@ -324,7 +324,9 @@ def _sample_near_other_kinds(
     if own.log_z > hopeless:
         points.append(own.samples(n // 2, rng=rng))
     try:
-        return _SamplesNearOtherKinds(importance_resampled(np.concatenate(points), problem, rng=rng, n_draws=n))
+        return _SamplesNearOtherKinds(
+            importance_sampled_about_points(np.concatenate(points), problem, rng=rng, n_draws=n)
+        )
     except NotConvergedError:
         return _SamplesNearOtherKinds(None)
 
@@ -336,7 +338,7 @@ def _n_samples_of_kind(kind: HypothesisKind, probability: float, n_particles: in
     return n_particles if probability >= _IMPROBABLE else n_particles // _FEWER
 
 
-def _normalised_odds(log_odds: FloatArray) -> FloatArray:
+def _probabilities_of_log_odds(log_odds: FloatArray) -> FloatArray:
     """Return probabilities in the ratios of exp(log_odds), summing to one."""
     share = np.exp(log_odds - log_odds.max())
     return np.asarray(share / share.sum())
@@ -377,18 +379,13 @@ def _kind_with_most_doubtful_evidence(now: Posterior, settled: set[int], most_of
             continue
         odds = log_odds[k] - float(logsumexp(others))
         doubt = 2 * particles.log_z_error + (_CARRIED if particles.n_resampled else 0.0)
-        p, low, high = (_probability_of_log_odds(odds + by) for by in (0.0, -doubt, doubt))
+        p, low, high = (float(expit(odds + by)) for by in (0.0, -doubt, doubt))
         off[k] = max(p - low, high - p)
-        least, most = (_probability_of_log_odds(odds + by) for by in (-_STRAINED, _STRAINED))
+        least, most = (float(expit(odds + by)) for by in (-_STRAINED, _STRAINED))
         may_be_right = most > _LOST and least < 1 - _LOST
         if particles.strained and (p > _HAS_A_SAY if doubted else may_be_right):
             off[k] = 1.0
     return int(off.argmax()) if off.max() > most_off else None
-
-
-def _probability_of_log_odds(odds: float) -> float:
-    """Return the probability with these log odds."""
-    return float(expit(odds))
 
 
 def _reestimate_kind(
@@ -399,7 +396,7 @@ def _reestimate_kind(
     if not particles.strained:
         found = bridged_evidence(had, problem, rng=rng, n_draws=n)
         if abs(found.log_z - had.log_z) < _TOLD_APART:
-            return _as_independent_start(particles, found)
+            return _independent_start_with_evidence(particles, found)
     try:
         run = from_scratch(problem)
     except NotConvergedError:  # no hypothesis of this kind could have given the readings
@@ -407,11 +404,11 @@ def _reestimate_kind(
     points = run.samples(n // 2, rng=rng)
     if particles.log_z > -math.inf:
         points = np.concatenate([points, had.samples(n // 2, rng=rng)])
-    drawn = importance_resampled(points, problem, rng=rng, n_draws=2 * n)
+    drawn = importance_sampled_about_points(points, problem, rng=rng, n_draws=2 * n)
     fresh = particles_from_posterior(
         replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng
     )
-    fresh = _as_independent_start(fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=n))
+    fresh = _independent_start_with_evidence(fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=n))
     return replace(fresh, weighted=replace(fresh.weighted, run=run), refitted=True)
 
 
@@ -419,13 +416,13 @@ def _with_bridged_evidence(particles: Particles, problem: SensorProblem, rng: np
     """Re-estimate the evidence of hurried samples by bridge sampling; the moved samples themselves are valid."""
     found = bridged_evidence(particles.weighted, problem, rng=rng, n_draws=min(2 * len(particles.ancestor), _DRAWS))
     return (
-        replace(_as_independent_start(particles, found), strained=particles.strained)
+        replace(_independent_start_with_evidence(particles, found), strained=particles.strained)
         if math.isfinite(found.log_z)
         else particles
     )
 
 
-def _as_independent_start(particles: Particles, found: BridgedEvidence) -> Particles:
+def _independent_start_with_evidence(particles: Particles, found: BridgedEvidence) -> Particles:
     """Give the samples a new evidence, and make them an independent start: each is its own ancestor."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)

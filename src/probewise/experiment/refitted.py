@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.experiment.evidence import weighted_draws
+from probewise.experiment.evidence import importance_weighted_draws
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.pace import EACH_S, run_time_s
@@ -67,16 +67,16 @@ class Fits:
         )
 
     @cached_property
-    def log_z(self) -> FloatArray:
-        """Log evidence by the Gaussian about each good fit, (n_good,)."""
+    def log_z_by_fit(self) -> FloatArray:
+        """Log evidence of the Gaussian about each good fit (Laplace), (n_good,)."""
         log_det = np.linalg.slogdet(self.precision[self.good_rows])[1]
         log_volume = 0.5 * self.theta.shape[1] * math.log(2 * math.pi) - 0.5 * log_det
         return np.asarray(self.score[self.good_rows] + log_volume)
 
     @property
     def highest_log_z(self) -> float:
-        """Largest of `log_z`; minus infinity if no fit is good."""
-        return float(self.log_z.max(initial=-math.inf))
+        """Largest of `log_z_by_fit`; minus infinity if no fit is good."""
+        return float(self.log_z_by_fit.max(initial=-math.inf))
 
 
 def fit_kind(
@@ -122,14 +122,14 @@ def fit_kind(
     def predict(at: FloatArray) -> FloatArray:
         return np.asarray(problem.model.predict(at, plan)[:, usable])
 
-    def cost_of(residual: FloatArray, at: FloatArray) -> FloatArray:
+    def negative_log_posterior(residual: FloatArray, at: FloatArray) -> FloatArray:
         cost = 0.5 * (residual**2).sum(axis=1) - kind.prior.log_prob(at)
         return np.where(np.isfinite(cost), cost, np.inf)
 
     n, n_params = theta.shape
     ridge = np.eye(n_params) / scale**2
     residual = (readings[usable] - predict(theta)) / noise_sd
-    cost, damping = cost_of(residual, theta), np.full(n, 1.0)
+    cost, damping = negative_log_posterior(residual, theta), np.full(n, 1.0)
     normal = np.broadcast_to(ridge, (n, n_params, n_params)).copy()
     # Half of the starts hold their effect and fit the shape alone, so that fits lie along a ridge, not at its top only.
     of_effect = np.arange(n_params) >= n_shape
@@ -149,7 +149,7 @@ def fit_kind(
         possible = np.isfinite(kind.prior.log_prob(tried))
         tried = np.where(possible[:, None], tried, theta)
         at = (readings[usable] - predict(tried)) / noise_sd
-        found = cost_of(at, tried)
+        found = negative_log_posterior(at, tried)
         better = found < cost
         theta = np.where(better[:, None], tried, theta)
         residual = np.where(better[:, None], at, residual)
@@ -174,8 +174,8 @@ def _prediction_slopes(
 
 
 @dataclass(frozen=True, eq=False)
-class _AnyShape:
-    """A density over a kind's parameters: the shape's prior, and kernels about the effect's parameters of fits.
+class _OpenShapeDensity:
+    """A density over a kind's parameters: the prior for those of the shape, kernels about fits for the effect's.
 
     Where the readings leave the shape open (a step of the light, and no white yet), Gaussians about fits cover little
     of the posterior.
@@ -186,7 +186,7 @@ class _AnyShape:
     of_effect: LocalKernels
 
     @classmethod
-    def about(cls, kind: HypothesisKind, found: Fits, rows: IntArray) -> _AnyShape | None:
+    def about_fits(cls, kind: HypothesisKind, found: Fits, rows: IntArray) -> _OpenShapeDensity | None:
         """Build from some fits of a kind; None for a kind without an effect on the mean."""
         if kind.effect is None:
             return None
@@ -239,16 +239,16 @@ def sampled_about_fits(
     The samples; None where hardly a draw is possible.
     """
     n_params = found.theta.shape[1]
-    best = found.good_rows[np.argsort(-found.log_z)][:_KEPT]
+    best = found.good_rows[np.argsort(-found.log_z_by_fit)][:_KEPT]
     densities: list[_Density] = [
         LocalKernels.from_moments(found.theta[best], _WIDER**2 * _inverse_precision(found.precision[best]))
     ]
-    if (open_shape := _AnyShape.about(kind, found, best)) is not None:
+    if (open_shape := _OpenShapeDensity.about_fits(kind, found, best)) is not None:
         densities.append(open_shape)
-    if with_own and len(rows := _resampled_rows(own, n_params, rng)):
+    if with_own and len(rows := _resampled_rows_if_distinct(own, n_params, rng)):
         densities.append(LocalKernels.fitted_to(own.theta[rows], rng=rng, widened=1.2, most=_KERNELS))
     first = _importance_sampled(own, problem, densities, n_draws // 2, rng)
-    if first is None or not len(rows := _resampled_rows(first, n_params, rng)):
+    if first is None or not len(rows := _resampled_rows_if_distinct(first, n_params, rng)):
         return first
     # A posterior is more curved than the Gaussians about its fits: once more, about what these have found.
     near = LocalKernels.fitted_to(first.theta[rows], rng=rng, most=_KERNELS)
@@ -256,7 +256,7 @@ def sampled_about_fits(
     return _importance_sampled(first, problem, [near, near, far, *densities], n_draws, rng) or first
 
 
-_Density = LocalKernels | _AnyShape
+_Density = LocalKernels | _OpenShapeDensity
 
 
 def _inverse_precision(precision: FloatArray) -> FloatArray:
@@ -266,7 +266,7 @@ def _inverse_precision(precision: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.inv(precision * both + _JITTER * np.eye(precision.shape[1])) * both)
 
 
-def _resampled_rows(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
+def _resampled_rows_if_distinct(posterior: Weighted, n_params: int, rng: np.random.Generator) -> IntArray:
     """Resample rows of a posterior; none where too few are distinct to fit kernels."""
     rows = resampled_rows(posterior.weight, len(posterior.theta), rng)
     return rows if len(np.unique(rows)) > 4 * n_params else rows[:0]
@@ -282,5 +282,5 @@ def _importance_sampled(
     def log_density(points: FloatArray) -> FloatArray:
         return np.asarray(logsumexp([d.log_density(points) for d in densities], axis=0) - math.log(len(densities)))
 
-    found = weighted_draws(draws, log_density, problem, least=_LEAST)
+    found = importance_weighted_draws(draws, log_density, problem, least=_LEAST)
     return None if found is None else replace(found, n_calls=own.n_calls + n)

@@ -2,8 +2,8 @@
 
 The effects and their typical sizes are those of the diagnosis. A run is no recording, though: before its first reading
 nothing is known of places and times. Effects of the pose and of the footprint take their scales from a scan of
-100 mm, as a calibration has it; effects that change with the place, from the whole field; with time, from five minutes.
-What a dozen readings could not show leaves nothing out that matters (`EffectLargeEnoughForRun`).
+100 mm, as a calibration has it; effects that change with the place, from the whole field; with time, from 150 s. What a
+dozen readings could not show leaves nothing out that matters (`EffectLargeEnoughForRun`).
 """
 
 from __future__ import annotations
@@ -71,15 +71,17 @@ OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
 
 
 @dataclass(frozen=True, eq=False)
-class Rival:
-    """One alternative to the sensor model: an effect on the mean, or another noise model."""
+class SensorModelRival:
+    """One alternative to the sensor model: an effect on the noise-free reading, or another likelihood of the noise."""
 
     name: str
     effect: DescribedEffect | None = None
     likelihood: Likelihood | None = None
 
 
-def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float, float]) -> tuple[Rival, ...]:
+def rivals_of(
+    model: SensorModel, likelihood: Likelihood, field_mm: tuple[float, float]
+) -> tuple[SensorModelRival, ...]:
     """Return the rivals of a sensor model.
 
     Parameters
@@ -110,21 +112,21 @@ def rivals_of(model: SensorModel, likelihood: Likelihood, field_mm: tuple[float,
         reach_mm = math.hypot(*field_mm) if wide else _SCAN_MM
         effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _plan_there_and_back(reach_mm)))
         if effect is not None and name not in carried:
-            found += [Rival(name, effect=way) for way in _effects_in_run(effect, field_mm)]
+            found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, field_mm)]
     noise = declared_noise(likelihood)
     if noise is not None:
         laws = noise_likelihoods(*noise, (model.levels.i_min, model.levels.i_max))
-        found += [Rival(name, likelihood=law) for name, law in laws.items()]
+        found += [SensorModelRival(name, likelihood=law) for name, law in laws.items()]
     return tuple(found)
 
 
-def _effects_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[DescribedEffect]:
-    """List the forms in which an effect may act in a run: one that changes with time does so at the run's own pace."""
+def _forms_of_effect_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[DescribedEffect]:
+    """List the forms in which an effect may act in a run; one that changes with time does so in the run's own time."""
     if effect.name in OF_MOTION:
         return [EffectLargeEnoughForRun(effect, field_mm), FromRest(EffectLargeEnoughForRun(effect, field_mm))]
     if effect.name not in _IN_TIME:
         return [EffectLargeEnoughForRun(effect, field_mm)]
-    ways = [effect, GainLoss.with_scales_of(effect)] if isinstance(effect, GainDrift) else [effect]
+    ways = [effect, GainLoss.from_gain_drift(effect)] if isinstance(effect, GainDrift) else [effect]
     return [EffectInRunTime(EffectLargeEnoughForRun(way, field_mm)) for way in ways]
 
 
@@ -133,8 +135,8 @@ class GainLoss(GainDrift):
     """A lamp that starts as calibrated and then changes: signal x (1 + frac (1 - exp(-t / tau_s)))."""
 
     @classmethod
-    def with_scales_of(cls, drift: GainDrift) -> Self:
-        """Take the scales of `drift`, whose signal ends as calibrated."""
+    def from_gain_drift(cls, drift: GainDrift) -> Self:
+        """Build with the scales of the priors of `drift`, whose signal ends as calibrated."""
         return cls(drift.typical, drift.shortest_s, drift.longest_s)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:

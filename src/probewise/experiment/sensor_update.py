@@ -73,7 +73,7 @@ def sensor_prior(sensor: FittedSensor, change: SensorChangeSds | None = None) ->
     """
     change = SensorChangeSds() if change is None else change
     n = sensor.n_gaussians
-    moments = _footprint_moments(footprint_of(sensor.samples[:, : 6 * n], n))
+    moments = _footprint_means_and_sds(footprint_of(sensor.samples[:, : 6 * n], n))
     mean, sd = sensor.mean(), sensor.sd()
     level = change.level * abs(mean["I_max"] - mean["I_min"])
     return Product(
@@ -88,8 +88,8 @@ def sensor_prior(sensor: FittedSensor, change: SensorChangeSds | None = None) ->
     )
 
 
-def _footprint_moments(footprint: Footprint) -> Mapping[str, FloatArray]:
-    """Return mean and sd of whole footprints along the sensor's axes, (n_samples,) each."""
+def _footprint_means_and_sds(footprint: Footprint) -> Mapping[str, FloatArray]:
+    """Return means "u", "v" and sds "sd_u", "sd_v" of footprints along the sensor's axes, mm, (n_samples,) each."""
     weight = footprint.weight[:, 0]
     u, v = (weight * footprint.u_mm[:, 0]).sum(axis=1), (weight * footprint.v_mm[:, 0]).sum(axis=1)
     var_u = (weight * (footprint.var_u[:, 0] + footprint.u_mm[:, 0] ** 2)).sum(axis=1) - u**2

@@ -85,7 +85,7 @@ def bin_width_of(sensor: FittedSensor) -> float:
 
 
 def shape_named(names: Sequence[str], field: Field) -> Shape:
-    """Build the hypothesis: one shape, or a set of shapes.
+    """Build the possible shape from one name, or the set of possible shapes from several.
 
     Raises
     ------
@@ -220,7 +220,7 @@ def experiment_without_inference(
         orientations_rad=orientations_rad,
         repeats=repeats,
         heights_mm=heights_mm,
-        calibrated_height_mm=calibrated_height(sensor, model, heights_mm) if heights_mm else None,
+        calibrated_height_mm=checked_calibrated_height_mm(sensor, model, heights_mm) if heights_mm else None,
     )
 
 
@@ -253,7 +253,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
 
 
 def _marginal_of_samples(samples: FloatArray) -> Marginal:
-    """Return what is known of a parameter, from its posterior samples, (n_samples,); what is positive stays so."""
+    """Return the marginal with mean and sd of samples, (n_samples,): log-normal if all are positive, else normal."""
     if (samples > 0).all():
         log = np.log(samples)
         return LogNormal(float(np.exp(log.mean())), float(log.std()))
@@ -274,8 +274,11 @@ def default_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Ut
     return 1.0 if plain else TRUST
 
 
-def calibrated_height(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:
-    """Return the height of the calibration, which determines the footprint at other heights."""
+def checked_calibrated_height_mm(sensor: FittedSensor, model: Model, heights_mm: tuple[float, ...]) -> float:
+    """Return the height of the calibration, to which the footprint at other heights is scaled.
+
+    Raises ParameterError for the naive model, and for a sensor that does not state it.
+    """
     height_mm = sensor.instrumentation.height_mm
     if model == "naive":
         raise ParameterError("heights_mm", heights_mm, 'none with the model "naive", which knows no height')

@@ -40,7 +40,7 @@ def run_from_place(
     """
     if max_readings < 1:
         raise ParameterError("max_readings", max_readings, "1 or more")
-    field = ArmOverGrid.of(instrument, experiment.grid)
+    field = ArmOverGrid.from_instrument(instrument, experiment.grid)
     prior_bits = prior_entropy(experiment.prior, rng=rng)
     state = dataclasses.replace(begin(experiment, field, rng=rng), next_pose=first, planned=())
     steps: list[Step] = []

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind
 from probewise.arm.instrument import Pose, Reading
-from probewise.experiment.configuration import Experiment, widest_mm
+from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.experiment.hidden import HiddenShape
 from probewise.experiment.journal import recording_of
 from probewise.experiment.pace import Pace
@@ -111,9 +111,12 @@ class Step(ShowsItself):
         return self.posterior.log_z
 
     @property
-    def widest_mm(self) -> float:
+    def largest_sd_mm(self) -> float:
         """Largest posterior sd among the parameters in mm."""
-        return widest_mm(self.names, self.sd)
+        return largest_sd_mm(self.names, self.sd)
+
+    widest_mm = largest_sd_mm
+    """The old name of `largest_sd_mm`."""
 
     @property
     def likely_shape(self) -> str:
@@ -121,12 +124,15 @@ class Step(ShowsItself):
         return max(self.shapes, key=self.shapes.__getitem__, default="")
 
     @property
-    def orientation_and_height(self) -> str:
-        """Orientation and height of the sensor, as far as they were chosen, as text after the place."""
+    def orientation_and_height_text(self) -> str:
+        """Orientation and height of the sensor, if they can be chosen, as text to follow the place; else empty."""
         pose, designs = self.reading.pose, self.map.designs
         turned = f", turned {math.degrees(pose.orientation_rad):.0f}°" if len(designs.orientations_rad) > 1 else ""
         raised = "" if pose.height_mm is None else f", {pose.height_mm:g} mm up"
         return turned + raised
+
+    orientation_and_height = orientation_and_height_text
+    """The old name of `orientation_and_height_text`."""
 
     def summary(self) -> str:
         """Return a one-line summary of the reading and the posterior."""
@@ -140,7 +146,7 @@ class Step(ShowsItself):
             believed = f"{self.likely_shape} (p = {self.shapes[self.likely_shape]:.2f}): {believed}"
         return (
             f"reading {self.number}: {self.reading.value:g} at ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"
-            f"{self.orientation_and_height}; {believed}; {self.bits:.1f} bits"
+            f"{self.orientation_and_height_text}; {believed}; {self.bits:.1f} bits"
         )
 
 
@@ -217,7 +223,7 @@ class Exploration(ShowsItself):
         reason = self.last.stop_reason or "the caller ended it"
         if self.arm is None or self.experiment.fitted_arm is not None:
             return reason
-        widest = widest_mm(self.last.names, self.sd)
+        widest = largest_sd_mm(self.last.names, self.sd)
         return f"{reason}; with the arm's own error the widest is known to {widest:.1f} mm"
 
     @property

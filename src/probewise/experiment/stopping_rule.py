@@ -9,7 +9,7 @@ from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray
 from probewise.arm.instrument import Reading
-from probewise.experiment.configuration import Experiment, widest_mm
+from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.inference.problem import SensorProblem
 from probewise.inquiry import UtilityMap
 from probewise.nested.importance import Weighted
@@ -25,10 +25,13 @@ def information_nats(posterior: Weighted) -> float:
     return float(posterior.weight[some] @ posterior.log_likelihood[some]) - posterior.log_z
 
 
-def shape_moments(experiment: Experiment, posterior: Weighted) -> tuple[FloatArray, FloatArray, dict[str, float]]:
-    """Return mean and sd of the shape's parameters, (n_params,) each, and shape probabilities.
+def shape_moments_and_probabilities(
+    experiment: Experiment, posterior: Weighted
+) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+    """Return mean and sd of the shape's parameters, (n_params,) each, and the probability of each shape by label.
 
-    For a set of shapes: given the most probable shape, with NaN for parameters that it does not have.
+    For a set of shapes, the moments are those given the most probable shape, with NaN for parameters that it does not
+    have. For a single shape the probabilities are empty.
     """
     theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
     if not isinstance(experiment.shape, AnyOf):
@@ -52,7 +55,7 @@ def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_m
     For a set of shapes: from the mean given the most probable shape, and other shapes count as wrong.
     """
     theta, weight = posterior.theta[:, experiment.shape_columns], posterior.weight
-    mean, _, _ = shape_moments(experiment, posterior)
+    mean, _, _ = shape_moments_and_probabilities(experiment, posterior)
     lengths = [
         k for k, name in enumerate(experiment.shape.prior.names) if name.endswith("_mm") and np.isfinite(mean[k])
     ]
@@ -70,8 +73,8 @@ def sensor_moments(experiment: Experiment, posterior: Weighted) -> dict[str, tup
     return {name: (float(mean[k]), float(sd[k])) for k, name in enumerate(experiment.names[:n_sensor])}
 
 
-def goodness_of_fit(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
-    """Return the p-value of the best hypothesis (upper tail of chi-square), and its worst-fitting reading.
+def p_value_and_worst_reading(experiment: Experiment, posterior: Weighted, problem: SensorProblem) -> tuple[float, int]:
+    """Return the p-value of the best hypothesis (upper tail of chi-square), and the index of its worst reading.
 
     It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.
     """
@@ -109,7 +112,7 @@ def stop_reason(
     """
     names = experiment.shape.prior.names
     included = "" if arm_sd is None else ", the arm's own error included"
-    widest = widest_mm(names, sd if arm_sd is None else np.hypot(sd, arm_sd))
+    widest = largest_sd_mm(names, sd if arm_sd is None else np.hypot(sd, arm_sd))
     if known and p_value < experiment.doubt_p:
         return (
             f"no hypothesis explains the readings (p = {p_value:.1g}), so the posterior, narrow as it is "
@@ -117,13 +120,13 @@ def stop_reason(
         )
     if known:
         return f"every length is known to better than {experiment.stop_sd_mm:g} mm{included}"
-    if arm_sd is not None and widest_mm(names, arm_sd) >= experiment.stop_sd_mm > widest_mm(names, sd):
+    if arm_sd is not None and largest_sd_mm(names, arm_sd) >= experiment.stop_sd_mm > largest_sd_mm(names, sd):
         return (
             f"the readings know every length to better than {experiment.stop_sd_mm:g} mm, but the arm's own error "
-            f"leaves {widest_mm(names, arm_sd):.1f} mm, which no reading lowers: `probewise arm fit-geometry` does, "
-            "with more marks or with marks met more closely"
+            f"leaves {largest_sd_mm(names, arm_sd):.1f} mm, which no reading lowers: `probewise arm fit-geometry` "
+            "does, with more marks or with marks met more closely"
         )
-    if utilities.flat:
+    if utilities.is_flat:
         promise = (
             "every reading within reach promises the same"
             if np.count_nonzero(utilities.reachable) > 1

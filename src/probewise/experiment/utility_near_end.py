@@ -14,7 +14,14 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.arm.instrument import Reading
-from probewise.experiment.checking import ENOUGH_BITS, FAR_SIDE, NAMES, Outline, bits_about_name, places_of_designs
+from probewise.experiment.checking import (
+    ENOUGH_BITS,
+    FAR_SIDE,
+    NAMES,
+    OutlineCoverage,
+    available_places_mm,
+    bits_about_left_out,
+)
 from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
@@ -42,7 +49,7 @@ _LABEL = "expected information about the shape and what the sensor leaves out (b
 _ENDS = "probability that a reading there ends the run, plus bits about what the sensor leaves out"
 
 
-def utility_near_end(
+def utility_map_and_must_continue(
     experiment: Experiment,
     posterior: Posterior,
     utility_input: UtilityInput,
@@ -52,10 +59,11 @@ def utility_near_end(
     rng: np.random.Generator,
     known: bool = False,
 ) -> tuple[UtilityMap, bool]:
-    """Return the map of the utility over designs for all kinds, or the given one far from the end.
+    """Return the utility map for all kinds near the end of a run, and whether the run has to continue all the same.
 
-    `known` says whether the posterior meets the stopping rule. The second value returned is True if the run has to take
-    another reading all the same, on the far side of the shape.
+    Far from the end, the given map is returned. `known` says whether the posterior meets the stopping rule; the run
+    continues nevertheless for a reading on the far side of the shape, or for one that is expected to tell enough about
+    what the sensor leaves out.
 
     Candidates are the designs with the largest information, those at edges and centres of probable shapes and on the
     far side, earlier places, and some random ones.
@@ -63,16 +71,20 @@ def utility_near_end(
     goal = utility_input.goal
     if goal is None:
         return utilities, False
-    theta, lengths, weight = _draw_hypotheses(experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng)
+    theta, lengths, weight = _draw_theta_lengths_weights(
+        experiment, posterior, _LEAST_OF_NAMES if known else _LEAST_EACH, rng
+    )
     spread = weight @ (lengths - weight @ lengths) ** 2
     if np.sqrt(spread.max()) > _NEAR * experiment.stop_sd_mm:
         return utilities, False
-    outline = Outline.of(utility_input, experiment.shape.region(_mean_shape(experiment, utility_input)), readings)
-    far = () if outline is None or outline.far_side is None else (outline.far_side,)
+    outline = OutlineCoverage.of(
+        utility_input, experiment.shape.region(_mean_shape_theta(experiment, utility_input)), readings
+    )
+    far = () if outline is None or outline.far_side_design is None else (outline.far_side_design,)
     rows = np.union1d(_candidate_designs(experiment, utility_input, utilities, theta, readings, rng), far).astype(
         np.int64
     )
-    plan = Pace.of(readings).plan_with_run_time(_plan_of_candidates(utility_input, rows, readings[-1]))
+    plan = Pace.from_readings(readings).plan_with_run_time(_plan_of_candidates(utility_input, rows, readings[-1]))
     answers = np.concatenate(
         [kind.model.predict(own, plan)[:, 1::2] for kind, own in zip(posterior.kinds, theta, strict=True) if len(own)]
     )
@@ -80,10 +92,10 @@ def utility_near_end(
     seen = (
         np.ones(len(rows), dtype=np.bool_)
         if outline is None
-        else outline.leaves_no_far_side(places_of_designs(utility_input)[rows])
+        else outline.leaves_no_far_side_mask(available_places_mm(utility_input)[rows])
     )
     if known and not far:
-        utility = bits_about_name(weight, answers, names, utility_input.readout)
+        utility = bits_about_left_out(weight, answers, names, utility_input.readout)
         return _map_of_candidates(utility_input, utilities, rows, utility, NAMES), bool(utility.max() >= ENOUGH_BITS)
     utility = _expected_bits(weight, answers, utility_input)
     if known:
@@ -100,7 +112,7 @@ def utility_near_end(
     if chance.max() < _LEAST_CHANCE:
         return _map_of_candidates(utility_input, utilities, rows, utility, _LABEL), False
     # Another reading has to follow where the far side is left; of two that are alike, the one that tells names counts.
-    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_about_name(
+    ends = chance * np.where(seen[best], 1.0, _UNSEEN) + bits_about_left_out(
         weight, answers[:, best], names, utility_input.readout
     )
     return _map_of_candidates(utility_input, utilities, rows[best], ends, _ENDS), False
@@ -109,23 +121,23 @@ def utility_near_end(
 def _map_of_candidates(
     utility_input: UtilityInput, utilities: UtilityMap, rows: IntArray, utility: FloatArray, label: str
 ) -> UtilityMap:
-    """Return the map of the utility of some available designs, (n,)."""
+    """Return the utility map with these values, (n,), for some available designs and 0 for the others."""
     values = np.zeros(len(utility_input.designs))
     values[utility_input.rows[rows]] = utility
     values.flags.writeable = False
     return UtilityMap(utility_input.designs, values, utilities.reachable, label)
 
 
-def _mean_shape(experiment: Experiment, utility_input: UtilityInput) -> FloatArray:
+def _mean_shape_theta(experiment: Experiment, utility_input: UtilityInput) -> FloatArray:
     """Return the posterior mean of the shape's parameters, (1, n_params)."""
     theta = utility_input.theta[:, experiment.shape_columns]
     return np.asarray((utility_input.weight @ theta)[None] / utility_input.weight.sum())
 
 
-def _draw_hypotheses(
+def _draw_theta_lengths_weights(
     experiment: Experiment, posterior: Posterior, least: int, rng: np.random.Generator
 ) -> tuple[list[FloatArray], FloatArray, FloatArray]:
-    """Draw hypotheses of each kind, with the lengths, (n, n_lengths), and weights, (n,), of all.
+    """Draw hypotheses of each kind; return them kind by kind, then lengths, (n, n_lengths), and weights, (n,), of all.
 
     Improbable kinds are over-represented, since they may differ in the shape.
     """
@@ -152,7 +164,7 @@ def _candidate_designs(
     readings: tuple[Reading, ...],
     rng: np.random.Generator,
 ) -> IntArray:
-    """Choose candidates among the available designs, (n,)."""
+    """Choose the candidates; return their indices among the available designs, (n,), sorted."""
     utility = utilities.values[utility_input.rows]
     n_shape = len(experiment.shape.prior.names)
     start = int(experiment.shape_columns[0])
@@ -173,7 +185,7 @@ def _candidate_designs(
 
 
 def _plan_of_candidates(utility_input: UtilityInput, rows: IntArray, last: Reading) -> Plan:
-    """Return a plan with each candidate as a scan from the arm's current place, with its own direction and time."""
+    """Return a plan of two rows per candidate: the arm's current place, then the candidate, as a scan of their own."""
     n = len(rows)
     at = utility_input.rows[rows]
     taken = utility_input.plan.take(np.repeat(at, 2))
@@ -205,7 +217,7 @@ def _probability_of_meeting_rule(
     given = GivenReading(answers, weight, utility_input.readout)
     out = np.empty(answers.shape[1])
     for design, mass in enumerate(given.weight_by_cell):
-        joint = given.weight_by_hypothesis(design)
+        joint = given.weight_by_hypothesis_and_cell(design)
         ends, off = np.ones(len(mass), dtype=np.bool_), np.zeros(joint.shape, dtype=np.bool_)
         for length in away.T:
             mean = length @ joint / mass

@@ -12,7 +12,7 @@ from probewise.inquiry.any_settings import Inquiry, Predictive, ReadingNoise
 from probewise.inquiry.batch import choose_several
 from probewise.inquiry.bound import Bound, capacity_bits, fewest_readings, target_entropy
 from probewise.inquiry.carded import CardedForecast, cards_of
-from probewise.inquiry.choice import best_places, choose
+from probewise.inquiry.choice import best_places_mask, choose
 from probewise.inquiry.designs import Design, Designs
 from probewise.inquiry.discs import DiscTable
 from probewise.inquiry.finishing import Finishing
@@ -68,7 +68,7 @@ __all__ = [
     "UtilityInput",
     "UtilityMap",
     "WhichShape",
-    "best_places",
+    "best_places_mask",
     "bits_gained",
     "capacity_bits",
     "cards_of",
@@ -103,6 +103,9 @@ TabledChain = TabulatedChain
 
 Prospect = UtilityInput
 """The old name of `UtilityInput`."""
+
+best_places = best_places_mask
+"""The old name of `best_places_mask`."""
 
 tell_apart = information_about_rivals
 """The old name of `information_about_rivals`."""

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.inquiry.choice import choose
-from probewise.inquiry.forecast import resampled_hypotheses
+from probewise.inquiry.forecast import resampled_rows_and_weights
 from probewise.inquiry.utility_input import UtilityInput
 
 _OUTCOMES = 16  # simulated outcomes of the readings chosen so far
@@ -34,26 +34,29 @@ def choose_several(utility_input: UtilityInput, n: int, *, rng: np.random.Genera
 
     Returns
     -------
-    Rows of `utility_input.rows`, in the order in which they were chosen; two may be the same.
+    Indices of designs, from `utility_input.rows`, in the order in which they were chosen; two may be the same.
     """
     if n < 1:
         raise ParameterError("n", n, "1 or more")
     everywhere = np.ones(len(utility_input.rows), dtype=np.bool_)
     chosen = [choose(utility_input.information(utility_input.weight), everywhere, rng=rng)]
-    rows, share = resampled_hypotheses(utility_input.weight, _FEW)
+    rows, share = resampled_rows_and_weights(utility_input.weight, _FEW)
     few = replace(utility_input, theta=utility_input.theta[rows], weight=share / share.sum())
     weights = [few.weight] * _OUTCOMES
     for _ in range(n - 1):
-        weights = _weights_after_simulated(few, chosen[-1], weights, rng)
+        weights = _weights_after_simulated_reading(few, chosen[-1], weights, rng)
         gain = np.mean([few.information(weight) for weight in weights], axis=0)
         chosen.append(choose(gain, everywhere, rng=rng))
     return tuple(int(utility_input.rows[row]) for row in chosen)
 
 
-def _weights_after_simulated(
+def _weights_after_simulated_reading(
     utility_input: UtilityInput, row: int, weights: list[FloatArray], rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Simulate an outcome of design `row` under each posterior, and return the weights of each updated by it."""
+    """Simulate a reading under each posterior, and return the weights of each, updated by its reading.
+
+    `row` is an index into `utility_input.rows`.
+    """
     readout = utility_input.readout
     level = utility_input.forecast.predict(utility_input.theta, utility_input.plan.take(utility_input.rows[[row]]))[
         :, 0

@@ -12,8 +12,8 @@ from probewise.inquiry.designs import Designs
 from probewise.inquiry.forecast import (
     Forecast,
     PredictiveDistributions,
-    nearest_level,
-    resampled_hypotheses,
+    nearest_level_index,
+    resampled_rows_and_weights,
     weight_by_level,
 )
 from probewise.recordings.plan import Plan
@@ -28,7 +28,7 @@ _MOST_ASKED = 400
 
 
 def cards_of(model: SensorModel) -> tuple[Card, ...]:
-    """List the known cards on a model's field."""
+    """Return the known cards on a model's field; empty if its scene has none."""
     scene = getattr(model, "scene", None)
     return scene.cards if isinstance(scene, CardedScene) else ()
 
@@ -55,19 +55,21 @@ class CardedModel:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Predict noise-free readings, (n_samples, n_params) -> (n_samples, n_points)."""
-        covered = self.share_on_cards(Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan)
-        dark, bright = self.black_and_white
+        covered = self.footprint_share_by_card(
+            Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None]), plan
+        )
+        dark, bright = self.black_and_white_readings
         seen = (self.plain.predict(theta, plan) - dark) / (bright - dark)
         return np.asarray(dark + (bright - dark) * mean_albedo_with_cards(seen, self.cards, covered))
 
     @property
-    def black_and_white(self) -> tuple[float, float]:
+    def black_and_white_readings(self) -> tuple[float, float]:
         """Readings over black and over white."""
         levels = self.chain.levels
         assert isinstance(levels, FixedLevels)
         return levels.i_min, levels.i_max
 
-    def share_on_cards(self, poses: Poses, plan: Plan) -> list[FloatArray]:
+    def footprint_share_by_card(self, poses: Poses, plan: Plan) -> list[FloatArray]:
         """Return the share of the footprint on each card, (n_samples or 1, n_points) each."""
         mixture = self.chain.ssf
         assert isinstance(mixture, FixedMixture)
@@ -112,11 +114,13 @@ class CardedForecast:
         """Return the predictive distribution at `rows`: by tables; near cards, by predictions of some hypotheses."""
         base = self.base.predictive(theta, weight, designs, plan, rows, noise_sd)
         there, model = plan.take(rows), self.model
-        covered = model.share_on_cards(Poses(there.x_mm[None], there.y_mm[None], there.orientation_rad[None]), there)
+        covered = model.footprint_share_by_card(
+            Poses(there.x_mm[None], there.y_mm[None], there.orientation_rad[None]), there
+        )
         near = np.flatnonzero(sum(share[0] for share in covered) > _SHOWS)
         if not near.size:
             return base
-        chosen, share = resampled_hypotheses(weight, _MOST_ASKED)
+        chosen, share = resampled_rows_and_weights(weight, _MOST_ASKED)
         answers = model.predict(theta[chosen], there.take(near))
         return _CardedPredictive(base, chosen, share / weight[chosen], answers, near, len(rows))
 
@@ -154,7 +158,7 @@ class _CardedPredictive:
         """Yield the weight of each level at each design: that of the tables, replaced at designs near a card."""
         own, n = weight[self.chosen] * self.stands_for, len(self.near)
         levels = self.levels
-        index = nearest_level(self.answers, levels)
+        index = nearest_level_index(self.answers, levels)
         mass_there = weight_by_level(np.clip(index, 0, len(levels) - 1), own, len(levels))
         number = np.full(self.n_rows, -1)
         number[self.near] = np.arange(n)

@@ -11,8 +11,8 @@ TIE = 1e-9
 """Utilities closer than this count as equal, since they differ by rounding only."""
 
 
-def best_places(utility: FloatArray, reachable: BoolArray) -> BoolArray:
-    """Mark the reachable places within `TIE` of the highest reachable utility, all arrays (n_places,).
+def best_places_mask(utility: FloatArray, reachable: BoolArray) -> BoolArray:
+    """Mark the reachable places within `TIE` of the highest reachable utility; a mask, all arrays (n_places,).
 
     Raises
     ------
@@ -30,4 +30,4 @@ def best_places(utility: FloatArray, reachable: BoolArray) -> BoolArray:
 
 def choose(utility: FloatArray, reachable: BoolArray, *, rng: np.random.Generator) -> int:
     """Draw the index of the next place at random among the best (paper, the machine learning system)."""
-    return int(rng.choice(np.flatnonzero(best_places(utility, reachable))))
+    return int(rng.choice(np.flatnonzero(best_places_mask(utility, reachable))))

@@ -23,7 +23,10 @@ _FAR_MM = 1e5
 
 @dataclass(frozen=True, eq=False)
 class CullingBounds:
-    """Bounding boxes of the hypotheses, `low_mm` and `high_mm`, (n_samples, 2); beyond, the reading is `outside`."""
+    """Bounding box of each hypothesis, corners `low_mm` and `high_mm`, (n_samples, 2).
+
+    A sensor beyond it reads `outside`.
+    """
 
     low_mm: FloatArray
     high_mm: FloatArray
@@ -53,8 +56,8 @@ class CullingBounds:
         outside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
         return cls(frozen(low - reach), frozen(high + reach), float(outside))
 
-    def tiles(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
-        """Yield tiles of the field: rows of the plan, and the hypotheses visible there."""
+    def visible_hypotheses_by_tile(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
+        """Yield, for each tile of the field, its rows of the plan and the indices of the hypotheses visible there."""
         column, row = (np.floor(place / _TILE_MM).astype(np.int64) for place in (plan.x_mm, plan.y_mm))
         tiles = np.unique(np.stack([column, row]), axis=1, return_inverse=True)[1].ravel()
         order = np.argsort(tiles, kind="stable")

@@ -27,7 +27,7 @@ class Design:
 
 @dataclass(frozen=True)
 class Designs:
-    """Combine every place of a grid with every orientation, number of repeats and other setting.
+    """The possible readings: every place of a grid with every orientation, number of repeats and other setting.
 
     Rows run over all places for the first combination, then for the next, so that values reshape to
     (n_combinations, n_places).
@@ -86,10 +86,10 @@ class Designs:
 
     def plan(self, pattern_name: str, *, time_s: float = 0.0) -> Plan:
         """Return a plan with one row per design, (n_designs,) rows, each a scan of its own (see `Grid.plan`)."""
-        return replace(self._layout, pattern_names=(pattern_name,), time_s=np.full(len(self), time_s))
+        return replace(self._plan_without_time, pattern_names=(pattern_name,), time_s=np.full(len(self), time_s))
 
     @cached_property
-    def _layout(self) -> Plan:
+    def _plan_without_time(self) -> Plan:
         """The plan of all designs except time and pattern name, cached because it has thousands of scan names."""
         n_places, n_designs = self.grid.n_places, len(self)
         once = self.grid.plan("")

@@ -62,7 +62,7 @@ class DiscTable:
         """Tabulate a model, or return None if that is not possible.
 
         A table holds a known mixture, or the naive sensor, over a single circle, with no effects but those of
-        `is_uniform_and_known`; it must see no farther than 80 mm.
+        `is_known_uniform_effect`; it must see no farther than 80 mm.
         """
         if not isinstance(model, (Chain, NaiveSensor)) or not isinstance(model.scene, HypothesisScene):
             return None
@@ -74,18 +74,20 @@ class DiscTable:
         low, high = shape.radius_mm
         bends = (1.0 / high, 1.0 / low)
         if isinstance(model, NaiveSensor):
-            dark, bright = _levels_outside_and_inside(model, high)
+            dark, bright = _readings_outside_and_inside(model, high)
             return cls(dark, bright, 0.0, bends, frozen(np.empty((0, 0, 0))))
-        if not isinstance(model.ssf, FixedMixture) or not all(map(is_uniform_and_known, model.effects)):
+        if not isinstance(model.ssf, FixedMixture) or not all(map(is_known_uniform_effect, model.effects)):
             return None
-        dark, bright = _levels_outside_and_inside(model, high)
-        directions = _unit_vectors(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
-        margin = _margin_of_discs(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
+        dark, bright = _readings_outside_and_inside(model, high)
+        directions = _unit_vectors_of_pseudo_angles(np.linspace(0.0, 4.0, _DIRECTIONS, endpoint=False))
+        margin = _disc_margin_mm(model, low, high, directions[:: _DIRECTIONS // 16], dark, bright)
         if margin >= _PROBE_MM:
             return None
         coarse = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _COARSE_MM)) + 1)
         fine = np.linspace(-margin, margin, 2 * int(np.ceil(margin / _FINE_MM)) + 1)
-        asked = np.stack([_levels_around_disc(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)])
+        asked = np.stack(
+            [_readings_around_disc(model, 1.0 / b, directions, coarse) for b in np.linspace(*bends, _BENDS)]
+        )
         asked = np.concatenate([asked, asked[:, :1]], axis=1)
         levels = np.ascontiguousarray(CubicSpline(coarse, asked, axis=-1)(fine))  # so that it is flat for free
         return cls(dark, bright, margin, bends, frozen(levels))
@@ -96,7 +98,7 @@ class DiscTable:
         return NAMES
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings, theta (n_samples, 3) -> (n_samples, n_points), interpolated in all three numbers."""
+        """Predict noise-free readings by interpolation, theta (n_samples, 3) -> (n_samples, n_points)."""
         return self.predict_at(theta, plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
 
     def predict_at(
@@ -125,7 +127,7 @@ class DiscTable:
         angle = _pseudo_angle(cosine * x + sine * y, cosine * y - sine * x)
         n_bends, n_directions, n_distances = self.levels.shape
         bend, along_bend = _index_and_fraction(
-            (1.0 / theta[:, 2] - self.bend_per_mm[0]) * self._entries_per_bend, n_bends
+            (1.0 / theta[:, 2] - self.bend_per_mm[0]) * self._entries_per_curvature, n_bends
         )
         turn, along_turn = _index_and_fraction(angle * ((n_directions - 1) / 4.0), n_directions)
         step, along = _index_and_fraction((distance + self.margin_mm) * self._entries_per_mm, n_distances)
@@ -179,10 +181,10 @@ class DiscTable:
             ring = intervals.places_near_edges()
             level: IntArray = np.full(len(ring.place), bright)  # a place exactly on the edge is inside
             if margin > 0.0:
-                away = _EdgePairs.of(discs, intervals, ring, y_mm, turn[start : start + ROWS].ravel())
+                away = _DiscPlacePairs.of(discs, intervals, ring, y_mm, turn[start : start + ROWS].ravel())
                 level = nearest.reshape(-1)[self._nearest_entry(away)]
             rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
-            mass[rows] = intervals.histogram(weight, ring, level, (dark, bright), n_levels)
+            mass[rows] = intervals.level_histogram(weight, ring, level, (dark, bright), n_levels)
         return mass
 
     mass = level_histogram  # its old name
@@ -195,7 +197,7 @@ class DiscTable:
         off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
         return float(np.abs(distance[off]).max(initial=0.0))
 
-    def _nearest_entry(self, away: _EdgePairs) -> IntArray:
+    def _nearest_entry(self, away: _DiscPlacePairs) -> IntArray:
         """Return the index of the table's nearest entry for pairs of disc and place."""
         _, n_directions, n_distances = self.levels.shape
         step = away.distance_mm + np.float32(self.margin_mm)
@@ -204,7 +206,7 @@ class DiscTable:
         turn = _pseudo_angle(away.x_mm, away.y_mm)
         turn *= (n_directions - 1) / 4.0
         turn += 0.5
-        bend = (1.0 / away.radius_mm - self.bend_per_mm[0]) * self._entries_per_bend + 0.5
+        bend = (1.0 / away.radius_mm - self.bend_per_mm[0]) * self._entries_per_curvature + 0.5
         entry = bend.astype(np.int32) * n_directions
         entry += turn.astype(np.int32)
         entry *= n_distances
@@ -216,11 +218,12 @@ class DiscTable:
         return float((self.levels.shape[2] - 1) / (2.0 * self.margin_mm))
 
     @property
-    def _entries_per_bend(self) -> float:
+    def _entries_per_curvature(self) -> float:
+        """Entries per unit of 1 / radius, 1 / mm."""
         return float((self.levels.shape[0] - 1) / (self.bend_per_mm[1] - self.bend_per_mm[0]))
 
 
-def is_uniform_and_known(effect: AnyEffect) -> bool:
+def is_known_uniform_effect(effect: AnyEffect) -> bool:
     """Return whether an effect is known and changes the footprint equally everywhere, so that a table can hold it."""
     return isinstance(effect, Known) and isinstance(effect.effect, EdgeBlur | Halo)
 
@@ -238,12 +241,18 @@ def _intervals_of_discs(discs: FloatArray, grid: Grid, y_mm: FloatArray, margin_
 
     outer = radius + np.float32(margin_mm)
     inner = np.maximum(radius - np.float32(margin_mm), 0.0)
-    return ScanlineIntervals.of_ends(grid, len(y_mm), row, hypothesis, interval_within(outer), interval_within(inner))
+    return ScanlineIntervals.from_interval_ends(
+        grid, len(y_mm), row, hypothesis, interval_within(outer), interval_within(inner)
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class _EdgePairs:
-    """Pairs of disc and place near its edge, (n_pairs,) each: place relative to the centre in the sensor's frame."""
+class _DiscPlacePairs:
+    """Pairs of a disc and a place near its edge, (n_pairs,) each.
+
+    `x_mm`, `y_mm`: the place relative to the disc's centre, in the sensor's frame. `distance_mm`: from the edge,
+    positive outside.
+    """
 
     x_mm: FloatArray
     y_mm: FloatArray
@@ -277,7 +286,7 @@ def _pseudo_angle(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.asarray(2.0 - np.copysign(1.0 + across, y))
 
 
-def _unit_vectors(pseudo_angle: FloatArray) -> FloatArray:
+def _unit_vectors_of_pseudo_angles(pseudo_angle: FloatArray) -> FloatArray:
     """Convert pseudo-angles to unit vectors, (n, 2)."""
     upper = pseudo_angle <= 2.0
     across = np.where(upper, 1.0 - pseudo_angle, pseudo_angle - 3.0)
@@ -291,10 +300,10 @@ def _index_and_fraction(position: FloatArray, n: int) -> tuple[IntArray, FloatAr
     return below, position - below
 
 
-def _levels_around_disc(
+def _readings_around_disc(
     model: SensorModel, radius_mm: float, directions: FloatArray, distance_mm: FloatArray
 ) -> FloatArray:
-    """Evaluate the model at places about one disc, -> (n_directions, n_distances)."""
+    """Predict readings at distances from the edge of one disc, in each direction, (n_directions, n_distances)."""
     away = (radius_mm + distance_mm)[:, None] * directions[:, None, :]
     places = away.reshape(-1, 2)
     n = len(places)
@@ -304,10 +313,10 @@ def _levels_around_disc(
     return predicted.reshape(len(directions), len(distance_mm))
 
 
-def _levels_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[float, float]:
-    """Return the levels far outside and at the middle of a large disc."""
+def _readings_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[float, float]:
+    """Return the readings far outside and at the middle of a disc; raise ParameterError if they are equal."""
     east = np.array([[1.0, 0.0]])
-    dark, bright = _levels_around_disc(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
+    dark, bright = _readings_around_disc(model, radius_mm, east, np.array([1e4, -radius_mm]))[0]
     if dark == bright:
         raise ParameterError(
             "levels", (dark, bright), "two different levels: a sensor that tells the disc from its surroundings"
@@ -315,14 +324,14 @@ def _levels_outside_and_inside(model: SensorModel, radius_mm: float) -> tuple[fl
     return float(dark), float(bright)
 
 
-def _margin_of_discs(
+def _disc_margin_mm(
     model: SensorModel, low_mm: float, high_mm: float, directions: FloatArray, dark: float, bright: float
 ) -> float:
     """Return the distance from a disc's edge beyond which the reading is constant, for small and large discs alike."""
     margin = _COARSE_MM
     for radius in (low_mm, high_mm):
         distance = np.arange(-min(radius, _PROBE_MM), _PROBE_MM, _COARSE_MM)
-        asked = _levels_around_disc(model, radius, directions, distance)
+        asked = _readings_around_disc(model, radius, directions, distance)
         off = np.abs(asked - np.where(distance <= 0.0, bright, dark)) > _FLAT * abs(bright - dark)
         margin = max(margin, float(np.abs(distance[off.any(axis=0)]).max(initial=0.0)) + _COARSE_MM)
     return margin

@@ -26,7 +26,7 @@ class Ellipses:
     `growth_by_offsets` the increase by the Gaussians' offsets from the centre. `axes` (n_gaussians, 2, n_ellipses) are
     the semi-axes, major and minor. `to_axes_frame` (n_gaussians, 2, 3, n_ellipses) maps a place to their frames: for
     each axis the factor of x, the factor of y, and a constant. `rows_mm` (2, n_ellipses) are the lowest and the
-    highest point.
+    highest point, `share` (n_gaussians,) the weights of the Gaussians.
     """
 
     rows_mm: FloatArray
@@ -118,11 +118,11 @@ class CrossedEllipses:
         for share, slope, base, axes in zip(self.share, self.slope, self.base, self.axes, strict=True):
             p, q = (np.abs(s.take(crossing) * x_mm + b.take(crossing)) for s, b in zip(slope, base, strict=True))
             a, b = (axis.take(crossing) for axis in axes)
-            cosine, sine = _normalised(p / a, q / b)
+            cosine, sine = _scaled_to_unit_length(p / a, q / b)
             bent = a * a - b * b
             u, v = bent / a * (cosine * cosine * cosine), -bent / b * (sine * sine * sine)  # the centre of curvature
             ratio = _vector_length(a * cosine - u, b * sine - v) / np.maximum(_vector_length(p - u, q - v), _TINY)
-            cosine, sine = _normalised(
+            cosine, sine = _scaled_to_unit_length(
                 np.maximum((p - u) * ratio + u, 0.0) / a, np.maximum((q - v) * ratio + v, 0.0) / b
             )
             steep_p, steep_q = cosine / a, sine / b
@@ -137,7 +137,7 @@ def _vector_length(x: FloatArray, y: FloatArray) -> FloatArray:
     return np.sqrt(x * x + y * y)
 
 
-def _normalised(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the vectors (x, y) at unit length."""
+def _scaled_to_unit_length(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Scale the vectors (x, y) to unit length."""
     length = np.maximum(_vector_length(x, y), _TINY)
     return x / length, y / length

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.inquiry.forecast import resampled_hypotheses
+from probewise.inquiry.forecast import resampled_rows_and_weights
 from probewise.inquiry.given_reading import GivenReading
 from probewise.inquiry.utility import InformationGain, Utility
 from probewise.inquiry.utility_input import Goal, UtilityInput
@@ -46,11 +46,11 @@ class Finishing:
         return f"{self.of.label}, or chance to finish"
 
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
-        """Return the utility of every available design, (n,), all by the same measure."""
-        return self.measure(utility_input)[0]
+        """Return the utility of every available design, (n,), all by the same one of the two."""
+        return self.utility_and_label(utility_input)[0]
 
-    def measure(self, utility_input: UtilityInput) -> tuple[FloatArray, str]:
-        """Return the utility of every available design, (n,), and the label of the measure used."""
+    def utility_and_label(self, utility_input: UtilityInput) -> tuple[FloatArray, str]:
+        """Return the utility of every available design, (n,), and the label of the one used."""
         plain = self.of(utility_input)
         if utility_input.goal is None or not _may_end_with_one_more(utility_input, utility_input.goal):
             return plain, self.of.label
@@ -62,6 +62,9 @@ class Finishing:
         out[best] = chance
         return out, "probability that a reading there ends the run"
 
+    measure = utility_and_label
+    """The old name of `utility_and_label`."""
+
 
 def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
     """Return whether one more reading may end the run."""
@@ -72,7 +75,7 @@ def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
 
 def _probability_of_ending(utility_input: UtilityInput, goal: Goal, designs: IntArray) -> FloatArray:
     """Return the probability that a reading at each design reaches the target precision, (n_designs,)."""
-    rows, share = resampled_hypotheses(utility_input.weight, _MOST_ASKED)
+    rows, share = resampled_rows_and_weights(utility_input.weight, _MOST_ASKED)
     away = utility_input.theta[rows][:, goal.columns]
     away = away - share @ away / share.sum()
     answers = utility_input.forecast.predict(

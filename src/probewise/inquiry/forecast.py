@@ -55,7 +55,7 @@ class Forecast(Protocol):
         ...
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings of hypotheses at the rows of a plan, (n_samples, n_params) -> (n_samples, n_points)."""
+        """Predict noise-free readings at the rows of a plan, (n_samples, n_params) -> (n_samples, n_points)."""
         ...
 
     def predictive(
@@ -91,7 +91,7 @@ class DirectForecast:
         self, theta: FloatArray, weight: FloatArray, designs: Designs, plan: Plan, rows: IntArray, noise_sd: float
     ) -> PredictiveDistributions:
         """Return the predictive distribution at `rows`, by predictions of at most 400 resampled hypotheses."""
-        chosen, share = resampled_hypotheses(weight, _MOST_ASKED)
+        chosen, share = resampled_rows_and_weights(weight, _MOST_ASKED)
         answers = predict_where_visible(self.model, theta[chosen], plan.take(rows))
         levels = evenly_spaced_levels(float(answers.min()), float(answers.max()), noise_sd / _PER_SD, most=MOST_LEVELS)
         per_level = 1.0 / (levels[1] - levels[0])
@@ -117,7 +117,7 @@ class _DirectPredictive:
             yield at, weight_by_level(self.index[:, at], own, n_levels)
 
 
-def nearest_level(answers: FloatArray, levels: FloatArray) -> IntArray:
+def nearest_level_index(answers: FloatArray, levels: FloatArray) -> IntArray:
     """Return the index of the nearest of evenly spaced levels to each prediction, of the same shape."""
     return np.asarray(np.rint((answers - levels[0]) / (levels[1] - levels[0])).astype(np.int64))
 
@@ -131,7 +131,7 @@ def weight_by_level(index: IntArray, weight: FloatArray, n_levels: int) -> Float
 
 
 def rows_by_combination(rows: IntArray, n_places: int) -> Iterator[tuple[int, IntArray, IntArray]]:
-    """Split rows of designs, (n,), by combination: its number, indices of its rows, and their places."""
+    """Split rows of designs, (n,), by combination; yield its number, the indices into `rows`, and the places there."""
     combination, place = np.divmod(rows, n_places)
     for number in np.unique(combination).tolist():
         at = np.flatnonzero(combination == number)
@@ -143,7 +143,7 @@ def predict_where_visible(model: SensorModel, theta: FloatArray, plan: Plan) -> 
     bounds = CullingBounds.of(model, theta, plan)
     if bounds is not None:
         out = np.full((len(theta), len(plan)), bounds.outside)
-        for rows, shown in bounds.tiles(plan):
+        for rows, shown in bounds.visible_hypotheses_by_tile(plan):
             if shown.size:
                 out[np.ix_(shown, rows)] = model.predict(theta[shown], plan.take(rows))
         return out
@@ -161,8 +161,11 @@ def evenly_spaced_levels(low: float, high: float, spacing: float, *, most: int |
     return np.linspace(low, max(high, low + spacing), n if most is None else min(n, most))
 
 
-def resampled_hypotheses(weight: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
-    """Return indices of at most `n` hypotheses and their weights, by systematic resampling with a fixed start."""
+def resampled_rows_and_weights(weight: FloatArray, n: int) -> tuple[IntArray, FloatArray]:
+    """Resample at most `n` hypotheses systematically, with a fixed start; return their indices and new weights.
+
+    The new weights have the same sum as all.
+    """
     some = np.flatnonzero(weight > 0)
     if len(some) <= n:
         return some, weight[some]

@@ -1,4 +1,4 @@
-"""Posterior means given each possible value of a reading, for many designs at once."""
+"""Posterior weights given each possible value of a reading, for many designs at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.inquiry.forecast import MOST_LEVELS, evenly_spaced_levels, nearest_level, weight_by_level
+from probewise.inquiry.forecast import MOST_LEVELS, evenly_spaced_levels, nearest_level_index, weight_by_level
 from probewise.inquiry.readout import Readout
 
 _PER_SD = 2.0  # levels of the predicted reading per noise sd
@@ -15,7 +15,7 @@ _LEAST = 1e-12
 
 
 class GivenReading:
-    """Sums over hypotheses, weighted by their probability of each cell of a reading.
+    """Weights of hypotheses times the probability of each cell of a reading, and sums over hypotheses.
 
     Hypotheses with nearly equal predictions are summed first, so that the noise is applied to some hundred levels
     instead of every hypothesis.
@@ -36,7 +36,7 @@ class GivenReading:
         levels = evenly_spaced_levels(
             float(answers.min()), float(answers.max()), readout.noise_sd / _PER_SD, most=MOST_LEVELS
         )
-        self._index = nearest_level(answers, levels)
+        self._index = nearest_level_index(answers, levels)
         self._weight = weight
         self._chance = readout.probability(levels, fine=fine, most=MOST_LEVELS)
 
@@ -49,6 +49,6 @@ class GivenReading:
         """Sum weight times value, each with the probability of the cell: values (n,) -> (n_designs, n_cells)."""
         return np.asarray(weight_by_level(self._index, self._weight * values, len(self._chance)) @ self._chance)
 
-    def weight_by_hypothesis(self, design: int) -> FloatArray:
-        """Weight of each hypothesis in each cell of one design, (n, n_cells)."""
+    def weight_by_hypothesis_and_cell(self, design: int) -> FloatArray:
+        """Return weight times probability of each cell for each hypothesis at one design, (n, n_cells)."""
         return np.asarray(self._weight[:, None] * self._chance[self._index[:, design]])

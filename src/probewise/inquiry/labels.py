@@ -1,4 +1,4 @@
-"""Labels of hypotheses: a measurement may target the information on a label only."""
+"""Labels of hypotheses: classes about which a reading may be chosen to inform."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ Interval = tuple[FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class PlacesNearEdges:
-    """Pairs of a span and a place near the edge, (n_pairs,): indices of span, column, and place."""
+    """Pairs of an interval and a place near the edge, (n_pairs,) each: indices of interval, column, and place."""
 
     interval: IntArray
     column: IntArray
@@ -29,7 +29,7 @@ class PlacesNearEdges:
 
 @dataclass(frozen=True, eq=False)
 class ScanlineIntervals:
-    """Intersections of shapes with some rows of a grid, (n_spans,) each: row, shape, and columns.
+    """Intersections of shapes with some rows of a grid, (n_intervals,) each: row, shape, and columns.
 
     The row is counted from the first of them. Columns from `first` to `last` are in the shape or near its edge,
     those from `inner_first` to `inner_last` deep inside; if there are none, these are `last` + 1 and `last`.
@@ -45,15 +45,15 @@ class ScanlineIntervals:
     inner_last: IntArray
 
     @classmethod
-    def of_ends(
+    def from_interval_ends(
         cls, grid: Grid, n_rows: int, row: IntArray, hypothesis: IntArray, outer: Interval, inner: Interval
     ) -> Self:
-        """Find the columns of intervals, (n_spans,) each: in the shape or near its edge, and deep inside.
+        """Build from ends of intervals along rows, (n_intervals,) each: in the shape or near its edge, and deep inside.
 
         Parameters
         ----------
         grid, n_rows, row, hypothesis
-            The grid, the number of its rows used, and the row and the shape of each span.
+            The grid, the number of its rows used, and the row and the shape of each interval.
         outer, inner
             Intervals along the row, in single precision, which resolves a ten-thousandth of a millimetre.
         """
@@ -71,7 +71,7 @@ class ScanlineIntervals:
         return cls(grid, n_rows, row, hypothesis, first, last, inner_first, inner_last)
 
     def places_near_edges(self) -> PlacesNearEdges:
-        """Pairs of span and place in the ring about the edge: left of the interior, then right of it."""
+        """Pair intervals with their places in the ring about the edge: left of the interior, then right of it."""
         n = len(self.row)
         count = np.concatenate([self.inner_first - self.first, self.last - self.inner_last])
         begin = np.concatenate([self.first, self.inner_last + 1])
@@ -82,7 +82,7 @@ class ScanlineIntervals:
         interval[int(count[:n].sum()) :] -= n
         return PlacesNearEdges(interval, column, column + to_int32(self.row * self.grid.n_x)[interval])
 
-    def histogram(
+    def level_histogram(
         self, weight: FloatArray, ring: PlacesNearEdges, level: IntArray, ends: tuple[int, int], n_levels: int
     ) -> FloatArray:
         """Return the weighted histogram of levels at every place of the rows.

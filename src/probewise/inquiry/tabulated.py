@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.inquiry.carded import CardedForecast, cards_of
 from probewise.inquiry.designs import Designs
-from probewise.inquiry.discs import DiscTable, is_uniform_and_known
+from probewise.inquiry.discs import DiscTable, is_known_uniform_effect
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
     DirectForecast,
@@ -131,7 +131,7 @@ class TabulatedForecast:
             shapes = self._shapes_under_sensor(theta, *way)
             if shapes is None or ways.shape[1] > _MOST_WAYS:
                 return predict_where_visible(self.model, theta, plan)
-            dark, bright = self._levels_at(way[1])
+            dark, bright = self._dark_and_bright_at(way[1])
             out[:, rows] = dark + (bright - dark) * shapes.footprint_share(plan.x_mm[rows], plan.y_mm[rows])
         return out
 
@@ -152,7 +152,7 @@ class TabulatedForecast:
             shapes = self._shapes_under_sensor(theta, turn, height)
             if shapes is None:
                 return asked()
-            shapes_at[turn, height] = _ShapesAt(shapes, *self._levels_at(height))
+            shapes_at[turn, height] = _ShapesAt(shapes, *self._dark_and_bright_at(height))
         low = min(min(each.dark, each.bright) for each in shapes_at.values())
         high = max(max(each.dark, each.bright) for each in shapes_at.values())
         levels = evenly_spaced_levels(low, high, noise_sd / _PER_SD, most=MOST_LEVELS)
@@ -167,8 +167,11 @@ class TabulatedForecast:
         )
         return TabulatedShapes.of(self.shape.region(theta), seen)
 
-    def _levels_at(self, height: float) -> tuple[float, float]:
-        """Return the readings outside and deep inside a shape; light falls with the square of the height."""
+    def _dark_and_bright_at(self, height: float) -> tuple[float, float]:
+        """Return the readings outside and deep inside a shape at `height` times that of the calibration.
+
+        Light falls with the square of the height.
+        """
         return self.levels.i_min, self.levels.i_min + (self.levels.i_max - self.levels.i_min) / height**2
 
     def _is_faithful(self, highest: float) -> bool:
@@ -176,7 +179,7 @@ class TabulatedForecast:
         prior, rng = self.shape.prior, np.random.default_rng(0)
         theta = prior.from_unit_cube(rng.random((_N_CHECKED, len(prior.names))))
         shapes = self._shapes_under_sensor(theta, 0.0, highest)
-        dark, bright = self._levels_at(highest)
+        dark, bright = self._dark_and_bright_at(highest)
         if shapes is None or dark == bright:
             return False
         reach = _REACH * highest * float(np.sqrt(np.linalg.eigvalsh(self.mixture.covs_mm2).max()))
@@ -236,7 +239,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
 
 def _tabulated_chain(model: Chain) -> TabulatedChain | None:
     """Return a chain with effects over the table of the chain without those that no table holds; None if impossible."""
-    table = DiscTable.of(replace(model, effects=tuple(filter(is_uniform_and_known, model.effects))))
+    table = DiscTable.of(replace(model, effects=tuple(filter(is_known_uniform_effect, model.effects))))
     return None if table is None else TabulatedChain.of(model, table)
 
 

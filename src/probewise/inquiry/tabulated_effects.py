@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.inquiry.carded import CardedModel
-from probewise.inquiry.discs import DiscTable, is_uniform_and_known
+from probewise.inquiry.discs import DiscTable, is_known_uniform_effect
 from probewise.recordings.plan import Plan
 from probewise.scene.cards import mean_albedo_with_cards
 from probewise.sensor import Chain
@@ -18,7 +18,11 @@ from probewise.sensor.stages import SensorModel, Stage, View
 
 @dataclass(frozen=True, eq=False)
 class TabulatedChain:
-    """A chain over one disc. No effect changes the disc; effects on the footprint must be those of the table."""
+    """A chain over one disc, with the response from a table and the other effects as they are.
+
+    No effect may change the disc itself, and effects on the footprint must be those of the table. `cards`: the model
+    with known cards, if there are any.
+    """
 
     chain: Chain
     table: DiscTable
@@ -34,7 +38,7 @@ class TabulatedChain:
         if not isinstance(table, DiscTable) or chain.names[:3] != table.names:
             return None
         seen = (effect for effect in chain.effects if effect.stage in (Stage.SCENE, Stage.FOOTPRINT))
-        if not all(map(is_uniform_and_known, seen)):
+        if not all(map(is_known_uniform_effect, seen)):
             return None
         return cls(chain, table, cards)
 
@@ -49,5 +53,5 @@ class TabulatedChain:
         level = table.predict_at(disc, poses.x_mm, poses.y_mm, poses.orientation_rad)
         seen = (level - table.dark) / (table.bright - table.dark)
         if self.cards is not None:
-            seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.share_on_cards(poses, plan))
+            seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.footprint_share_by_card(poses, plan))
         return self.chain.readings_of_view(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)

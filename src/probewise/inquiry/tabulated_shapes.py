@@ -60,8 +60,8 @@ class TabulatedShapes:
     def of(cls, region: Region, footprint: FixedMixture) -> Self | None:
         """Build from the regions of hypotheses; None unless all are white ellipses or convex polygons."""
         parts = []
-        for rows, part in _regions_by_kind(region):
-            kind = _shapes_of_region(part, footprint)
+        for rows, part in _rows_and_regions_by_kind(region):
+            kind = _shapes_of_one_kind(part, footprint)
             if kind is None:
                 return None
             parts.append((rows, kind))
@@ -114,25 +114,27 @@ class TabulatedShapes:
                 y_mm = to_single_precision(grid.y_mm[start : start + ROWS])
                 row, which = np.nonzero((y_mm[:, None] >= bottom) & (y_mm[:, None] <= top) & (own > 0))
                 crossed = kind.crossed_by_rows(which, y_mm[row])
-                intervals = ScanlineIntervals.of_ends(
+                intervals = ScanlineIntervals.from_interval_ends(
                     grid, len(y_mm), row, which, crossed.interval_within(-reach), crossed.interval_within(reach)
                 )
                 ring = intervals.places_near_edges()
                 seen = crossed.footprint_share(ring.interval, to_single_precision(grid.x_mm)[ring.column])
                 level = to_int32(lowest + per_share * seen + 0.5)
                 block = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
-                mass[block] += intervals.histogram(own, ring, level, ends, n_levels)
+                mass[block] += intervals.level_histogram(own, ring, level, ends, n_levels)
         return mass
 
 
-def _regions_by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
+def _rows_and_regions_by_kind(region: Region) -> Iterator[tuple[IntArray, Region]]:
+    """Yield the regions of each kind, with the indices of their hypotheses."""
     if isinstance(region, MixtureOfRegions):
         yield from region.rows_and_regions()
     else:
         yield np.arange(region.n_regions), region
 
 
-def _shapes_of_region(region: Region, footprint: FixedMixture) -> _ShapesOfOneKind | None:
+def _shapes_of_one_kind(region: Region, footprint: FixedMixture) -> _ShapesOfOneKind | None:
+    """Build the geometry of regions under a footprint; None unless they are white ellipses or convex polygons."""
     if not isinstance(region, (EllipseRegion, PolygonRegion)) or (region.outside, region.inside) != (0.0, 1.0):
         return None
     return (

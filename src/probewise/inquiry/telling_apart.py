@@ -12,7 +12,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.inquiry.forecast import (
     MOST_LEVELS,
     evenly_spaced_levels,
-    nearest_level,
+    nearest_level_index,
     predict_where_visible,
     weight_by_level,
 )
@@ -78,7 +78,7 @@ def information_about_rivals(rivals: Sequence[Rival], plan: Plan, readout: Reado
         mixed = np.zeros((len(bits[block]), chance.shape[1]))
         for rival, answer in zip(rivals, answers, strict=True):
             even = np.full(len(answer), 1.0 / len(answer))
-            own = weight_by_level(nearest_level(answer[:, block], levels), even, len(levels)) @ chance
+            own = weight_by_level(nearest_level_index(answer[:, block], levels), even, len(levels)) @ chance
             share = rival.probability / total
             mixed += share * own
             bits[block] -= share * entropy_bits(own)

@@ -31,19 +31,20 @@ def mass_within_corner(first: FloatArray, second: FloatArray, opening: IntArray)
 
     `opening` numbers the correlation r of the two distances: floor((arcsin(r) / pi + 1 / 2) N_OPENINGS).
     """
-    index = opening * (_N * _N) + _index_of(second) * _N
-    index += _index_of(first)
+    index = opening * (_N * _N) + _distance_index(second) * _N
+    index += _distance_index(first)
     return np.asarray(_corner_table().reshape(-1)[index])
 
 
 def mass_within_bend(distance: FloatArray, bend: FloatArray) -> FloatArray:
     """Return the mass of the unit Gaussian inside a curved edge; `bend` is the edge's curvature times the sd."""
     index = np.minimum(to_int32(bend / (1.0 + bend) * _N_BENDS), _N_BENDS - 1) * _N
-    index += _index_of(distance)
+    index += _distance_index(distance)
     return np.asarray(_bend_table().reshape(-1)[index])
 
 
-def _index_of(distance: FloatArray) -> IntArray:
+def _distance_index(distance: FloatArray) -> IntArray:
+    """Return the index of the nearest tabulated distance."""
     return to_int32(np.clip(distance, -REACH, REACH) * _PER_SD + (REACH * _PER_SD + 0.5))
 
 

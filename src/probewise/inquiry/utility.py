@@ -45,7 +45,7 @@ class ReadingEntropy:
             raise ParameterError("bin_width", self.bin_width, "finite, greater than 0")
 
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
-        """Entropy in bits at every design, (n,)."""
+        """Return the entropy in bits at every available design, (n,)."""
         return label_entropy(np.rint(utility_input.predicted / self.bin_width))
 
 
@@ -60,7 +60,7 @@ class InformationGain:
     label: ClassVar[str] = "expected information (bits)"
 
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
-        """Bits at every design, (n,)."""
+        """Return the bits at every available design, (n,)."""
         return utility_input.information(utility_input.weight)
 
 
@@ -80,7 +80,7 @@ class InformationAbout:
         return f"information about {self.of} (bits)"
 
     def __call__(self, utility_input: UtilityInput) -> FloatArray:
-        """Bits at every design, (n,)."""
+        """Return the bits at every available design, (n,)."""
         labels = self.of(utility_input.names, utility_input.theta, utility_input.weight)
         bits = utility_input.reading_entropy(utility_input.weight)
         for value in np.unique(labels):

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.errors import ReachError, ShapeError
-from probewise.inquiry.choice import best_places, choose
+from probewise.inquiry.choice import best_places_mask, choose
 from probewise.inquiry.designs import Designs
 from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.forecast import DirectForecast
@@ -57,20 +57,23 @@ class UtilityMap:
         return float(self.values[self.reachable].max())
 
     @property
-    def flat(self) -> bool:
+    def is_flat(self) -> bool:
         """Whether there is no choice: all available designs have equal utility, or the only one has none."""
         values = self.values[self.reachable]
         return bool(np.ptp(values) <= FLAT and (len(values) > 1 or values[0] <= FLAT))
 
     @property
-    def best(self) -> BoolArray:
+    def best_mask(self) -> BoolArray:
         """Mask of the reachable designs with the largest utility, ties included, shape (n_designs,)."""
-        return best_places(self.values, self.reachable)
+        return best_places_mask(self.values, self.reachable)
 
-    def choose(self, *, rng: np.random.Generator) -> tuple[float, float]:
-        """Draw the next place (x_mm, y_mm) at random among the best."""
+    def draw_place_mm(self, *, rng: np.random.Generator) -> tuple[float, float]:
+        """Draw the next place, x and y, at random among the best."""
         design = self.designs[choose(self.values, self.reachable, rng=rng)]
         return design.x_mm, design.y_mm
+
+    # Old names.
+    flat, best, choose = is_flat, best_mask, draw_place_mm
 
 
 def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
@@ -85,7 +88,9 @@ def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
     """
     # The utility with two measures reports which one these values are.
     value, label = (
-        utility.measure(utility_input) if isinstance(utility, Finishing) else (utility(utility_input), utility.label)
+        utility.utility_and_label(utility_input)
+        if isinstance(utility, Finishing)
+        else (utility(utility_input), utility.label)
     )
     found = np.asarray(value, dtype=np.float64)
     if found.shape != utility_input.rows.shape:
@@ -93,7 +98,7 @@ def utility_map(utility_input: UtilityInput, utility: Utility) -> UtilityMap:
     values = np.zeros(len(utility_input.designs))
     reachable = np.zeros(len(utility_input.designs), dtype=np.bool_)
     values[utility_input.rows], reachable[utility_input.rows] = found, True
-    best_places(values, reachable)  # raises if a value is not finite
+    best_places_mask(values, reachable)  # raises if a value is not finite
     values.flags.writeable = False
     return UtilityMap(utility_input.designs, values, reachable, label)
 

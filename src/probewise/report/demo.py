@@ -77,10 +77,10 @@ def equal_readings_text(searches: Sequence[RobotSearch]) -> str:
     """Compare in a sentence both robots' widest posterior sds after as many readings as the SSF robot needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
-    widest = naive.run.steps[naive.step_at(n) - 1].widest_mm
+    widest = naive.run.steps[naive.step_at(n) - 1].largest_sd_mm
     return (
         f"After {count(n, 'reading')} each, the naive robot knows the circle to {number(widest, 1)} mm, the other "
-        f"to {number(ssf.run.last.widest_mm, 1)} mm (widest posterior sd)."
+        f"to {number(ssf.run.last.largest_sd_mm, 1)} mm (widest posterior sd)."
     )
 
 
@@ -170,7 +170,7 @@ def figures(
     names = [f"{s.model} model" for s in searches]
     axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
     posterior_widths(
-        {n: np.array([step.widest_mm for step in s.run.steps]) for n, s in zip(names, searches, strict=True)},
+        {n: np.array([step.largest_sd_mm for step in s.run.steps]) for n, s in zip(names, searches, strict=True)},
         ax=axes[0, 0],
     )
     information_gained(
@@ -215,7 +215,7 @@ def _draw_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> Axes
         for ax, search in zip(row, searches, strict=True):
             k = search.step_at(n)
             step = search.run.steps[k - 1]
-            title = f"{search.model} model, {count(k, 'reading')}: known to {number(step.widest_mm, 1)} mm"
+            title = f"{search.model} model, {count(k, 'reading')}: known to {number(step.largest_sd_mm, 1)} mm"
             paper_view(
                 search.run, k, levels=search.levels, truth_mm=search.truth_mm, window_mm=window, title=title, ax=ax
             )
@@ -358,7 +358,7 @@ def _search_section(
     n_slides = max(len(s.run.steps) for s in searches)
     texts = [
         "; ".join(
-            f"{s.model} model, {count(k := s.step_at(n), 'reading')}: {number(s.run.steps[k - 1].widest_mm, 1)} mm"
+            f"{s.model} model, {count(k := s.step_at(n), 'reading')}: {number(s.run.steps[k - 1].largest_sd_mm, 1)} mm"
             + (" (ended)" if n > len(s.run.steps) else "")
             for s in searches
         )

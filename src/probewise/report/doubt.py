@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from probewise.experiment import left_out_of
+from probewise.experiment import left_out_after_step
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Section, figure, paragraph, table
 from probewise.report.paper_view import window_mm
@@ -22,7 +22,7 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     """Say in one sentence how both robots ended, the trusting one first."""
     trusting, doubting = (
         f"{count(len(s.run.steps), 'reading')}, off by {number(s.largest_error_mm, 1)} mm "
-        f"(posterior sd up to {number(s.run.last.widest_mm, 1)} mm)"
+        f"(posterior sd up to {number(s.run.last.largest_sd_mm, 1)} mm)"
         for s in searches
     )
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
@@ -48,14 +48,14 @@ def figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
         ).set(xlim=(left, right), ylim=(low, high))
     field_legend(axes)
     doubting = searches[-1].run
-    beliefs = [left_out_of(step, doubting.experiment.trust).probability for step in doubting.steps]
+    beliefs = [left_out_after_step(step, doubting.experiment.trust).probability for step in doubting.steps]
     return {"doubt.png": png(axes), "belief.png": png(effect_probabilities_by_reading(beliefs))}
 
 
 def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
     """Build the demo's section from both searches, the trusting robot's first, and from `figures`."""
     doubting = searches[-1].run
-    missing = left_out_of(doubting.last, doubting.experiment.trust)
+    missing = left_out_after_step(doubting.last, doubting.experiment.trust)
     introduction = paragraph(
         f"A third world conceals a fault: its sensor saturates at {SATURATION:g} LEGO units, where white would read "
         f"{number(searches[0].levels[1], 0)}. The sensor model leaves that out. One robot trusts the model. The other "
@@ -69,7 +69,7 @@ def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Sect
                 s.model,
                 str(len(s.run.steps)),
                 f"{number(s.largest_error_mm, 1)} mm",
-                f"{number(s.run.last.widest_mm, 1)} mm",
+                f"{number(s.run.last.largest_sd_mm, 1)} mm",
                 s.run.stop_reason,
             )
             for s in searches

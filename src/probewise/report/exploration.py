@@ -16,7 +16,7 @@ from probewise.experiment import (
     Exploration,
     Step,
     found_shape,
-    left_out_of,
+    left_out_after_step,
     probability_of_length_off,
 )
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
@@ -131,7 +131,7 @@ def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust
 
 def _fault_probabilities(steps: Sequence[Step], trust: float) -> Section:
     """Build the section on possible faults of the sensor: their probabilities after each reading."""
-    doubted = left_out_of(steps[-1], trust)
+    doubted = left_out_after_step(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
     changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
     dashed = " A dashed line marks a change of the most probable one." if changed else ""
@@ -206,9 +206,9 @@ def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
         (
             (
                 str(s.number),
-                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.orientation_and_height}",
+                f"{number(s.reading.pose.x_mm, 0)}, {number(s.reading.pose.y_mm, 0)}{s.orientation_and_height_text}",
                 f"{s.reading.value:g}",
-                number(s.widest_mm, 1),
+                number(s.largest_sd_mm, 1),
                 number(s.bits, 1),
             )
             for s in run.steps
@@ -285,7 +285,7 @@ def write_page(
                 figure(
                     png(
                         posterior_widths(
-                            {name: np.array([s.widest_mm for s in steps]) for name, steps in runs.items()},
+                            {name: np.array([s.largest_sd_mm for s in steps]) for name, steps in runs.items()},
                             target_mm=run.experiment.stop_sd_mm,
                         )
                     ),

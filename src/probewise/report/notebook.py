@@ -130,7 +130,7 @@ def _(value: Exploration) -> str:
         value.last, value.experiment, readings, levels=(min(seen), max(seen)), truth_mm=truth_mm
     )
     widths = posterior_widths(
-        {"run": np.array([s.widest_mm for s in value.steps])}, target_mm=value.experiment.stop_sd_mm
+        {"run": np.array([s.largest_sd_mm for s in value.steps])}, target_mm=value.experiment.stop_sd_mm
     )
     return _div(
         paragraph(exploration_report.summary_sentence(value)),

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray
 from probewise._version import __version__
 from probewise.arm import Pose, Reach, Reading, SimulatedArm, Speed
 from probewise.campaign import run_campaign
-from probewise.experiment import CLEAN, TRUST, left_out_of, recording_of
+from probewise.experiment import CLEAN, TRUST, left_out_after_step, recording_of
 from probewise.progress import Progress, silent
 from probewise.recordings import Disc
 from probewise.study.circles import FIELD, POPULATIONS
@@ -176,7 +176,7 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     for step, cpu_s in steps:
         last = step
         cpu.append(cpu_s)
-    left_out = left_out_of(last, trial.trust)
+    left_out = left_out_after_step(last, trial.trust)
     return {
         "known": has_reached_target(last, experiment),
         "readings": last.number,

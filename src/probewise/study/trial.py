@@ -23,7 +23,7 @@ from probewise.experiment import (
     explore,
     naive_levels_from_world,
     probability_of_length_off,
-    student_t_bounds,
+    student_t_likelihood,
 )
 from probewise.inference import GaussianKnown, Naive
 from probewise.inquiry import Grid, utility_named
@@ -89,7 +89,7 @@ def experiment_of(row: Row) -> Experiment:
         levels = FixedLevels(DARK, BRIGHT)
         chain = Chain(mixture, levels, scene, n_nodes=FAST_NODES)
         if row.method == "paper":
-            return Experiment(shape, chain, student_t_bounds(levels, None), **common)
+            return Experiment(shape, chain, student_t_likelihood(levels, None), **common)
         return Experiment(shape, chain, GaussianKnown(row.noise_sd), **common)
     free = Chain(AdjustedMixture(mixture), FreeLevels(), scene, n_nodes=FAST_NODES)
     return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_prior_of_sensor_changes())
@@ -122,7 +122,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     for step, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):
         last = step
         cpu.append(cpu_s)
-        widest.append(round(step.widest_mm, 3))
+        widest.append(round(step.largest_sd_mm, 3))
         if first_white is None and step.reading.value > _ON_WHITE:
             first_white, bits_at_white = step.number, round(step.bits, 3)
     return {

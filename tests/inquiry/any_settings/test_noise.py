@@ -46,9 +46,9 @@ def test_draws_follow_the_distribution(name):
 
 
 def test_the_nodes_of_a_gaussian_have_its_moments_and_those_of_a_student_t_its_quantiles():
-    node, weight = LAWS["gaussian"].nodes
+    node, weight = LAWS["gaussian"].nodes_and_weights
     np.testing.assert_allclose([weight @ node**k for k in (0, 1, 2, 4)], [1, 0, 1, 3], atol=1e-12)
-    node, weight = LAWS["student"].nodes
+    node, weight = LAWS["student"].nodes_and_weights
     assert weight @ (np.abs(node) < 1.0) == pytest.approx(stats.t(3).cdf(1) - stats.t(3).cdf(-1), abs=0.1)
     assert weight @ np.abs(node) == pytest.approx(stats.t(3).expect(np.abs), rel=0.02)
 

@@ -44,14 +44,14 @@ class Predictive:
         self._centre = grouped.mean(axis=1)
         self._scale = np.sqrt((scales.reshape(*self._shape, -1) ** 2).mean(axis=1))
         self._width = np.sqrt(self._scale**2 + grouped.var(axis=1))
-        self._read = self._sample_of_node(grouped, noise.nodes[1])
+        self._read = self._predictions_at_nodes(grouped, noise.nodes_and_weights[1])
 
-    def _sample_of_node(self, grouped: FloatArray, weight: FloatArray) -> FloatArray:
-        """Choose the sample of each group to which each noise node is added, (n_groups, n_nodes, n_settings).
+    def _predictions_at_nodes(self, grouped: FloatArray, weight: FloatArray) -> FloatArray:
+        """Return the prediction of each group to which each noise node is added, (n_groups, n_nodes, n_settings).
 
         A group may hold samples far apart, with no sample near its mean. So each pair of nodes, above and below, is
-        added to another sample, in turn from group to group. If the noise is wider than the group, the nodes are
-        shifted and scaled to its mean and variance.
+        added to another sample's prediction, in turn from group to group. If the noise is wider than the group, these
+        predictions are shifted and scaled to its mean and variance.
         """
         n_groups, size = self._shape
         n_pairs = (len(weight) + 1) // 2
@@ -68,12 +68,12 @@ class Predictive:
 
     def information(self) -> FloatArray:
         """Return the expected information about all parameters jointly, bits, (n_settings,)."""
-        node, weight = self.noise.nodes
+        node, weight = self.noise.nodes_and_weights
         alone = self._centre[:, None, :] + self._scale[:, None, :] * node[:, None]
         log_own = self.noise.log_density(alone, self._centre[:, None, :], self._scale[:, None, :])
         given = (weight[:, None] * log_own).sum(axis=1).mean(axis=0)
         mixed = np.concatenate(
-            [self._mean_over_nodes(np.log(density)) for _, _, density, _ in self._blocks_of_settings()]
+            [self._mean_over_nodes(np.log(density)) for _, _, density, _ in self._yield_density_blocks()]
         )
         share = self.noise.outliers
         if share:
@@ -94,10 +94,10 @@ class Predictive:
         """
         n = self._order.shape[0]
         centred = values[:n] - values[:n].mean(axis=0)
-        lines = [self._regression_on_reading(value) for value in centred.T]
+        lines = [self._regress_on_reading(value) for value in centred.T]
         least = _LEAST_SHARE * (centred**2).mean(axis=0)
         out = np.zeros(self._order.shape[1])
-        for rows, at, density, each in self._blocks_of_settings():
+        for rows, at, density, each in self._yield_density_blocks():
             for (level, slope, rest), sd, at_least in zip(lines, goal, least, strict=True):
                 a, b, r = level[:, rows], slope[:, rows], rest[:, rows]
                 mean, by_reading, square, both, curve = (
@@ -108,7 +108,7 @@ class Predictive:
                 out[rows] += self._mean_over_nodes(np.maximum(far, 0.0))
         return out
 
-    def _regression_on_reading(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def _regress_on_reading(self, value: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Regress a value on the reading within each group: level, slope, residual variance, (n_groups, n_settings).
 
         Within a group, value and reading are assumed jointly Gaussian.
@@ -119,10 +119,13 @@ class Predictive:
         slope = together / self._width**2
         return mean - slope * self._centre, slope, own.var(axis=1) - slope * together
 
-    def _blocks_of_settings(self) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
-        """Yield blocks of settings: rows, nodes (n_rows, n_nodes), density at each, and each group's part of it."""
+    def _yield_density_blocks(self) -> Iterator[tuple[slice, FloatArray, FloatArray, FloatArray]]:
+        """Yield, by blocks of settings: rows; nodes and the predictive density there, (n_rows, n_nodes); groups' parts.
+
+        The last, (n_groups, n_rows, n_nodes), sums to the density.
+        """
         n_groups, n_settings = self._centre.shape
-        node = self.noise.nodes[0]
+        node = self.noise.nodes_and_weights[0]
         outliers = self.noise.outlier_nodes(_N_OUTLIERS)
         n_nodes = n_groups * len(node) + len(outliers)
         size = max(1, _BLOCK // (n_groups * n_nodes))
@@ -137,9 +140,9 @@ class Predictive:
             yield rows, at, each.sum(axis=0), each
 
     def _mean_over_nodes(self, values: FloatArray) -> FloatArray:
-        """Mean over the predictive distribution, (n_rows, n_nodes) -> (n_rows,)."""
+        """Average values at the nodes over the predictive distribution, (n_rows, n_nodes) -> (n_rows,)."""
         n_groups = len(self._centre)
-        weight = np.tile(self.noise.nodes[1], n_groups) / n_groups
+        weight = np.tile(self.noise.nodes_and_weights[1], n_groups) / n_groups
         core = values[:, : len(weight)] @ weight
         share = self.noise.outliers
         if not share:

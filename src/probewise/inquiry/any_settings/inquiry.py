@@ -158,7 +158,7 @@ class Inquiry(ShowsItself):
         if self._readings is None:
             return None
         best = self._posterior.theta[[int(np.argmax(self._posterior.log_likelihood))]]
-        p_value, worst = self._readings.goodness_of_fit(best)
+        p_value, worst = self._readings.p_value_and_worst_reading(best)
         if p_value >= _DOUBT_P:
             return None
         setting, value = self._taken[worst]
@@ -265,7 +265,7 @@ class Inquiry(ShowsItself):
         return np.asarray(now - predictive.distance_from_goal(values, np.array(goal)))
 
     def _costs_s(self) -> FloatArray:
-        """Return the seconds of a reading at each setting from here, (n_settings,) or a single number."""
+        """Return the seconds of a reading at each setting from here, (n_settings,) or one number; 1 by default."""
         given = self._cost_s
         if given is None:
             return np.ones(len(self._settings))
@@ -280,7 +280,7 @@ class Inquiry(ShowsItself):
 
 
 def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> dict[str, float]:
-    """Check the target sds by parameter; none if no goal is given."""
+    """Return the target sds by parameter, checked; empty if no goal is given."""
     if goal is None:
         return {}
     if not isinstance(goal, Mapping) or not goal:
@@ -294,7 +294,7 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
 
 
 def _append_reading(readings: Readings | None, model: Model, at: Settings, value: float) -> Readings:
-    """Append a reading; settings that were read before are not listed again."""
+    """Return the readings with one more; a setting that was read before is not listed again."""
     if readings is None:
         return Readings(model, at, np.array([0]), np.array([value]))
     known = readings.settings

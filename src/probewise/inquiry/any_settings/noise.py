@@ -78,7 +78,10 @@ class ReadingNoise:
         return isinstance(self.sd, Marginal)
 
     def scale(self, predicted: FloatArray, sd: FloatArray | None) -> FloatArray:
-        """Sd for each prediction, (n_samples, n_points); `sd` (n_samples,) holds that of each sample if inferred."""
+        """Return the sd of each prediction's noise, (n_samples, n_points).
+
+        `sd` (n_samples,) is that of each sample if it is inferred, else None.
+        """
         if sd is not None:
             return np.asarray(np.broadcast_to(sd[:, None], predicted.shape))
         if not callable(self.sd):
@@ -97,14 +100,14 @@ class ReadingNoise:
         return out
 
     def log_density(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
-        """Natural log of the density of each reading; arrays that broadcast."""
+        """Return the natural log of the density of each reading; arrays that broadcast."""
         core = self._log_standard_density((readings - predicted) / scale) - np.log(scale)
         if not self.outliers:
             return np.asarray(core)
         return np.asarray(np.logaddexp(math.log1p(-self.outliers) + core, self._log_outlier_density(readings)))
 
     def cdf(self, readings: FloatArray, predicted: FloatArray, scale: FloatArray) -> FloatArray:
-        """Probability of a smaller reading; arrays that broadcast."""
+        """Return the probability of a smaller reading; arrays that broadcast."""
         z = (readings - predicted) / scale
         core = ndtr(z) if math.isinf(self.dof) else stdtr(self.dof, z)
         if not self.outliers:
@@ -123,8 +126,8 @@ class ReadingNoise:
         )
 
     @cached_property
-    def nodes(self) -> tuple[FloatArray, FloatArray]:
-        """Nodes in sds and weights, (n_nodes,) each, of means over the noise, outliers apart."""
+    def nodes_and_weights(self) -> tuple[FloatArray, FloatArray]:
+        """Nodes in sds, and their weights, of a quadrature over the noise without its outliers, (n_nodes,) each."""
         if math.isinf(self.dof):
             node, weight = np.polynomial.hermite_e.hermegauss(_N_GAUSSIAN)
             return node, weight / weight.sum()
@@ -132,7 +135,7 @@ class ReadingNoise:
         return np.asarray(stdtrit(self.dof, (node + 1) / 2)), weight / 2
 
     def outlier_nodes(self, n: int) -> FloatArray:
-        """Evenly spread outliers, (n,); none if there are no outliers."""
+        """Return `n` evenly spaced outliers, (n,); empty if the noise has none."""
         if not self.outliers:
             return np.empty(0)
         low, high = self._outlier_range

@@ -93,11 +93,11 @@ class Model:
         raise ParameterError(f"the model at {at}, setting {settings[row]}", float(out[sample, row]), "finite readings")
 
     def scale(self, theta: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Sd of the noise of each prediction, (n_samples, n_settings)."""
+        """Return the sd of the noise of each prediction, (n_samples, n_settings)."""
         return self.noise.scale(predicted, theta[:, -1] if self.noise.inferred else None)
 
     def log_density(self, theta: FloatArray, settings: Settings, readings: FloatArray) -> FloatArray:
-        """Log density of each reading, (n_samples, n_readings)."""
+        """Return the log density of readings, one at each setting, (n_settings,) -> (n_samples, n_settings)."""
         predicted = self.predict(theta, settings)
         return self.noise.log_density(readings, predicted, self.scale(theta, predicted))
 
@@ -131,7 +131,7 @@ class Readings:
             out[k : k + at_once] = density.sum(axis=1)
         return out
 
-    def goodness_of_fit(self, theta: FloatArray) -> tuple[float, int]:
+    def p_value_and_worst_reading(self, theta: FloatArray) -> tuple[float, int]:
         """Return the chi-square p-value of one hypothesis (1, n_params), and the index of its worst-fitting reading.
 
         It has one degree of freedom per reading, regardless of fitted parameters, so that it is conservative.

@@ -54,11 +54,11 @@ class Settings:
         return len(next(iter(self.columns.values())))
 
     def take(self, rows: IntArray) -> Settings:
-        """Select settings."""
+        """Select settings by their indices."""
         return Settings({name: column[rows] for name, column in self.columns.items()}, self.form)
 
     def joined(self, other: Settings) -> Settings:
-        """Append other settings."""
+        """Return these settings, then `other`."""
         return Settings({n: np.concatenate([c, other.columns[n]]) for n, c in self.columns.items()}, self.form)
 
     def in_model_form(self, columns: Mapping[str, Column]) -> Any:

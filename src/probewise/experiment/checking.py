@@ -1,4 +1,4 @@
-"""Check readings before a run ends: for faults of the sensor, and on the side of the shape that has no reading yet.
+"""Checks before a run ends: readings for faults of the sensor, and on the side of the shape that has none yet.
 
 A dozen readings that fit the plain sensor cannot exclude most faults, and a single further reading would show some of
 them. And if a shape was read from one side only, its far side is computed from the sensor model alone: with a fault
@@ -141,7 +141,10 @@ class OutlineCoverage:
         return cls(edge, nearest, apart, spacing, diameter)
 
     def nearest_reading_distances_if_read_at(self, places_mm: FloatArray) -> FloatArray:
-        """Return `apart_mm` with one more reading at each of these places, (n_places, 2) -> (n, n_places)."""
+        """Return `apart_mm` with one more reading at each of these places, (n_places, 2) -> (n, n_places).
+
+        A place farther than one spacing of the grid from the outline changes nothing.
+        """
         apart = np.linalg.norm(self.edge_mm[:, None] - places_mm, axis=2)
         at_edge = apart.min(axis=0) <= _AT_EDGE * self.spacing_mm
         return np.asarray(np.minimum(np.where(at_edge, apart, np.inf), self.apart_mm[:, None]))

@@ -1,4 +1,4 @@
-"""Re-estimate an evidence from posterior samples, by bridge sampling with kernels fitted to them.
+"""Evidence re-estimated from posterior samples, by bridge sampling with kernels fitted to them.
 
 The sequential estimate of the evidence accumulates errors from reading to reading. Bridge sampling (Meng & Wong 1996)
 between the samples and draws from a kernel density fitted to them gives an estimate independent of the history. Each

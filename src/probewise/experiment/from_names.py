@@ -1,4 +1,4 @@
-"""Build an experiment from names, as on the command line: method, sensor model, utility."""
+"""An experiment from names, as on the command line: method, sensor model, utility."""
 
 from __future__ import annotations
 

@@ -284,7 +284,7 @@ def _flattened_settings(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(eq=False)
 class JournalWriter:
-    """Appends to a journal; every call returns when the line is on disk. Use as a context manager.
+    """Writer that appends to a journal, a context manager; every call returns when the text is on disk.
 
     While it is open, no other process can write to the journal.
     """

@@ -27,10 +27,11 @@ _FEW = 600  # points up to which all distances are faster than a tree
 
 @dataclass(frozen=True, eq=False)
 class LocalKernels:
-    """A mixture of equally weighted Gaussians: `centre` (n_kernels, n_params), and `root` of each covariance.
+    """A mixture of equally weighted Gaussians.
 
-    `form` (n_features, n_kernels) gives the log density of each kernel as a product with a point's
-    features: one, the coordinates about `origin`, and their products.
+    `centre` (n_kernels, n_params) are their means relative to `origin`, `root` (n_kernels, n_params, n_params) the
+    Cholesky factors of their covariances. `form` (n_features, n_kernels) gives the log density of each kernel as a
+    product with a point's features: one, the coordinates about `origin`, and their products.
     """
 
     origin: FloatArray

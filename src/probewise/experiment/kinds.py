@@ -44,7 +44,7 @@ class HypothesisKind:
     whole_names
         Names of the experiment's parameters.
     effect
-        The effect left out, if it is on the mean; its parameters are the last ones.
+        The effect left out, if it acts on the noise-free reading; its parameters are the last ones.
     """
 
     shape: str
@@ -77,7 +77,7 @@ def kinds_of(
     Parameters
     ----------
     shape
-        The possible shape; each shape of a set is a kind.
+        The possible shape; each shape of a set has kinds of its own.
     sensor_prior
         Prior of the parameters before the shape's, shared by every kind; or None.
     prior, likelihood
@@ -92,7 +92,7 @@ def kinds_of(
     quick, chain = models
     ways = Counter(rival.name for rival in rivals)
     kinds = []
-    for part in _parts_of_shape(shape, sensor_prior, prior):
+    for part in _member_shapes(shape, sensor_prior, prior):
         own, log_prior = part.prior, math.log(part.share)
         plain = log_prior + math.log(trust)
         whole, model = _add_estimated_effects(own, chain, quick) if trust < 1 else (own, quick)
@@ -143,8 +143,8 @@ def _add_estimated_effects(own: Prior, chain: SensorModel, quick: SensorModel) -
 
 
 @dataclass(frozen=True, eq=False)
-class _ShapePart:
-    """One shape: its prior with the sensor's, its prior probability, and the columns of its parameters.
+class _MemberShape:
+    """One shape of a set, or the single one: its prior with the sensor's, its prior probability, its columns of theta.
 
     `number` is its index in the set, None for a single shape; `n_sensor` the number of columns before the shape's.
     """
@@ -179,16 +179,16 @@ class _ShapePart:
         return _RestrictedModel(whole, (*self.prior.names, *more), columns, others)
 
 
-def _parts_of_shape(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_ShapePart]:
+def _member_shapes(shape: Shape, sensor_prior: Prior | None, prior: Prior) -> list[_MemberShape]:
     """List the shapes of a set, or the single shape, each with the sensor's parameters before its own."""
     if not isinstance(shape, AnyOf):
-        return [_ShapePart("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
+        return [_MemberShape("", 1.0, prior, prior, np.arange(len(prior.names)), None, 0)]
     n_sensor = 0 if sensor_prior is None else len(sensor_prior.names)
     parts = []
     for k, (name, member) in enumerate(shape.shapes.items()):
         columns = np.concatenate([np.arange(n_sensor), n_sensor + shape.prior.columns[k]])
         own = member.prior if sensor_prior is None else Joint((sensor_prior, member.prior))
-        parts.append(_ShapePart(name, shape.weights[k], own, prior, columns, k, n_sensor))
+        parts.append(_MemberShape(name, shape.weights[k], own, prior, columns, k, n_sensor))
     return parts
 
 

@@ -1,4 +1,4 @@
-"""Measure, infer, inquire, until the target precision is reached (paper, the machine learning system).
+"""The loop of a run: measure, infer, inquire, until the target precision is reached (paper, machine learning system).
 
 `step` processes one reading; `explore` is the loop around it, a generator, so that the command line, notebooks and
 reports see the same steps; `run` collects them.
@@ -262,6 +262,8 @@ def explore(
         If no place of the grid is reachable.
     FileError
         If the journal is damaged, belongs to a run with other settings, or is written to by another process.
+    ParameterError
+        If the journal holds more than `max_readings` readings.
     NotConvergedError
         If no hypothesis could have given the readings.
     LinkError
@@ -388,7 +390,7 @@ def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
 
 
 def _rng_of_reading(seed: np.random.SeedSequence, number: int) -> np.random.Generator:
-    """Return the generator of one reading, independent of draws for earlier readings."""
+    """Return the generator of one reading, from 1 (0: before the first), independent of draws for the others."""
     return np.random.default_rng(np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number)))
 
 

@@ -216,7 +216,8 @@ def paper_experiment(
 def student_t_likelihood(levels: FixedLevels, step: float | None) -> OneScan:
     """Return the Student-t likelihood with its noise sd bounded for these levels.
 
-    The sd is at least that of rounding or 0.001 of the levels' difference, the larger; at most that difference.
+    The sd is at least that of rounding or 0.001 of the levels' difference, whichever is larger; at most that
+    difference, or ten times the least sd if that is larger.
     """
     span = abs(levels.i_max - levels.i_min)
     floor = _least_sd(span, step)
@@ -274,5 +275,5 @@ def _naive_from_readings(black: FloatArray, white: FloatArray, step: float | Non
 
 
 def _least_sd(span: float, step: float | None) -> float:
-    """Return the least plausible sd: of rounding, or a thousandth of the levels' difference."""
+    """Return the least plausible sd: that of rounding or a thousandth of `span`, whichever is larger."""
     return max((step or 0.0) / math.sqrt(12.0), _LEAST_SHARE * span)

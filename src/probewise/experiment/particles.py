@@ -1,10 +1,10 @@
-"""Sequential Monte Carlo: reweight samples after each reading, and resample and move them when needed.
+"""Sequential Monte Carlo: samples reweighted after each reading, and resampled and moved when needed.
 
-Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweights the samples. If the effective sample size
-falls below half, the reading's likelihood is tempered. At each temperature the samples are resampled and moved by
-Metropolis-Hastings steps on all readings so far. The evidence is the product of the mean weights. Thousands of samples
-represent what a long search has excluded. The error of the evidence is estimated from the genealogy: if few initial
-samples are ancestors of the current ones, another start would have given another evidence (Lee & Whiteley 2018).
+Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006). A reading reweights the samples. If the effective share of the
+samples falls below a limit, the reading's likelihood is tempered. At each temperature the samples are resampled and
+moved by Metropolis-Hastings steps on all readings so far. The evidence is the product of the mean weights. Thousands of
+samples represent what a long search has excluded. The error of the evidence is estimated from the genealogy: if few
+initial samples are ancestors of the current ones, another start would give another evidence (Lee & Whiteley 2018).
 """
 
 from __future__ import annotations
@@ -348,7 +348,7 @@ class _LastReading:
         return checked_log_prob(self.problem.likelihood, self.problem.recording.readings[rows], predicted[:, rows])
 
     def evaluate_samples(self, theta: FloatArray) -> _EvaluatedSamples:
-        """Evaluate samples; the model is not evaluated outside the prior."""
+        """Evaluate prior and likelihoods of samples; those outside the prior get a likelihood of zero."""
         problem = self.problem
         log_prior = problem.prior.log_prob(theta)
         before, after = np.zeros(len(theta)), np.full(len(theta), -np.inf)
@@ -429,7 +429,10 @@ def _propose_along_differences(
 
 
 def _partition_rows(rows: IntArray) -> list[IntArray]:
-    """Partition resampled `rows` with copies of a sample together; one part if others would be too small."""
+    """Split the samples resampled by `rows` into two parts, with copies of a sample in the same part.
+
+    Return the indices of each part's samples; a single part if one of two were too small to fit kernels.
+    """
     parts = [np.flatnonzero(rows % 2 == k) for k in (0, 1)]
     return parts if min(map(len, parts)) >= _LEAST_PART * len(rows) else [np.arange(len(rows))]
 
@@ -447,7 +450,7 @@ def _next_power(log_weight: FloatArray, base: FloatArray, now: _EvaluatedSamples
 
 
 def _updated_log_weights(log_weight: FloatArray, after: FloatArray, before: FloatArray) -> FloatArray:
-    """Return weights updated for new likelihoods; excluded samples remain excluded."""
+    """Return log weights updated from log likelihoods `before` to those `after`; excluded samples remain excluded."""
     alive = np.isfinite(log_weight)
     return np.asarray(np.where(alive, log_weight + after - np.where(alive, before, 0.0), -np.inf))
 

@@ -140,7 +140,7 @@ class Posterior:
 
 
 def prior_posterior(kinds: Sequence[HypothesisKind], n_particles: int, *, rng: np.random.Generator) -> Posterior:
-    """Draw samples of every kind's prior."""
+    """Return the posterior without readings: samples of every kind's prior, fewer for improbable kinds and rivals."""
     shares = [math.exp(kind.log_prior) for kind in kinds]
     sizes = [_n_samples_of_kind(kind, p, n_particles) for kind, p in zip(kinds, shares, strict=True)]
     drawn = (prior_particles(kind.prior, n, rng=rng) for kind, n in zip(kinds, sizes, strict=True))
@@ -363,7 +363,7 @@ def _reestimated_where_doubtful(
 
 
 def _kind_with_most_doubtful_evidence(now: Posterior, settled: set[int], most_off: float) -> int | None:
-    """Return the kind whose evidence error has the largest effect on its probability; None if all are negligible.
+    """Return the index of the kind whose probability its evidence's error affects most; None if none by `most_off`.
 
     In a run that doubts its sensor, a kind whose samples are in doubt counts where it has a say in the shape.
     """

@@ -87,7 +87,7 @@ def fit_kind(
     noise_sd: float,
     rng: np.random.Generator,
 ) -> Fits:
-    """Fit a kind with an effect on the mean to all readings, starting at samples of other kinds.
+    """Fit a kind with an effect on the noise-free reading to all readings, starting at samples of other kinds.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ class _OpenShapeDensity:
 
     @classmethod
     def about_fits(cls, kind: HypothesisKind, found: Fits, rows: IntArray) -> _OpenShapeDensity | None:
-        """Build from some fits of a kind; None for a kind without an effect on the mean."""
+        """Build from some fits of a kind; None for a kind whose rival is a noise model."""
         if kind.effect is None:
             return None
         n = len(kind.effect.prior.names)

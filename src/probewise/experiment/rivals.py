@@ -72,7 +72,7 @@ OF_MOTION = frozenset({Backlash.name, Hysteresis.name})
 
 @dataclass(frozen=True, eq=False)
 class SensorModelRival:
-    """One alternative to the sensor model: an effect on the noise-free reading, or another likelihood of the noise."""
+    """One alternative to the sensor model: an effect on the noise-free reading, or another likelihood."""
 
     name: str
     effect: DescribedEffect | None = None

@@ -1,4 +1,4 @@
-"""Infer the sensor jointly with the shape, with a prior from its calibration and possible changes since.
+"""The sensor as an unknown beside the shape, with a prior from its calibration and possible changes since.
 
 Paper, Conclusion: "calibration on the fly". The calibrated SSF keeps its form; its size along the sensor's two axes,
 its place and the two levels are free. Their prior is the calibration's posterior, widened for possible changes since:

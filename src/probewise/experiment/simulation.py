@@ -1,4 +1,4 @@
-"""Build the experiment of a fitted sensor, and a simulated arm over a simulated field."""
+"""The experiment of a fitted sensor, and a simulated arm over a simulated field."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ _PAINTED_VERTICES = 512  # vertices of a curved outline that is not an ellipse: 
 
 
 class RandomStreams(NamedTuple):
-    """Independent random streams of one simulated run: robot, hidden shape, shadow run, noise.
+    """Independent random streams of one simulated run: the robot's inference, the hidden shape, the shadow run, noise.
 
-    `noise` is a number, from which each reading's generator is made; see `arm_over`. `levels` is that of readings over
-    black and white before the run, see `naive_levels_from_world`.
+    `noise` is a seed, from which each reading's generator is made; see `arm_over`. `levels` is the stream of readings
+    over black and white before the run, see `naive_levels_from_world`.
     """
 
     run: np.random.Generator
@@ -208,7 +208,10 @@ def experiment_without_inference(
     repeats: tuple[int, ...],
     heights_mm: tuple[float, ...],
 ) -> partial[Experiment]:
-    """Build the part of an experiment that all methods share: shape, field, scale of readings, designs."""
+    """Build the part of an experiment that all methods share: shape, field, scale of readings, designs.
+
+    Model, likelihood and what differs between methods are passed to the result, which returns the experiment.
+    """
     scale = scale_of(sensor.instrumentation)
     return partial(
         Experiment,
@@ -253,7 +256,7 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
 
 
 def _marginal_of_samples(samples: FloatArray) -> Marginal:
-    """Return the marginal with mean and sd of samples, (n_samples,): log-normal if all are positive, else normal."""
+    """Fit a marginal to samples, (n_samples,), by mean and sd: log-normal if all are positive, else normal."""
     if (samples > 0).all():
         log = np.log(samples)
         return LogNormal(float(np.exp(log.mean())), float(log.std()))
@@ -267,8 +270,8 @@ TRUST = 0.9
 def default_trust(shape: Shape, *, model: Model, learn_sensor: bool, utility: Utility) -> float:
     """Return the default prior probability that the sensor model is complete (its trust).
 
-    It is `TRUST`, or 1 where no rival is considered: for the naive model, a sensor that is learnt, several shapes, or a
-    user's own utility.
+    It is `TRUST`, or 1 where no rival is considered: for the naive model, a sensor that is learnt, several shapes, or
+    any utility but `Finishing()`.
     """
     plain = model == "naive" or learn_sensor or isinstance(shape, AnyOf) or utility != Finishing()
     return 1.0 if plain else TRUST
@@ -297,7 +300,7 @@ def scale_of(instrumentation: Instrumentation) -> ReadingScale:
 
 
 def world_like(sensor: FittedSensor) -> World:
-    """Build the world of a sensor.json: its mean field as the footprint, its levels, noise and height."""
+    """Build the simulated world of a fitted sensor: its mean field as the footprint, its levels, noise and height."""
     require_sensor(sensor)
     field, means = sensor.field, sensor.mean()
     corner = (field.origin_mm[0] - field.pixel_mm / 2, field.origin_mm[1] - field.pixel_mm / 2)
@@ -333,7 +336,7 @@ def surface_of_region(region: Region, name: str) -> Surface:
 
 
 def with_cards(surface: Surface, cards: Sequence[Card]) -> Surface:
-    """Add cards to a surface of the world; only geometry and albedo are shared."""
+    """Return a surface of the world with cards on it; one that has cards already is returned as it is."""
     if not cards or isinstance(surface, CoveredSurface):
         return surface
     laid = [Polygon(tuple((float(x), float(y)) for x, y in card.corners_mm), inside=card.albedo) for card in cards]

@@ -50,7 +50,7 @@ def shape_moments_and_probabilities(
 
 
 def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:
-    """Return the probability that a length differs by more than `off_mm` from its posterior mean.
+    """Return the probability that some length differs by more than `off_mm` from its posterior mean.
 
     For a set of shapes: from the mean given the most probable shape, and other shapes count as wrong.
     """

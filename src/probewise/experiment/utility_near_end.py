@@ -65,8 +65,8 @@ def utility_map_and_must_continue(
     continues nevertheless for a reading on the far side of the shape, or for one that is expected to tell enough about
     what the sensor leaves out.
 
-    Candidates are the designs with the largest information, those at edges and centres of probable shapes and on the
-    far side, earlier places, and some random ones.
+    Candidates are the designs with the largest information, those at edges and centres of sampled shapes, on the far
+    side, at cards and at earlier places, and some random ones.
     """
     goal = utility_input.goal
     if goal is None:

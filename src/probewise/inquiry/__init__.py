@@ -1,4 +1,4 @@
-"""Choose the next measurement (paper, the machine learning system, figures 3 and 8).
+"""The choice of the next measurement (paper, the machine learning system, figures 3 and 8).
 
 Samples of the posterior predict a reading at every place of a fine grid; where their predictions differ most, a reading
 tells most. The utility of a reading has one interface, `Utility`: the paper's is `ReadingEntropy`, of fifty hypotheses;

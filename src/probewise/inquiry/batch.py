@@ -1,4 +1,4 @@
-"""Choose several readings at once (a batch)."""
+"""The choice of several readings at once (a batch)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Choose the next place at random among the best reachable ones."""
+"""The choice of the next place, at random among the best reachable ones."""
 
 from __future__ import annotations
 

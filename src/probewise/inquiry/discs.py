@@ -171,7 +171,7 @@ class DiscTable:
         per_level = 1.0 / (levels[1] - levels[0])
         dark, bright = np.rint((np.array([self.dark, self.bright]) - levels[0]) * per_level).astype(np.int64).tolist()
         nearest = np.clip(np.rint((self.levels - levels[0]) * per_level), 0, n_levels - 1).astype(np.int16)
-        margin = self._distance_to_constant_level(nearest, (dark, bright))
+        margin = self._distance_to_constant_level_mm(nearest, (dark, bright))
         discs = to_single_precision(theta)
         mass = np.empty((grid.n_places, n_levels))
         turn = turn_rad.reshape(grid.n_y, grid.n_x)
@@ -182,14 +182,14 @@ class DiscTable:
             level: IntArray = np.full(len(ring.place), bright)  # a place exactly on the edge is inside
             if margin > 0.0:
                 away = _DiscPlacePairs.of(discs, intervals, ring, y_mm, turn[start : start + ROWS].ravel())
-                level = nearest.reshape(-1)[self._nearest_entry(away)]
+                level = nearest.reshape(-1)[self._nearest_entry_index(away)]
             rows = slice(start * grid.n_x, (start + ROWS) * grid.n_x)
             mass[rows] = intervals.level_histogram(weight, ring, level, (dark, bright), n_levels)
         return mass
 
     mass = level_histogram  # its old name
 
-    def _distance_to_constant_level(self, nearest: IntArray, ends: tuple[int, int]) -> float:
+    def _distance_to_constant_level_mm(self, nearest: IntArray, ends: tuple[int, int]) -> float:
         """Return the distance from an edge beyond which the nearest of a list of levels is constant."""
         if self.margin_mm == 0.0:
             return 0.0
@@ -197,7 +197,7 @@ class DiscTable:
         off = (nearest != np.where(distance <= 0.0, ends[1], ends[0])).any(axis=(0, 1))
         return float(np.abs(distance[off]).max(initial=0.0))
 
-    def _nearest_entry(self, away: _DiscPlacePairs) -> IntArray:
+    def _nearest_entry_index(self, away: _DiscPlacePairs) -> IntArray:
         """Return the index of the table's nearest entry for pairs of disc and place."""
         _, n_directions, n_distances = self.levels.shape
         step = away.distance_mm + np.float32(self.margin_mm)

@@ -1,4 +1,4 @@
-"""Near the end of a run, choose the reading most likely to end it."""
+"""A utility for the end of a run: the probability that a reading ends it."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Finishing:
 
 
 def _may_end_with_one_more(utility_input: UtilityInput, goal: Goal) -> bool:
-    """Return whether one more reading may end the run."""
+    """Return whether one more reading may end the run: the largest sd exceeds the goal by less than a factor of 15."""
     lengths = utility_input.theta[:, goal.columns]
     spread = utility_input.weight @ (lengths - utility_input.weight @ lengths) ** 2
     return bool(goal.sd <= np.sqrt(spread.max()) < _NEAR * goal.sd)

@@ -101,7 +101,10 @@ class DirectForecast:
 
 @dataclass(frozen=True, eq=False)
 class _DirectPredictive:
-    """Predictions of the hypotheses `chosen` as the `index` of the nearest level, (n_asked, n_designs)."""
+    """Predictions of the hypotheses `chosen` as the `index` of the nearest level, (n_asked, n_designs).
+
+    `stands_for`, (n_asked,): factor from the weight of each to that of all hypotheses for which it stands.
+    """
 
     chosen: IntArray
     stands_for: FloatArray

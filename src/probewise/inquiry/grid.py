@@ -42,7 +42,7 @@ class Grid:
 
     @cached_property
     def y_mm(self) -> FloatArray:
-        """Rows from the lower edge up, shape (n_y,)."""
+        """Y of each row, the lowest first, (n_y,)."""
         return _read_only(np.linspace(0.0, self.height_mm, self.n_y))
 
     @cached_property

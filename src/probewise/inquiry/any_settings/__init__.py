@@ -1,4 +1,4 @@
-"""Choose the next setting of any instrument, given a model of its readings, a prior, its settings and its noise.
+"""The choice of the next setting of any instrument, from a model of its readings, a prior, settings and noise.
 
 The paper's machine learning system without a field of shapes: readings update the posterior (`posterior`), and the next
 setting maximises an acquisition function (`Inquiry.utility`): expected information (Lindley 1956) or, near a goal, the

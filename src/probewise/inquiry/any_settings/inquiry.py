@@ -1,4 +1,4 @@
-"""Measure, infer, inquire with any instrument: the posterior after each reading, and the setting to read next."""
+"""Inquiry with any instrument: the posterior after each reading, and the setting to read next."""
 
 from __future__ import annotations
 
@@ -147,7 +147,10 @@ class Inquiry(ShowsItself):
 
     @property
     def settled(self) -> bool:
-        """Whether the posterior sd of every parameter in the goal is at most its goal."""
+        """Whether the posterior sd of every parameter in the goal is at most its goal.
+
+        Raises ParameterError if the inquiry has no goal.
+        """
         if not self._goal:
             raise ParameterError("goal", None, 'posterior sds by parameter, such as {"centre_hz": 0.5}')
         return self._largest_sd_over_goal <= 1.0
@@ -188,7 +191,8 @@ class Inquiry(ShowsItself):
         Raises
         ------
         ParameterError
-            If the reading is not a finite number. The posterior is unchanged.
+            If the reading is not a finite number, or the setting not of the form of `settings`. The posterior is
+            unchanged.
         NotConvergedError
             If no hypothesis could have given these readings. The posterior is unchanged.
         """

@@ -394,10 +394,10 @@ def test_what_a_free_ssf_takes_up_whole_is_no_effect_until_the_sensor_is_known()
     blur = VOCABULARY["edge_blur"].for_extent(Extent(10.0, 60.0, plan))
     heights = np.where(np.arange(len(plan)) < 400, np.nan, 20.0)
     raised = dataclasses.replace(plan, covariates={**plan.covariates, "height_mm": heights})
-    assert blur.is_of_the_ssf(plan)
-    assert not blur.is_of_the_ssf(raised)
+    assert blur.is_absorbed_by_ssf(plan)
+    assert not blur.is_absorbed_by_ssf(raised)
     higher = dataclasses.replace(raised, covariates={**plan.covariates, "height_mm": np.full(len(plan), 20.0)})
-    assert blur.is_of_the_ssf(higher)
+    assert blur.is_absorbed_by_ssf(higher)
 
 
 @pytest.mark.slow

@@ -134,7 +134,7 @@ def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, 
     z = np.full(model.n_params, 0.2)
     usable = np.arange(len(plan))
     found = Fit(model, z, model.predict(z[None, :])[0], np.zeros(len(plan)), np.zeros((len(plan), 7)), 1.0, 0.0)
-    effect = VOCABULARY[name].for_extent(EXTENT).coarse()
+    effect = VOCABULARY[name].for_extent(EXTENT).with_fewer_variants()
     whole = effect_templates(found, effect, usable)
     monkeypatch.setattr("probewise.diagnosis.evidence.templates._AT_ONCE", 5 * len(plan))
     few = effect_templates(found, effect, usable, most=7)

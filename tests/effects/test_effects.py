@@ -38,7 +38,7 @@ from probewise.effects import (
     ScanMisplacement,
     StickSlip,
 )
-from probewise.effects.patches import scanned_lines
+from probewise.effects.patches import straight_scan_lines
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import jittered
@@ -135,13 +135,13 @@ def test_a_prior_maps_the_unit_cube_to_its_own_density(name):
 
 def test_lines_are_found_whichever_way_they_were_scanned():
     """The two-way plan goes along X, forth and back, and once along Y; a turned plan along its own line."""
-    along_x, along_y = scanned_lines(PLAN)
+    along_x, along_y = straight_scan_lines(PLAN)
     assert (along_x.angle_rad, along_x.offset_mm, along_x.low_mm, along_x.high_mm) == (0.0, 0.0, -50.0, 50.0)
     assert along_y.angle_rad == pytest.approx(np.pi / 2)
     assert (along_y.offset_mm, along_y.low_mm, along_y.high_mm) == pytest.approx((5.0, -60.0, 60.0))
     line = paper_plan().take(np.arange(101))
     c, s = np.cos(0.4), np.sin(0.4)
-    (found,) = scanned_lines(replace(line, x_mm=c * line.x_mm - s * 7, y_mm=s * line.x_mm + c * 7))
+    (found,) = straight_scan_lines(replace(line, x_mm=c * line.x_mm - s * 7, y_mm=s * line.x_mm + c * 7))
     assert (found.angle_rad, found.offset_mm, found.length_mm) == pytest.approx((0.4, 7.0, 100.0))
     x, y = found.place(np.array([3.0]), np.array([-2.0]))
     np.testing.assert_allclose(found.coordinates(x, y), [[3.0], [-2.0]], atol=1e-12)
@@ -300,8 +300,8 @@ def test_the_moments_of_a_step_lie_between_the_readings():
 @pytest.mark.parametrize("kind", [AmbientStep, ArmKnock, GainStep])
 def test_gates_open_what_each_variant_acts_on(kind):
     """Route one: everywhere, and the gate; route two: each variant by itself."""
-    effect = kind.for_extent(EXTENT).coarse()
-    gates = effect.gates(PLAN)
+    effect = kind.for_extent(EXTENT).with_fewer_variants()
+    gates = effect.variant_masks(PLAN)
     plain = base().predict(np.zeros((1, 0)), PLAN)
     everywhere = base().with_effects(effect).predict(gates.always, PLAN) - plain
     for k in (0, 7, len(gates.opened) - 1):
@@ -349,11 +349,11 @@ def test_the_time_of_a_step_is_spread_over_the_readings_between_which_it_may_lie
     step = AmbientStep.for_extent(Extent(0.0, 1.0, there_and_back()))
     theta = np.full((4000, 2), [1.5, 5.0])
     weights = np.array([0.0, 0.25, 0.75, 0.0, 0.0])
-    found = step.variants()[2].spread(theta, weights, rng=np.random.default_rng(0))
+    found = step.variants()[2].redraw_by_variant(theta, weights, rng=np.random.default_rng(0))
     np.testing.assert_array_equal(found[:, 0], 1.5)
     assert (found[:, 1].min() > 10.0, found[:, 1].max() < 30.0) == (True, True)
     assert np.mean(found[:, 1] < 20.0) == pytest.approx(0.25, abs=0.03)
-    plain = Backlash().spread(theta[:, :1], np.ones(1), rng=np.random.default_rng(0))
+    plain = Backlash().redraw_by_variant(theta[:, :1], np.ones(1), rng=np.random.default_rng(0))
     np.testing.assert_array_equal(plain, theta[:, :1])
 
 

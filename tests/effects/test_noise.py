@@ -11,7 +11,7 @@ from probewise.effects import (
     CorrelatedNoise,
     Dropouts,
     Extent,
-    NoiseRows,
+    FittedReadings,
     Outliers,
     Quantisation,
     SignalDependentNoise,
@@ -123,7 +123,7 @@ def test_a_lattice_shows_through_printing(digits):
 
 
 def test_a_printing_lattice_and_a_declared_one_are_no_effect():
-    rows = NoiseRows(np.zeros(300), SD)
+    rows = FittedReadings(np.zeros(300), SD)
     printed = np.round(np.random.default_rng(2).normal(0, 1, (300, 2)) * SD, 2) / SD
     assert Quantisation().nodes(printed[:, 0], rows).shape == (0, 1)
     declared = replace(PLAN, instrumentation=replace(PLAN.instrumentation, step=1.0))

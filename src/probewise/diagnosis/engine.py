@@ -37,7 +37,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictRepor
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
 from probewise.diagnosis.verdict_report.reason import Grounds, reason_of
 from probewise.effects import VOCABULARY, NamedEffect
-from probewise.effects.vocabulary import require_effects
+from probewise.effects.vocabulary import require_effect_classes
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
 
@@ -95,7 +95,7 @@ def diagnose(
     """
     require_rng(rng)
     require_progress(progress)
-    require_effects(effects)
+    require_effect_classes(effects)
     if null is not None:
         allowed = (
             "a null model: OwnModel(simulate, prior) or SensorAndShape, of probewise.diagnosis; a sensor is sensor="

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 from probewise.diagnosis.names import Names
-from probewise.effects import UNNAMED, NamedEffect, first_of, is_out_of_vocabulary
+from probewise.effects import UNNAMED, NamedEffect, is_out_of_vocabulary, name_of_first_copy
 from probewise.sensor import Stage
 
 
@@ -49,7 +49,7 @@ class PriorOdds:
         """Divide the odds among these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
         unnamed = sum(is_out_of_vocabulary(name) for name in effects)
-        twofold = frozenset(first for name in effects if (first := first_of(name)) is not None)
+        twofold = frozenset(first for name in effects if (first := name_of_first_copy(name)) is not None)
         n_named = len(effects) - len(on_noise) - unnamed - len(twofold)
         return cls(n_named, unnamed, len(on_noise), twofold=twofold)
 
@@ -60,7 +60,7 @@ class PriorOdds:
             log_p = self._log_of_named(len(named))
         else:
             once = self.twofold.intersection(named)
-            n_again = sum(first_of(name) is not None for name in named)
+            n_again = sum(name_of_first_copy(name) is not None for name in named)
             log_p = self._log_of_named(len(named) - n_again)
             log_p += n_again * math.log(self.twice) + (len(once) - n_again) * math.log1p(-self.twice)
         for k in range(len(names) - len(named)):

@@ -21,9 +21,9 @@ from probewise.effects.knocks import ArmKnock, GainStep
 from probewise.effects.known import Estimated, Informed, Known
 from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_sd
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
-from probewise.effects.motion import in_scans, sign_of_motion
+from probewise.effects.motion import scan_indicator, sign_of_motion
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
-from probewise.effects.noise_distribution import NoiseRows, draw_readings, log_density, variance
+from probewise.effects.noise_distribution import FittedReadings, draw_readings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
 from probewise.effects.predictive_mixture import PredictiveMixture
@@ -107,18 +107,27 @@ def public_name(name: str) -> str:
 
 
 def spoken_name(name: str) -> str:
-    """Write an effect's name with spaces for underscores, unless it holds a user's column, parameter or state."""
+    """Return an effect's name with spaces for underscores; unchanged if it names a user's target ("drifts:k_1")."""
     own = public_name(name)
     return own if ":" in own else own.replace("_", " ")
 
 
-def first_of(name: str) -> str | None:
+def name_of_first_copy(name: str) -> str | None:
     """Return the name of the first copy if `name` is that of a second copy, otherwise None."""
     return name.removesuffix(AGAIN) if name.endswith(AGAIN) else None
 
 
 sign_of_move = sign_of_motion
 """The old name of `sign_of_motion`."""
+
+first_of = name_of_first_copy
+"""The old name of `name_of_first_copy`."""
+
+in_scans = scan_indicator
+"""The old name of `scan_indicator`."""
+
+NoiseRows = FittedReadings
+"""The old name of `FittedReadings`."""
 
 HeavyTailed = HeavyTailedPrior
 """The old name of `HeavyTailedPrior`."""
@@ -152,6 +161,7 @@ __all__ = [
     "EdgeShadow",
     "Estimated",
     "Extent",
+    "FittedReadings",
     "Flicker",
     "GainDrift",
     "GainStep",
@@ -169,7 +179,6 @@ __all__ = [
     "NamedEffect",
     "NoiseEffect",
     "NoisePerRun",
-    "NoiseRows",
     "Nonlinearity",
     "OffsetDrift",
     "OrientationError",
@@ -189,13 +198,13 @@ __all__ = [
     "SlowTurn",
     "StickSlip",
     "draw_readings",
-    "first_of",
-    "in_scans",
     "is_out_of_vocabulary",
     "lattice_step",
     "lattice_step_sd",
     "log_density",
+    "name_of_first_copy",
     "public_name",
+    "scan_indicator",
     "sign_of_motion",
     "spoken_name",
     "variance",

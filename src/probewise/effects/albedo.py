@@ -16,7 +16,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.patches import PatchEffect, bell, scanned_lines
+from probewise.effects.patches import PatchEffect, gaussian_bump, straight_scan_lines
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
@@ -48,7 +48,7 @@ class AlbedoGradient(LinearEffect[SceneView]):
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return replace(
             value,
-            regions={name: RegionWithGradient(r, theta) for name, r in _regions_under_readings(value, plan).items()},
+            regions={name: RegionWithGradient(r, theta) for name, r in _regions_with_readings(value, plan).items()},
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -75,12 +75,12 @@ class AlbedoPatch(PatchEffect[SceneView]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search along the straight scans; None where there are none."""
-        lines = scanned_lines(extent.plan)
+        lines = straight_scan_lines(extent.plan)
         return cls(line=lines[0], lines=lines) if lines else None
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
         return replace(
-            value, regions={name: RegionWithPatch(r, theta) for name, r in _regions_under_readings(value, plan).items()}
+            value, regions={name: RegionWithPatch(r, theta) for name, r in _regions_with_readings(value, plan).items()}
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -101,7 +101,7 @@ class RegionWithGradient:
 
     @property
     def n_regions(self) -> int:
-        """Number of hypotheses, or 1 where all share one region."""
+        """Number of regions, one for each sample; 1 where all samples share one."""
         return max(self.region.n_regions, len(self.per_mm))
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -118,17 +118,20 @@ class RegionWithGradient:
 
 @seen_by_one.register
 def _mean_albedo_over_gradient(region: RegionWithGradient, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Integrate by Stein's lemma: response times field at the centre, plus a central difference of the response."""
+    """Return the mean albedo under each Gaussian, by Stein's lemma.
+
+    It is the gradient's factor at the centre times the region's mean albedo, plus a central difference of the latter.
+    """
     a, b = region.per_mm[:, :1], region.per_mm[:, 1:]
     x, y = a * gaussian.var_x + b * gaussian.cov_xy, a * gaussian.cov_xy + b * gaussian.var_y  # C t
     rise = np.sqrt(np.maximum(a * x + b * y, 1e-300))  # sd of the field under the footprint, t.C t
     x, y = x / rise * _STEP, y / rise * _STEP
 
-    def shifted(sign: float) -> FloatArray:
+    def mean_albedo_at_shift(sign: float) -> FloatArray:
         moved = replace(gaussian, dx_mm=gaussian.dx_mm + sign * x, dy_mm=gaussian.dy_mm + sign * y)
         return seen_by_one(region.region, moved, n_nodes)
 
-    ahead, behind = shifted(1.0), shifted(-1.0)
+    ahead, behind = mean_albedo_at_shift(1.0), mean_albedo_at_shift(-1.0)
     field = 1 + a * (gaussian.x_mm + gaussian.dx_mm) + b * (gaussian.y_mm + gaussian.dy_mm)
     return np.asarray(field * (ahead + behind) / 2 + rise * (ahead - behind) / (2 * _STEP))
 
@@ -142,7 +145,7 @@ class RegionWithPatch:
 
     @property
     def n_regions(self) -> int:
-        """Number of hypotheses, or 1 where all share one region."""
+        """Number of regions, one for each sample; 1 where all samples share one."""
         return max(self.region.n_regions, len(self.patch))
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -155,12 +158,12 @@ class RegionWithPatch:
 
     def _added_albedo(self, points_mm: FloatArray) -> FloatArray:
         albedo, x, y, r = (self.patch[:, k : k + 1] for k in range(4))
-        return albedo * bell((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
+        return albedo * gaussian_bump((points_mm[:, 0] - x) ** 2 + (points_mm[:, 1] - y) ** 2, r)
 
 
 @seen_by_one.register
 def _mean_albedo_over_patch(region: RegionWithPatch, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Integrate the region, then add the patch: under N(m, C) it is a bell of covariance C + r^2 about its centre."""
+    """Return the mean albedo under each Gaussian: the region's, plus the patch's, a bell of covariance C + r^2."""
     albedo, x, y, r = (region.patch[:, k : k + 1] for k in range(4))
     from_x, from_y = gaussian.x_mm + gaussian.dx_mm - x, gaussian.y_mm + gaussian.dy_mm - y
     var_x, var_y = gaussian.var_x + r**2, gaussian.var_y + r**2
@@ -170,8 +173,8 @@ def _mean_albedo_over_patch(region: RegionWithPatch, gaussian: LabGaussian, n_no
     return seen_by_one(region.region, gaussian, n_nodes) + added
 
 
-def _regions_under_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
-    """Keep the regions that lie under at least one reading."""
+def _regions_with_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]:
+    """Return the regions, by pattern, that lie under at least one reading."""
     return {name: view.regions[name] for name, _ in plan.rows_by_pattern() if name in view.regions}
 
 
@@ -180,4 +183,5 @@ def _regions_under_readings(view: SceneView, plan: Plan) -> Mapping[str, Region]
 def _edge_distance_of_changed_region(
     region: RegionWithGradient | RegionWithPatch, x_mm: FloatArray, y_mm: FloatArray
 ) -> FloatArray:
+    """Return the distance of points from the nearest edge of the region itself, which the effect leaves in place."""
     return edge_distance(region.region, x_mm, y_mm)

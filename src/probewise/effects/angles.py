@@ -9,8 +9,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
-from probewise.effects.motion import candidate_scan_groups, in_scans
+from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_words
+from probewise.effects.motion import candidate_scan_groups, scan_indicator
 from probewise.effects.vocabulary import single_column_entries, value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
@@ -37,7 +37,7 @@ class OrientationError(LinearEffect[Poses]):
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
         return replace(value, orientation_rad=value.orientation_rad + np.radians(theta))
 
-    def is_of_the_ssf(self, plan: Plan) -> bool:
+    def is_absorbed_by_ssf(self, plan: Plan) -> bool:
         """Return True: turning the sensor turns its SSF, so calibration absorbs it."""
         return True
 
@@ -46,7 +46,7 @@ class OrientationError(LinearEffect[Poses]):
 
 
 @dataclass(frozen=True)
-class ScanAngleError(OneScanEffect[Poses]):
+class ScanAngleError(ScanGroupEffect[Poses]):
     """The sensor is turned by deg more than was commanded in one mounting (scans of one orientation) or one scan."""
 
     typical_deg: float = 3.0
@@ -60,12 +60,14 @@ class ScanAngleError(OneScanEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Take each mounting and each scan as a candidate; None where there is only one."""
+        """Take each mounting and each scan as a candidate; None for a single scan."""
         choices = candidate_scan_groups(extent.plan)
         return cls(choices=choices) if choices else None
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return replace(value, orientation_rad=value.orientation_rad + np.radians(theta) * in_scans(plan, self.scans))
+        return replace(
+            value, orientation_rad=value.orientation_rad + np.radians(theta) * scan_indicator(plan, self.scans)
+        )
 
     def bank(self) -> FloatArray:
         return single_column_entries(self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0]))

@@ -33,24 +33,24 @@ class ChangePointEffect(NamedEffect[V]):
     between_s: tuple[float, float] | None = None
 
     @property
-    def sizes(self) -> Mapping[str, float]:
+    def typical_sizes(self) -> Mapping[str, float]:
         """Typical size of each amplitude, by name."""
         raise NotImplementedError
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
         """All parameters but the time."""
-        return tuple(range(len(self.sizes)))
+        return tuple(range(len(self.typical_sizes)))
 
     @cached_property
     def prior(self) -> Product:
-        """Sizes of either sign, and the time: uniform over the recording, or between two chosen readings."""
-        sizes = {name: HeavyTailedPrior(size) for name, size in self.sizes.items()}
+        """Amplitudes of either sign, and the time: uniform over the recording, or between the two chosen readings."""
+        sizes = {name: HeavyTailedPrior(size) for name, size in self.typical_sizes.items()}
         return Product({**sizes, "at_s": Uniform(*self.change_interval_s)})
 
     def bank(self) -> FloatArray:
-        """Return one entry with a column for each amplitude, its time in the middle of the open interval."""
-        sizes = np.diag(list(self.sizes.values()))
+        """Return one entry, (1, n_amplitudes, n_params): a column for each amplitude, the time amid its interval."""
+        sizes = np.diag(list(self.typical_sizes.values()))
         return np.column_stack([sizes, np.full(len(sizes), sum(self.change_interval_s) / 2)])[None, :, :]
 
     @property
@@ -59,28 +59,28 @@ class ChangePointEffect(NamedEffect[V]):
         return self.between_s or (self.times_s[0], self.times_s[-1])
 
     @staticmethod
-    def is_after_change(theta: FloatArray, plan: Plan) -> BoolArray:
-        """Mark the readings taken after the change point, (n_samples, n_points)."""
+    def after_change_mask(theta: FloatArray, plan: Plan) -> BoolArray:
+        """Return the mask of the readings taken after each sample's change point, (n_samples, n_points)."""
         return np.asarray(plan.time_s > theta[:, -1:])
 
     def variants(self) -> tuple[Self, ...]:
         """Return one variant for each pair of consecutive readings."""
         return tuple(replace(self, between_s=pair) for pair in pairwise(self.times_s))
 
-    def coarse(self) -> Self:
-        """Return the effect with neighbouring intervals joined, so that about 48 remain."""
+    def with_fewer_variants(self) -> Self:
+        """Return the effect with neighbouring intervals joined, so that at most 48 remain."""
         stride = -(-(len(self.times_s) - 1) // _FEW)
         return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
 
-    def gates(self, plan: Plan) -> Gates:
+    def variant_masks(self, plan: Plan) -> Gates:
         """Return the mask of the readings after each candidate change point, taken at the middle of its interval."""
         always = self.bank()[0]
         always[:, -1] = -np.inf
         middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]
         return Gates(always, np.array([plan.time_s > at for at in middles]))
 
-    def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the time of change: for each sample an interval by its weight, then a time uniform within it.
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw the time of change: for each sample an interval with probability `weights`, then a time within it.
 
         `theta` is (n_samples, n_params), in and out; `weights` is (n_intervals,).
         """
@@ -91,7 +91,7 @@ class ChangePointEffect(NamedEffect[V]):
 
 
 def change_point_times(extent: Extent) -> tuple[float, ...] | None:
-    """List the times of a recording's readings, thinned to about 512; None where there is only one."""
+    """Return the times of a recording's readings, thinned to at most 512 intervals; None where there is only one."""
     times = np.unique(extent.plan.time_s)
     if len(times) < 2:
         return None

@@ -1,4 +1,4 @@
-"""The normal density of a reading, and its mean over the rounding cell of a quantised reading."""
+"""The normal density of a reading, and its mean over the rounding cell of a reading rounded to a step."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ def log_gaussian_density(readings: FloatArray, mean: FloatArray | float, sd: Flo
 
 
 def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: float | FloatArray) -> FloatArray:
-    """Return the natural log of the Gaussian mass within half a step of each reading, divided by the step.
+    """Return the natural log of the mean normal density over each reading's rounding cell, reading ± step / 2.
 
-    The two tail masses are subtracted in logs, so the result stays finite however far the reading
-    lies from the mean.
+    The two tail masses are subtracted in logs, so the result stays finite however far the reading lies from the mean.
     """
     low = (readings - step / 2 - mean) / sd
     high = (readings + step / 2 - mean) / sd
@@ -31,6 +30,6 @@ def log_cell_density(readings: FloatArray, mean: FloatArray, sd: FloatArray, ste
 
 
 def log_mass_between(low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return the log of a standard normal's mass between two bounds; the greater must not lie far in the upper tail."""
+    """Return the log of a standard normal's mass from `low` to `high`; inexact where both lie far in the upper tail."""
     log_low, log_high = log_ndtr(low), log_ndtr(high)
     return np.asarray(log_high + np.log(-np.expm1(np.minimum(log_low - log_high, -1e-15))))

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
-from probewise.effects.patches import bell
+from probewise.effects.patches import gaussian_bump
 from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
@@ -25,7 +25,7 @@ from probewise.sensor.stages import Footprint, Stage, View
 
 @dataclass(frozen=True)
 class EdgeBlur(LinearEffect[Footprint]):
-    """Printed edges are blurred by a Gaussian of sd_mm, which equals a wider footprint over sharp edges.
+    """Printed edges are blurred by a Gaussian of sd_mm, which acts as a wider footprint over sharp edges would.
 
     The footprint's covariance grows by sd_mm^2 along each axis, whatever the sensor's orientation.
     """
@@ -49,13 +49,13 @@ class EdgeBlur(LinearEffect[Footprint]):
         wider = theta[:, :, None] ** 2
         return replace(value, var_u=value.var_u + wider, var_v=value.var_v + wider)
 
-    def is_of_the_ssf(self, plan: Plan) -> bool:
+    def is_absorbed_by_ssf(self, plan: Plan) -> bool:
         """Return True (it equals a wider SSF) unless the height varies, which scales a footprint but not a blur."""
         ratio = height_ratio(plan)
         return ratio is None or float(np.ptp(ratio)) == 0.0
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Scale the square of the width by the fitted amount."""
+        """Return the width, (1,), with its square scaled by the fitted amount."""
         return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -64,9 +64,9 @@ class EdgeBlur(LinearEffect[Footprint]):
 
 @dataclass(frozen=True)
 class Halo(NamedEffect[Footprint]):
-    """Light scattered in the lens: (1 - share) u + share u(halo), the halo a Gaussian of sd r_mm about the footprint.
+    """Light scattered in the lens: a share of it comes from a Gaussian of sd r_mm about the footprint's centre.
 
-    It adds one Gaussian to the mixture.
+    It adds this Gaussian to the footprint's mixture.
     """
 
     least_share: float = 1e-3
@@ -93,22 +93,22 @@ class Halo(NamedEffect[Footprint]):
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
         share, variance = theta[:, :1, None], theta[:, 1:2, None] ** 2
 
-        def joined(own: FloatArray, skirt: FloatArray) -> FloatArray:
+        def with_halo_appended(own: FloatArray, halo: FloatArray) -> FloatArray:
             n_gaussians = max(own.shape[2], value.weight.shape[2])
-            shape = (*np.broadcast_shapes(own.shape[:2], skirt.shape[:2]), n_gaussians)
-            return np.concatenate([np.broadcast_to(own, shape), np.broadcast_to(skirt, (*shape[:2], 1))], axis=2)
+            shape = (*np.broadcast_shapes(own.shape[:2], halo.shape[:2]), n_gaussians)
+            return np.concatenate([np.broadcast_to(own, shape), np.broadcast_to(halo, (*shape[:2], 1))], axis=2)
 
-        def middle(mean: FloatArray) -> FloatArray:
+        def mixture_mean(mean: FloatArray) -> FloatArray:
             return np.asarray(np.sum(value.weight * mean, axis=2, keepdims=True))
 
         return replace(
             value,
-            weight=joined((1 - share) * value.weight, share),
-            u_mm=joined(value.u_mm, middle(value.u_mm)),
-            v_mm=joined(value.v_mm, middle(value.v_mm)),
-            var_u=joined(value.var_u, variance),
-            var_v=joined(value.var_v, variance),
-            cov_uv=joined(value.cov_uv, np.zeros((1, 1, 1))),
+            weight=with_halo_appended((1 - share) * value.weight, share),
+            u_mm=with_halo_appended(value.u_mm, mixture_mean(value.u_mm)),
+            v_mm=with_halo_appended(value.v_mm, mixture_mean(value.v_mm)),
+            var_u=with_halo_appended(value.var_u, variance),
+            var_v=with_halo_appended(value.var_v, variance),
+            cov_uv=with_halo_appended(value.cov_uv, np.zeros((1, 1, 1))),
         )
 
     def bank(self) -> FloatArray:
@@ -125,8 +125,8 @@ class Halo(NamedEffect[Footprint]):
 class EdgeShadow(NamedEffect[View]):
     """A raised edge casts a shadow: u - amp exp(-d^2 / 2 w^2), d the sensor's distance from the nearest edge.
 
-    Patterns may be made in different ways, one glued on, another printed. `patterns` are those with raised edges,
-    () for all; `choices` are the candidate groups.
+    Here u is the seen white fraction. Patterns may be made in different ways, one glued on, another printed. `patterns`
+    are those with raised edges, () for all; `choices` are the candidate groups.
     """
 
     typical: float = 0.01
@@ -147,7 +147,7 @@ class EdgeShadow(NamedEffect[View]):
 
         Raised edges may belong to all kinds of pattern, to one kind, or to all kinds but one.
         """
-        kinds = _edged_patterns_by_kind(extent.plan)
+        kinds = _groups_of_edged_patterns(extent.plan)
         but_one = [tuple(itertools.chain(*kinds[:k], *kinds[k + 1 :])) for k in range(len(kinds))]
         choices = tuple(dict.fromkeys([(), *kinds, *but_one])) if len(kinds) > 1 else ((),)
         return cls(narrowest_mm=0.01 * extent.length_mm, widest_mm=extent.length_mm / 3, choices=choices)
@@ -170,7 +170,7 @@ class EdgeShadow(NamedEffect[View]):
         distance = np.full((max((len(part) for _, part in parts), default=1), len(plan)), np.inf)
         for rows, part in parts:
             distance[:, rows] = part
-        return replace(value, seen=value.seen - theta[:, :1] * bell(distance**2, theta[:, 1:2]))
+        return replace(value, seen=value.seen - theta[:, :1] * gaussian_bump(distance**2, theta[:, 1:2]))
 
     def variants(self) -> tuple[Self, ...]:
         return tuple(replace(self, patterns=choice) for choice in self.choices)
@@ -188,8 +188,8 @@ class EdgeShadow(NamedEffect[View]):
         )
 
 
-def _edged_patterns_by_kind(plan: Plan) -> tuple[tuple[str, ...], ...]:
-    """Group by kind the names of the plan's patterns that have edges."""
+def _groups_of_edged_patterns(plan: Plan) -> tuple[tuple[str, ...], ...]:
+    """Return the names of the plan's patterns that have edges, one group for each kind of pattern."""
     kinds: dict[type, list[str]] = {}
     for name, _ in plan.rows_by_pattern():
         if isinstance(pattern := plan.patterns.get(name), HalfPlane | Quadrant | Disc | Polygon | Stripes):

@@ -49,25 +49,27 @@ class Extent:
         return cls(low, max(high, low + tiny), recording.plan)
 
     @property
-    def unit(self) -> str:
+    def reading_unit(self) -> str:
         """Unit of a reading, as it is written after a number."""
         return self.plan.instrumentation.unit_after_number
 
+    unit = reading_unit  # its earlier name
+
     @property
     def span(self) -> float:
-        """Range of the readings, in their unit."""
+        """Largest minus least usable reading."""
         return self.high - self.low
 
     @cached_property
     def length_mm(self) -> float:
-        """Length of the longest scan, mm; 1 where nothing moves."""
+        """Diagonal of the X and Y ranges of the longest scan, mm; 1 where nothing moves."""
         plan = self.plan
         ends = [(plan.x_mm[rows], plan.y_mm[rows]) for rows in plan.rows_by_scan() if rows.size]
         return max(float(np.hypot(np.ptp(x), np.ptp(y))) for x, y in ends) or 1.0
 
     @cached_property
     def duration_s(self) -> float:
-        """Time from the first reading to the last, s; 1 where it is 0."""
+        """Time from the first reading to the last, s; 1 where no time passes."""
         return float(np.ptp(self.plan.time_s)) or 1.0
 
     @cached_property

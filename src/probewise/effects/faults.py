@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.noise_distribution import NoiseRows
+from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -51,7 +51,7 @@ class Outliers(NoiseEffect):
 class Dropouts(NoiseEffect):
     """Lost readings: with probability `share` a reading is `value`, whatever lies under the sensor.
 
-    `ends` are the ends of the instrument's declared range: a lost reading is most likely one of them.
+    `lowest` and `highest` bound that value; `ends` are those of the instrument's declared range, its likeliest values.
     """
 
     lowest: float = -50.0
@@ -67,9 +67,9 @@ class Dropouts(NoiseEffect):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Allow any value from 1 % below the range of the readings to 1 % above; note the declared range's ends."""
+        """Allow values from 1 % below the range of the readings to 1 % above, and note the declared range's ends."""
         low, high = extent.low - 0.01 * extent.span, extent.high + 0.01 * extent.span
-        return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.unit)
+        return cls(low, high, extent.plan.instrumentation.declared_ends, unit=extent.reading_unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -82,8 +82,11 @@ class Dropouts(NoiseEffect):
         ends = (self.lowest + 0.01, self.highest - 0.01)
         return np.array([[[share, end]] for share in (0.01, 0.05) for end in ends])
 
-    def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Pair the commonest outlying value with twelve shares; none unless it occurs twice or is a range end."""
+    def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
+        """Return the commonest outlying value with each of twelve shares, (12, 2).
+
+        There is no node, (0, 2), unless an outlying value occurs twice or is an end of the declared range.
+        """
         far = (rows.predicted + rows.sd * residuals)[np.abs(residuals) > _FAR]
         # Floats differ in their last digits, so the value is one of the readings, not their mean.
         n_alike = (np.abs(far[:, None] - far) <= 1e-6 * rows.sd).sum(axis=0)

@@ -23,7 +23,7 @@ _REFERENCE_MV = 8000.0
 
 @dataclass(frozen=True)
 class GainDrift(NamedEffect[FloatArray]):
-    """Warming up of the lamp: signal x (1 + frac exp(-t / tau_s)), t as in `time_s`."""
+    """A lamp that warms up: signal x (1 + frac exp(-t / tau_s)), t the plan's `time_s`."""
 
     typical: float = 0.02
     shortest_s: float = 5.0

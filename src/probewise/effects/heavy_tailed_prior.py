@@ -57,14 +57,16 @@ class HeavyTailedPrior:
         return np.asarray(0.5 * erfc(x[..., None] / (self._sds * math.sqrt(2))).mean(axis=-1))
 
     def from_unit(self, u: FloatArray) -> FloatArray:
-        """Evaluate the quantile function, any shape: a table lookup, then Newton steps on the log of the tail."""
+        """Evaluate the quantile function, any shape."""
         u = np.asarray(u, dtype=np.float64)
         if self.positive:
             tail, sign = (1.0 - u) / 2, np.ones_like(u)
         else:
             tail, sign = np.minimum(u, 1.0 - u), np.where(u < 0.5, -1.0, 1.0)
         goal = -np.log(2 * np.clip(tail, 1e-15, 0.5))
-        return np.asarray(sign * self.typical * _tabulate_quantiles(self.smallest, self.largest).sizes_at(goal))
+        return np.asarray(
+            sign * self.typical * _tabulate_quantiles(self.smallest, self.largest).sizes_at_log_tail(goal)
+        )
 
     def to_unit(self, value: FloatArray) -> FloatArray:
         """Evaluate the cumulative distribution function, any shape."""
@@ -81,14 +83,14 @@ class HeavyTailedPrior:
 
 @dataclass(frozen=True, eq=False)
 class _QuantileTable:
-    """Quantiles of the mixture of typical size one: a table of -log(2 x upper tail), and the size it belongs to."""
+    """Quantiles of the mixture of typical size one: `depth` is -log(2 x upper tail) at each `size`."""
 
     sds: FloatArray
     depth: FloatArray
     size: FloatArray
 
-    def sizes_at(self, goal: FloatArray) -> FloatArray:
-        """Return the sizes at which -log(2 x upper tail) equals `goal`, any shape."""
+    def sizes_at_log_tail(self, goal: FloatArray) -> FloatArray:
+        """Return the sizes at which -log(2 x upper tail) equals `goal`, in its shape: a look-up, then Newton steps."""
         x = np.interp(goal, self.depth, self.size)
         for _ in range(3):
             scaled = x[..., None] / (self.sds * math.sqrt(2))
@@ -115,7 +117,7 @@ def _tabulate_quantiles(smallest: float, largest: float) -> _QuantileTable:
 
 @dataclass(frozen=True)
 class LogHeavyTailedPrior:
-    """Prior of a factor or exponent near one: its logarithm is heavy-tailed about zero."""
+    """Prior of a positive factor or exponent about one: its logarithm has a heavy-tailed prior about zero."""
 
     typical_log: float
     smallest: float = SMALLEST_AND_LARGEST[0]

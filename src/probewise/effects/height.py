@@ -7,8 +7,8 @@ from typing import Self
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
-from probewise.effects.motion import candidate_scan_groups, in_scans
+from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_words
+from probewise.effects.motion import candidate_scan_groups, scan_indicator
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.commanded import footprint_at_height
@@ -50,7 +50,7 @@ class HeightGradient(LinearEffect[Footprint]):
 
 
 @dataclass(frozen=True)
-class HeightOffset(OneScanEffect[Footprint]):
+class HeightOffset(ScanGroupEffect[Footprint]):
     """One mounting or scan at another height: h = h0 + mm there; footprint x h/h0, signal x (h0/h)^2."""
 
     typical_mm: float = 0.15
@@ -69,7 +69,7 @@ class HeightOffset(OneScanEffect[Footprint]):
         return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_height(value, 1 + theta * in_scans(plan, self.scans) / _nominal_height_mm(plan))
+        return footprint_at_height(value, 1 + theta * scan_indicator(plan, self.scans) / _nominal_height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "higher" if mean[0] > 0 else "lower"
@@ -78,4 +78,5 @@ class HeightOffset(OneScanEffect[Footprint]):
 
 
 def _nominal_height_mm(plan: Plan) -> float:
+    """Return the height in the recording's description, or 14 mm where it gives none."""
     return plan.instrumentation.height_mm or _USUAL_MM

@@ -1,4 +1,4 @@
-"""Changes at one time that are outside the vocabulary: the arm is knocked, or the gain jumps."""
+"""Sudden changes that are outside the vocabulary: the arm is knocked, or the gain jumps."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ class ArmKnock(ChangePointEffect[Poses]):
         return None if times is None else cls(times, typical_mm=0.005 * extent.length_mm)
 
     @property
-    def sizes(self) -> Mapping[str, float]:
+    def typical_sizes(self) -> Mapping[str, float]:
         return {"dx_mm": self.typical_mm, "dy_mm": self.typical_mm, "turn_deg": self.typical_deg}
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        since = self.is_after_change(theta, plan)
+        since = self.after_change_mask(theta, plan)
         return replace(
             value,
             x_mm=value.x_mm + theta[:, :1] * since,
@@ -75,11 +75,11 @@ class GainStep(ChangePointEffect[FloatArray]):
         return None if times is None else cls(times)
 
     @property
-    def sizes(self) -> Mapping[str, float]:
+    def typical_sizes(self) -> Mapping[str, float]:
         return {"frac": self.typical}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value * (1 + theta[:, :1] * self.is_after_change(theta, plan)))
+        return np.asarray(value * (1 + theta[:, :1] * self.after_change_mask(theta, plan)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "stronger" if mean[0] > 0 else "weaker"

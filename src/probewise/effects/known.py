@@ -42,7 +42,7 @@ class Known(WrappedEffect[V]):
 
 @dataclass(frozen=True)
 class Informed(WrappedEffect[V]):
-    """An effect whose prior is `own`, from what is known of its parameters, instead of its usual one."""
+    """An effect with the prior `own`, from earlier knowledge of its parameters, in place of its usual one."""
 
     effect: Effect[V]
     own: Prior
@@ -69,5 +69,5 @@ class Estimated(Known[V]):
 
     @property
     def informed(self) -> Informed[V]:
-        """The effect with these marginals as its prior."""
+        """The effect with free parameters again, these marginals as its prior."""
         return Informed(self.effect, Product(dict(zip(self.effect.prior.names, self.marginals, strict=True))))

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.noise_distribution import NoiseRows
+from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
@@ -23,7 +23,7 @@ _DIGITS = 1e-6  # of a step: below this a difference is rounding
 
 @dataclass(frozen=True)
 class Quantisation(NoiseEffect):
-    """Rounded readings: step round(reading / step), after the noise."""
+    """Readings rounded to a step that was not declared: step round(reading / step), after the noise."""
 
     smallest: float = 0.05
     largest: float = 20.0
@@ -43,7 +43,7 @@ class Quantisation(NoiseEffect):
         """Search steps from a thousandth to a fifth of the readings' range; None where a step is declared."""
         if extent.plan.instrumentation.step is not None:
             return None
-        return cls(1e-3 * extent.span, 0.2 * extent.span, unit=extent.unit)
+        return cls(1e-3 * extent.span, 0.2 * extent.span, unit=extent.reading_unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -52,8 +52,8 @@ class Quantisation(NoiseEffect):
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
         return replace(value, step=theta[:, :1])
 
-    def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
-        """Return the step of the readings' lattice as the only node; no node where it is too fine to matter."""
+    def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
+        """Return the step of the readings' lattice as the only node, (1, 1); (0, 1) where it is too fine to matter."""
         step = lattice_step(rows.predicted + rows.sd * residuals)
         return np.array([[step]]) if step > self.seen_above * rows.sd else np.zeros((0, 1))
 
@@ -64,10 +64,11 @@ class Quantisation(NoiseEffect):
 
 
 def lattice_step(readings: FloatArray) -> float:
-    """Find the step of a lattice that holds all readings; 0 where none is coarser than a millionth of the range.
+    """Find the step of a lattice that holds all readings; 0 where there is none.
 
-    Readings printed to some digits lie on a lattice too; a coarser lattice is found through it, since printing moves
-    each value by at most half a digit.
+    It is 0 also for a step below 1e-5 of the range, and for fewer than three distinct readings. Readings printed to
+    some digits lie on a lattice too; a coarser lattice is found through it, since printing moves each value by at most
+    half a digit.
     """
     values = np.unique(readings[np.isfinite(readings)])
     if len(values) < 3:
@@ -80,7 +81,8 @@ def lattice_step(readings: FloatArray) -> float:
 def lattice_step_sd(readings: FloatArray, step: float) -> float:
     """Estimate the sd of a lattice's step, as fitted to distinct readings that were printed to some digits.
 
-    It is the sd of the printing's rounding error over the norm of the readings' lattice numbers, centred.
+    It is the sd of the printing's rounding error over the norm of the readings' lattice numbers, centred; at least a
+    millionth of the step.
     """
     values = np.unique(readings[np.isfinite(readings)])
     digits = (10.0**-n for n in range(10) if np.allclose(values, np.round(values, n), rtol=0, atol=1e-6 * 10.0**-n))

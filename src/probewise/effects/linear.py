@@ -47,7 +47,7 @@ class LinearEffect(NamedEffect[V]):
 
 
 @dataclass(frozen=True)
-class OneScanEffect(LinearEffect[V]):
+class ScanGroupEffect(LinearEffect[V]):
     """Base of linear effects on one scan, or on the scans of one mounting: which of them is a discrete choice.
 
     `scans` are the affected scans; `choices` are the candidate groups of scans.
@@ -61,5 +61,5 @@ class OneScanEffect(LinearEffect[V]):
 
 
 def scans_in_words(scans: tuple[str, ...]) -> str:
-    """Write the names of scans: "scan a", or "scans a, b"."""
+    """Return the names of scans as a phrase: "scan a", or "scans a, b"."""
     return f"scan{'s' if len(scans) > 1 else ''} {', '.join(scans)}"

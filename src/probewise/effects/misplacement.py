@@ -9,8 +9,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.linear import LinearEffect, OneScanEffect, scans_in_words
-from probewise.effects.motion import in_scans
+from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_words
+from probewise.effects.motion import scan_indicator
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.patterns import HalfPlane, Ramp, Stripes
 from probewise.recordings.plan import Plan
@@ -43,7 +43,7 @@ class EdgeMisplacement(LinearEffect[SceneView]):
 
 
 @dataclass(frozen=True)
-class ScanMisplacement(OneScanEffect[SceneView]):
+class ScanMisplacement(ScanGroupEffect[SceneView]):
     """In one scan the pattern is shifted by offset_mm along its edge's normal, or along X where it has none."""
 
     typical_mm: float = 0.3
@@ -64,7 +64,7 @@ class ScanMisplacement(OneScanEffect[SceneView]):
         return cls(choices=tuple((name,) for name in names), typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:
-        return _with_shifted_patterns(value, theta * in_scans(plan, self.scans), plan)
+        return _with_shifted_patterns(value, theta * scan_indicator(plan, self.scans), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -74,7 +74,7 @@ class ScanMisplacement(OneScanEffect[SceneView]):
 
 
 def _with_shifted_patterns(view: SceneView, by_mm: FloatArray, plan: Plan) -> SceneView:
-    """Shift each reading's pattern by `by_mm`, (n_samples, n_points)."""
+    """Return the view with each reading's pattern shifted along its edge's normal, `by_mm` (n_samples, n_points)."""
     angle = np.zeros(len(plan))
     for name, rows in plan.rows_by_pattern():
         pattern = plan.patterns.get(name)

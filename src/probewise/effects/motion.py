@@ -19,8 +19,8 @@ def direction_varies(plan: Plan) -> bool:
     return bool(np.ptp(sign_of_motion(plan)) > 0)
 
 
-def in_scans(plan: Plan, names: tuple[str, ...]) -> FloatArray:
-    """Return 1 for the readings of these scans, 0 for the others, (n_points,)."""
+def scan_indicator(plan: Plan, names: tuple[str, ...]) -> FloatArray:
+    """Return 1.0 for the readings of these scans, 0.0 for the others, (n_points,)."""
     member = np.array([name in names for name in plan.scan_names], dtype=np.float64)
     return np.asarray(member[plan.scan])
 

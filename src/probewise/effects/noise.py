@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
-from probewise.effects.noise_distribution import NoiseRows
+from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
@@ -37,7 +37,7 @@ class CorrelatedNoise(NoiseEffect):
         return Product({"rho": Uniform(self.lowest, self.highest)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the correlation; the sd of a single reading does not change."""
+        """Return the noise with this correlation; the sd of a single reading does not change."""
         return replace(value, rho=theta[:, :1])
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -126,7 +126,7 @@ class RandomWalk(NoiseEffect):
         return Product({"sd_per_row": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Set the step; the sd of a reading about the walk does not change."""
+        """Return the noise with steps of this sd; the sd of a reading about the walk does not change."""
         return replace(
             value, walk=theta[:, :1], walked=np.asarray(self.n_before + 1.0 + np.arange(len(plan)), dtype=np.float64)
         )
@@ -141,7 +141,7 @@ _NEWTON_STEPS = 40
 
 @dataclass(frozen=True)
 class NoisePerRun(NoiseEffect):
-    """Another noise sd in each run: sd x value of the run; the logarithms of the values are normal about 0.
+    """A noise sd of its own in each run: sd x the run's value; the logarithm of a value has a heavy-tailed prior.
 
     Parameters
     ----------
@@ -190,10 +190,10 @@ class NoisePerRun(NoiseEffect):
         """Return one entry, 1 in every run: `weighed_nodes` finds the values from a fit's residuals."""
         return np.ones((1, 1, len(self.runs)))
 
-    def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
+    def weighed_nodes(self, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
         """Return the runs' most probable values, (n_nodes, n_runs), and log Laplace weights, (n_nodes,).
 
-        Each node is one sd of the logs of the values between runs.
+        There is one node for each assumed sd, between runs, of the logs of the values.
         """
         n_runs = len(self.runs)
         counts = np.bincount(rows.run, minlength=n_runs).astype(np.float64)
@@ -202,7 +202,7 @@ class NoisePerRun(NoiseEffect):
             return np.zeros((0, n_runs)), np.zeros(0)
         values, log_weights = [], []
         for spread in _SPREADS:
-            logs = _most_likely_log_sds(counts, squares, spread)
+            logs = _most_probable_log_sd_ratios(counts, squares, spread)
             curvature = 2 * counts + spread**-2
             # The overall sd is integrated elsewhere, at fixed values: `beside` corrects for its coupling to them.
             beside = float(np.sum(2 * counts * spread**-2 / curvature)) / float(2 * counts.sum())
@@ -232,8 +232,8 @@ class NoisePerRun(NoiseEffect):
         )
 
 
-def _most_likely_log_sds(counts: FloatArray, squares: FloatArray, spread: float) -> FloatArray:
-    """Return the most probable logs of the runs' noise sds over the overall sd, which is profiled out, (n_runs,).
+def _most_probable_log_sd_ratios(counts: FloatArray, squares: FloatArray, spread: float) -> FloatArray:
+    """Return the most probable logs of each run's noise sd over the overall sd, (n_runs,); the latter is profiled out.
 
     `counts` and `squares` are the number of readings and the sum of squared residuals of each run, (n_runs,); `spread`
     is the prior sd of the logs.

@@ -14,8 +14,8 @@ _NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseRows:
-    """A fit as noise effects need it: `predicted` readings and their `run` (scan number), (n_points,); noise `sd`."""
+class FittedReadings:
+    """A fit's predicted readings and the number of each one's run (scan), (n_points,), and the noise sd."""
 
     predicted: FloatArray
     sd: float
@@ -23,7 +23,7 @@ class NoiseRows:
 
 
 def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Return the natural log of each reading's marginal density, (n_samples, n_points), per unit of the reading.
+    """Return the natural log of the density of each reading alone, (n_samples, n_points), per unit of the reading.
 
     Parameters
     ----------
@@ -47,14 +47,14 @@ def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) 
 
 
 def variance(level: NoiseLevel) -> FloatArray:
-    """Return the variance of a reading that is not lost, broadcasting to (n_samples, n_points)."""
+    """Return the variance of a reading that is not lost, with outliers, random walk and rounding; it broadcasts."""
     level = _with_walk_variance(level)
     wide = 1 + level.wide_share * (level.wide_times**2 - 1)
     return np.asarray(level.sd**2 * wide + level.step**2 / 12)
 
 
 def _with_walk_variance(level: NoiseLevel) -> NoiseLevel:
-    """Add the random walk's marginal variance at each row to the noise sd."""
+    """Return the noise with the random walk's marginal variance at each row included in its sd."""
     if not np.any(level.walk):
         return level
     return replace(level, sd=level.sd * np.sqrt(1 + level.walk**2 * level.walked), walk=np.zeros((1, 1)))

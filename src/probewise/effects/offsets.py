@@ -36,7 +36,7 @@ class AmbientGradient(LinearEffect[FloatArray]):
         """Set the typical slope to 1 % of the readings' range over the longest scan; None where nothing moves."""
         if np.ptp(extent.plan.x_mm) == np.ptp(extent.plan.y_mm) == 0:
             return None
-        return cls(typical_per_mm=0.01 * extent.span / extent.length_mm, unit=extent.unit)
+        return cls(typical_per_mm=0.01 * extent.span / extent.length_mm, unit=extent.reading_unit)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         return np.asarray(value + theta[:, :1] * plan.x_mm + theta[:, 1:2] * plan.y_mm)
@@ -51,7 +51,7 @@ class AmbientGradient(LinearEffect[FloatArray]):
 
 @dataclass(frozen=True)
 class OffsetDrift(LinearEffect[FloatArray]):
-    """A slow drift: reading + per_hour t, t as in `time_s`."""
+    """A slow drift: reading + per_hour t, t the plan's time in hours."""
 
     typical_per_hour: float = 1.0
     unit: str = field(default="", kw_only=True)
@@ -66,7 +66,7 @@ class OffsetDrift(LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical drift to 1 % of the readings' range over the recording."""
-        return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600), unit=extent.unit)
+        return cls(typical_per_hour=0.01 * extent.span / (extent.duration_s / 3600), unit=extent.reading_unit)
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         return np.asarray(value + theta[:, :1] * (plan.time_s / 3600))
@@ -96,16 +96,16 @@ class AmbientStep(ChangePointEffect[FloatArray]):
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical step to 1 % of the readings' range; None where all readings share one time."""
         times = change_point_times(extent)
-        return None if times is None else cls(times, typical=0.01 * extent.span, unit=extent.unit)
+        return None if times is None else cls(times, typical=0.01 * extent.span, unit=extent.reading_unit)
 
     @property
-    def sizes(self) -> Mapping[str, float]:
+    def typical_sizes(self) -> Mapping[str, float]:
         return {"amp": self.typical}
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * self.is_after_change(theta, plan))
+        return np.asarray(value + theta[:, :1] * self.after_change_mask(theta, plan))
 
-    def coarse(self) -> Self:
+    def with_fewer_variants(self) -> Self:
         """Keep all intervals: the time of the step is what identifies it."""
         return self
 

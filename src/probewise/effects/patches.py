@@ -25,14 +25,17 @@ _STRAIGHT = 0.02  # of a scan's length: the largest deviation from a straight li
 _LEAST_PLACES = 8
 
 
-def bell(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
-    """Return exp(-d^2 / 2 r^2); the arrays broadcast."""
+def gaussian_bump(squared_distance: FloatArray, radius: FloatArray) -> FloatArray:
+    """Return exp(-d^2 / 2 r^2) of the squared distances d^2; the arrays broadcast."""
     return np.exp(-0.5 * squared_distance / radius**2)
 
 
 @dataclass(frozen=True)
 class ScanLine:
-    """A line of places s t + offset_mm n, s from low_mm to high_mm; t at `angle_rad` to X, n a quarter turn further."""
+    """A line at `angle_rad` to X, `offset_mm` beside the origin, from `low_mm` to `high_mm` along it.
+
+    Its places are s t + offset_mm n, s from low_mm to high_mm; t is its unit vector, n is t turned by 90 degrees.
+    """
 
     angle_rad: float
     offset_mm: float
@@ -41,7 +44,7 @@ class ScanLine:
 
     @property
     def length_mm(self) -> float:
-        """Length of the line."""
+        """Length of the line, mm."""
         return self.high_mm - self.low_mm
 
     def place(self, along_mm: FloatArray, beside_mm: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -59,8 +62,8 @@ ALONG_X = ScanLine(0.0, 0.0, -50.0, 50.0)
 """The X axis, 50 mm to either side."""
 
 
-def scanned_lines(plan: Plan) -> tuple[ScanLine, ...]:
-    """List the distinct lines of the straight scans."""
+def straight_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
+    """Return the distinct lines of the straight scans of eight places or more."""
     found: dict[tuple[float, float], ScanLine] = {}
     for rows in plan.rows_by_scan():
         places = np.unique(np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1), axis=0)
@@ -96,7 +99,7 @@ class PatchPrior:
         return (self.size, "x", "y", "r")
 
     @property
-    def radius(self) -> LogUniform:
+    def radius_prior(self) -> LogUniform:
         """Prior of the radius."""
         return LogUniform(_RADII[0] / 2 * self.line.length_mm, _RADII[-1] * 2 * self.line.length_mm)
 
@@ -109,7 +112,7 @@ class PatchPrior:
                 "on_line": HeavyTailedPrior(self.typical),
                 "along": Uniform(line.low_mm - _MARGIN * length, line.high_mm + _MARGIN * length),
                 "beside": self.BESIDE,
-                "r": self.radius,
+                "r": self.radius_prior,
             }
         )
 
@@ -139,7 +142,7 @@ class PatchPrior:
 
 @dataclass(frozen=True)
 class PatchEffect(NamedEffect[V]):
-    """Base of effects that are a patch on or beside a scanned line, `line`; `lines` are the candidates."""
+    """Base of effects that are a patch on or beside the scanned line `line`; `lines` are the candidate lines."""
 
     typical: float
     line: ScanLine = ALONG_X
@@ -158,7 +161,7 @@ class PatchEffect(NamedEffect[V]):
         return tuple(replace(self, line=line) for line in self.lines)
 
     def bank(self) -> FloatArray:
-        """List patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
+        """Return patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
         patches = []
         for share in _RADII:
             r = share * self.line.length_mm

@@ -78,7 +78,7 @@ class PositionScale(LinearEffect[Poses]):
         return replace(value, x_mm=value.x_mm * (1 + theta[:, :1]), y_mm=value.y_mm * (1 + theta[:, 1:2]))
 
     def bank(self) -> FloatArray:
-        """Return entries of two columns: one small, which the SSF's width may absorb, and four large."""
+        """Return five entries, (5, 2, 2): a small one, which the SSF's width may absorb, and four large ones."""
         return np.array([self.typical, *_LARGE_SCALES])[:, None, None] * np.eye(2)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

@@ -21,7 +21,7 @@ class PredictiveMixture:
     readings
         Measured readings, (n_points,).
     scored
-        Which readings get a log density, (n_points,).
+        Mask of the readings that get a log density, (n_points,).
     step
         The declared rounding step, if any.
     """
@@ -72,7 +72,7 @@ class PredictiveMixture:
 
 
 def _noise_of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
-    """Select the noise of some rows."""
+    """Return the noise of some rows, given by their mask (n_points,)."""
     if level.sd.shape[-1] == 1:
         return level
     return replace(level, sd=level.sd[:, rows])

@@ -37,7 +37,7 @@ class BentRails(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical quadratic error to 0.5 % of the longest scan's length, at half of it or 10 mm if more."""
+        """Set the typical quadratic error to 0.5 % of the longest scan's length L, at X = L / 2 or 10 mm if more."""
         return cls(typical_mm=0.005 * extent.length_mm / max(0.5 * extent.length_mm / _UNIT_MM, 1.0) ** 2)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
@@ -107,7 +107,7 @@ class MissingTooth(NamedEffect[Poses]):
 
 
 def _thinned_positions(axis_mm: FloatArray) -> tuple[float, ...]:
-    """List distinct positions of one axis, thinned to at most 160."""
+    """Return the distinct positions of one axis, sorted and thinned to at most 160."""
     places = np.unique(np.round(axis_mm, 6))
     stride = -(-len(places) // _MOST_PLACES)
     return tuple(places[::stride].tolist())

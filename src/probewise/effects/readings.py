@@ -36,7 +36,7 @@ class Hysteresis(LinearEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical amplitude to 1 % of the readings' range; None where the direction never changes."""
-        return cls(typical=0.01 * extent.span, unit=extent.unit) if direction_varies(extent.plan) else None
+        return cls(typical=0.01 * extent.span, unit=extent.reading_unit) if direction_varies(extent.plan) else None
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         return np.asarray(value + theta[:, :1] * sign_of_motion(plan))
@@ -80,7 +80,7 @@ class Lag(NamedEffect[FloatArray]):
         return Product({"tau_s": LogUniform(self.shortest_s, self.longest_s)})
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Filter the readings, (n_samples, n_points).
+        """Return the lagged readings, (n_samples, n_points).
 
         Each lagged reading is an affine map of the one before. A parallel prefix scan composes the maps in pairs, then
         pairs of pairs, until each reading's map starts at the beginning of its scan.

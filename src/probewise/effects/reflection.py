@@ -35,7 +35,7 @@ class Reflection(NamedEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search displacements up to half the longest scan."""
+        """Search displacements up to half the length of the longest scan, along X and along Y."""
         return cls(farthest_mm=0.5 * extent.length_mm)
 
     @cached_property
@@ -50,12 +50,12 @@ class Reflection(NamedEffect[Footprint]):
         u_mm = value.u_mm + np.cos(turn) * dx + np.sin(turn) * dy
         v_mm = value.v_mm - np.sin(turn) * dx + np.cos(turn) * dy
         return Footprint(
-            weight=_joined_gaussians(value.weight * (1 - share), value.weight * share),
-            u_mm=_joined_gaussians(value.u_mm, u_mm),
-            v_mm=_joined_gaussians(value.v_mm, v_mm),
-            var_u=_joined_gaussians(value.var_u, value.var_u),
-            var_v=_joined_gaussians(value.var_v, value.var_v),
-            cov_uv=_joined_gaussians(value.cov_uv, value.cov_uv),
+            weight=_concatenated_components(value.weight * (1 - share), value.weight * share),
+            u_mm=_concatenated_components(value.u_mm, u_mm),
+            v_mm=_concatenated_components(value.v_mm, v_mm),
+            var_u=_concatenated_components(value.var_u, value.var_u),
+            var_v=_concatenated_components(value.var_v, value.var_v),
+            cov_uv=_concatenated_components(value.cov_uv, value.cov_uv),
             brightness=value.brightness,
         )
 
@@ -72,6 +72,7 @@ class Reflection(NamedEffect[Footprint]):
         )
 
 
-def _joined_gaussians(first: FloatArray, second: FloatArray) -> FloatArray:
+def _concatenated_components(first: FloatArray, second: FloatArray) -> FloatArray:
+    """Concatenate values of two sets of Gaussians, (n_samples, n_points, n_gaussians) each, along the last axis."""
     shape = np.broadcast_shapes(first.shape, second.shape)
     return np.concatenate([np.broadcast_to(first, shape), np.broadcast_to(second, shape)], axis=2)

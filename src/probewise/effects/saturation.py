@@ -44,18 +44,18 @@ class Saturation(NamedEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search limits from 20 % of the readings' range to 30 % above it: a soft limit acts below its level."""
+        """Search levels from 20 % of the readings' range to 30 % above it: a soft limit acts below its level."""
         return cls(
             lowest=extent.low + 0.2 * extent.span,
             highest=extent.high + 0.3 * extent.span,
             sharpest=1e-3 * extent.span,
             softest=0.3 * extent.span,
-            unit=extent.unit,
+            unit=extent.reading_unit,
         )
 
     @cached_property
     def prior(self) -> Product:
-        """Level, uniform over the range where it would act, and softness, log-uniform."""
+        """Level, uniform over the levels at which the limit would act, and softness, log-uniform."""
         return Product(
             {"level": Uniform(self.lowest, self.highest), "softness": LogUniform(self.sharpest, self.softest)}
         )
@@ -65,7 +65,7 @@ class Saturation(NamedEffect[FloatArray]):
         return np.asarray(level - softness * np.logaddexp(0.0, (level - value) / softness))
 
     def bank(self) -> FloatArray:
-        """Return entries of one column: sharp limits, denser near the top, and soft limits."""
+        """Return 13 entries, (13, 1, 2): nine sharp limits, denser near the top, and four soft ones."""
         span = (self.highest - self.lowest) / 1.1
         top = self.highest - 0.3 * span
         sharp = [(top - share * 0.8 * span, self.sharpest * 5) for share in np.geomspace(0.02, 0.9, 9)]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_mapping
 from probewise.effects.extent import Extent
-from probewise.effects.noise_distribution import NoiseRows
+from probewise.effects.noise_distribution import FittedReadings
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Effect, NoiseLevel
@@ -48,7 +48,7 @@ class NamedEffect(Effect[V], Protocol[V]):
 
     @property
     def covariates(self) -> tuple[str, ...]:
-        """Covariates against which its residuals show a trend."""
+        """Names of covariates against which the residuals show a trend where the effect is left out."""
         ...
 
     @property
@@ -81,7 +81,7 @@ class NamedEffect(Effect[V], Protocol[V]):
         """
         return cls()
 
-    def is_of_the_ssf(self, plan: Plan) -> bool:
+    def is_absorbed_by_ssf(self, plan: Plan) -> bool:
         """Return whether a free SSF absorbs the effect completely under this plan, so that it cannot be identified.
 
         By default False.
@@ -123,18 +123,19 @@ class NamedEffect(Effect[V], Protocol[V]):
         """
         return (self,)
 
-    def gates(self, plan: Plan) -> Gates | None:
+    def variant_masks(self, plan: Plan) -> Gates | None:
         """Return the masks of variants that differ only in the readings they act on; None for other variants."""
         return None
 
-    def coarse(self) -> Self:
-        """Return the effect with fewer variants, enough to detect it; by default with all of them."""
+    def with_fewer_variants(self) -> Self:
+        """Return the effect with fewer variants, as many as detection needs; by default with all of them."""
         return self
 
-    def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Redraw the parameter that the variant determines: for each sample a variant by its weight, then the value.
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Redraw the parameter that the variants divide among them: draw a variant for each sample, then its value.
 
-        `theta` is (n_samples, n_params), in and out; `weights` is (n_variants,). By default theta does not change.
+        Returns theta, (n_samples, n_params) as given, with that parameter replaced; by default unchanged. `weights`
+        (n_variants,) are the probabilities of the variants.
         """
         return theta
 
@@ -149,8 +150,8 @@ class NamedEffect(Effect[V], Protocol[V]):
         return np.asarray(setting)
 
 
-def require_effects(effects: object) -> None:
-    """Raise ParameterError unless these are classes of effects by name, each with all members of its own."""
+def require_effect_classes(effects: object) -> None:
+    """Raise ParameterError unless `effects` maps names to classes of effects that define all required members."""
     allowed = "classes of effects by name, such as {**VOCABULARY, 'overflow': Overflow}, of probewise.effects"
     require_mapping("effects", effects, allowed)
     assert isinstance(effects, Mapping)
@@ -180,27 +181,27 @@ class NoiseEffect(NamedEffect[NoiseLevel], Protocol):
     """Whether it is physics of the mean, seen in the readings alone."""
 
     @property
-    def certain_parameters(self) -> FloatArray | None:
-        """Parameters (n_params,) that are certain from the readings alone; by default None: they take a fit."""
+    def parameters_known_before_fit(self) -> FloatArray | None:
+        """Parameters, (n_params,), that the readings alone determine; None, by default, where they need a fit."""
         return None
 
-    def change(self, predicted: FloatArray) -> FloatArray:
-        """Return by how much it changes readings predicted without it, same shape; 0 unless it `changes_the_mean`."""
+    def change_of_readings(self, predicted: FloatArray) -> FloatArray:
+        """Return the change of readings that were predicted without it, same shape; 0 unless it `changes_the_mean`."""
         return np.zeros_like(predicted)
 
     def bank(self) -> FloatArray:
         """Return equally weighted nodes of the prior of its one parameter, (n_nodes, 1, 1)."""
         return self.prior.from_unit_cube((np.arange(self.n_nodes)[:, None] + 0.5) / self.n_nodes)[:, None, :]
 
-    def nodes(self, residuals: FloatArray, rows: NoiseRows) -> FloatArray:
+    def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:
         """Return equally weighted nodes of the prior given a fit, (n_nodes, n_params); none where the fit excludes it.
 
         `residuals` (n_points,) are in units of the noise sd.
         """
         return self.bank()[:, 0, :]
 
-    def weighed_nodes(self, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
-        """Return nodes given a fit and the log of each one's prior weight, (n_nodes, n_params) and (n_nodes,)."""
+    def weighed_nodes(self, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
+        """Return nodes given a fit, (n_nodes, n_params), and the log of each one's prior weight, (n_nodes,)."""
         nodes = self.nodes(residuals, rows)
         return nodes, np.full(len(nodes), -np.log(max(len(nodes), 1)))
 
@@ -215,7 +216,7 @@ def single_column_entries(*parameters: ArrayLike) -> FloatArray:
 
 
 def value_with_sd(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:
-    """Write mean ± sd and the unit, rounded to two significant digits of the sd."""
+    """Return "mean ± sd unit", both numbers times `factor`, rounded to two significant digits of the sd."""
     mean, sd = factor * mean, factor * sd
     if np.isfinite(sd) and sd > 0:
         digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, 8))

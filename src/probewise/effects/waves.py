@@ -25,7 +25,7 @@ _ORDERS = np.arange(1, 7)  # harmonics of a sawtooth; the slip takes a sixth of 
 _SHARES = np.sinc(_ORDERS / 7) / _ORDERS * 2 / np.pi  # amplitude of each, damped against Gibbs overshoot
 
 
-def sine_and_cosine(*parameters: ArrayLike) -> FloatArray:
+def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of waves, a sine and a cosine each, (n_bank, 2, n_params).
 
     `parameters` are those before the phase, which is the last: numbers or (n_bank,); the first is the amplitude.
@@ -33,8 +33,11 @@ def sine_and_cosine(*parameters: ArrayLike) -> FloatArray:
     return np.concatenate([single_column_entries(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
 
 
-def amplitude_and_phase(entry: FloatArray, amounts: FloatArray) -> FloatArray:
-    """Convert the amounts of sine and cosine to amplitude, first, and phase, last; the rest of the entry stays."""
+def starting_point_of_wave(entry: FloatArray, amounts: FloatArray) -> FloatArray:
+    """Return the parameters, (n_params,), of the wave that a bank entry's sine and cosine add up to, by fitted amounts.
+
+    The amplitude is the first, the phase the last; those between are the entry's.
+    """
     setting = entry[0].copy()
     sine, cosine = amounts * setting[0]
     setting[0], setting[-1] = np.hypot(sine, cosine), np.arctan2(cosine, sine)
@@ -42,10 +45,10 @@ def amplitude_and_phase(entry: FloatArray, amounts: FloatArray) -> FloatArray:
 
 
 class _WaveEffect(NamedEffect[V]):
-    """Base of effects with an amplitude, a frequency or period, and a phase; a bank entry holds sine and cosine."""
+    """Base of effects with amplitude, frequency or period, and phase; an entry has a sine and a cosine column."""
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        return amplitude_and_phase(entry, amounts)
+        return starting_point_of_wave(entry, amounts)
 
 
 @dataclass(frozen=True)
@@ -69,13 +72,13 @@ class Flicker(_WaveEffect[FloatArray]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Search from 0.01 Hz to half the median rate, with two frequencies per resolution width 1 / duration."""
+        """Search from 0.01 Hz to half the median rate of readings, two frequencies per 1 / duration; None if empty."""
         highest = 0.5 / extent.gap_s
         if highest <= cls.lowest_hz:
             return None
         wanted = 2 * (highest - cls.lowest_hz) * extent.duration_s
         n_frequencies = int(np.clip(np.ceil(wanted), 8, _MOST_FREQUENCIES))
-        return cls(0.01 * extent.span, cls.lowest_hz, highest, n_frequencies, unit=extent.unit)
+        return cls(0.01 * extent.span, cls.lowest_hz, highest, n_frequencies, unit=extent.reading_unit)
 
     @cached_property
     def prior(self) -> Product:
@@ -88,7 +91,7 @@ class Flicker(_WaveEffect[FloatArray]):
 
     def bank(self) -> FloatArray:
         frequencies = np.linspace(self.lowest_hz, self.highest_hz, self.n_frequencies + 2)[1:-1]
-        return sine_and_cosine(self.typical, frequencies)
+        return sine_and_cosine_entries(self.typical, frequencies)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -116,7 +119,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search periods from three steps of X to twice its range; None where X takes fewer than eight positions."""
-        shortest, reach = _three_steps_and_range(extent.plan)
+        shortest, reach = _shortest_period_and_range_mm(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 2 * reach) if reach > 0 else None
 
     @cached_property
@@ -133,7 +136,7 @@ class PeriodicPositionError(_WaveEffect[Poses]):
         n_even = self.n_periods - 8
         waves = np.linspace(1.0, self.longest_mm / 2 / self.shortest_mm, n_even + 1)[1:]
         periods = np.append(self.longest_mm / 2 / waves, self.longest_mm / np.geomspace(1.05, 2.0, 8))
-        return sine_and_cosine(self.typical_mm, np.maximum(periods, self.shortest_mm * 1.001))
+        return sine_and_cosine_entries(self.typical_mm, np.maximum(periods, self.shortest_mm * 1.001))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -161,7 +164,7 @@ class StickSlip(NamedEffect[Poses]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search periods from three steps of X to a quarter of its range; None where that is empty."""
-        shortest, reach = _three_steps_and_range(extent.plan)
+        shortest, reach = _shortest_period_and_range_mm(extent.plan)
         return cls(0.003 * extent.length_mm, shortest, 0.25 * reach) if 0.25 * reach > shortest else None
 
     @cached_property
@@ -187,7 +190,7 @@ class StickSlip(NamedEffect[Poses]):
         )
 
 
-def _three_steps_and_range(plan: Plan) -> tuple[float, float]:
+def _shortest_period_and_range_mm(plan: Plan) -> tuple[float, float]:
     """Return three times the median step of X and the range of X, mm; 0 and 0 for fewer than eight positions."""
     x_mm = np.unique(plan.x_mm)
     return (3 * float(np.median(np.diff(x_mm))), float(np.ptp(x_mm))) if len(x_mm) >= 8 else (0.0, 0.0)

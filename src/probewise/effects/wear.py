@@ -44,7 +44,7 @@ class SlowTurn(LinearEffect[Poses]):
 
 @dataclass(frozen=True)
 class SlowSinking(LinearEffect[Footprint]):
-    """The height changes: h/h0 = 1 + per_hour t; footprint x h/h0, signal x (h0/h)^2."""
+    """The sensor sinks or rises: h/h0 = 1 + per_hour t; footprint x h/h0, signal x (h0/h)^2."""
 
     typical_per_hour: float = 0.1
 

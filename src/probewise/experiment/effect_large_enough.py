@@ -43,7 +43,7 @@ class EffectLargeEnoughForRun(WrappedEffect[Any]):
         if isinstance(own, PatchPrior):
             size = HeavyTailedPrior(own.typical, smallest=_SMALLEST)
             x, y = (Uniform(0.0, length) for length in self.field_mm)
-            return Product({own.size: size, "x": x, "y": y, "r": own.radius})
+            return Product({own.size: size, "x": x, "y": y, "r": own.radius_prior})
         if not isinstance(own, Product):
             return own
         return Product({name: self._marginal_for_run(name, marginal) for name, marginal in own.marginals.items()})

@@ -8,7 +8,7 @@ import pytest
 from scipy.special import gammaln, logsumexp
 
 from probewise.diagnosis.noise.law import NoiseLaw, white_noise
-from probewise.effects import NoisePerRun, NoiseRows, RandomWalk, draw_readings, variance
+from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, draw_readings, variance
 from probewise.sensor import NoiseLevel
 
 
@@ -57,7 +57,7 @@ def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
     run = np.repeat([0, 1, 2], counts)
     residuals = rng.standard_normal(90) * np.array([1.0, 2.0, 0.7])[run]
     effect = NoisePerRun(("a", "b", "c"), counts)
-    nodes, log_weights = effect.weighed_nodes(residuals, NoiseRows(0 * residuals, 1.0, run))
+    nodes, log_weights = effect.weighed_nodes(residuals, FittedReadings(0 * residuals, 1.0, run))
 
     def log_z(values):
         law = replace(white_noise(90), sd=values[run])
@@ -78,6 +78,6 @@ def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
 
 def test_one_run_has_no_noise_per_run_to_tell():
     nodes, weights = NoisePerRun(("all",), (30,)).weighed_nodes(
-        np.ones(30), NoiseRows(np.zeros(30), 1.0, np.zeros(30, dtype=np.int64))
+        np.ones(30), FittedReadings(np.zeros(30), 1.0, np.zeros(30, dtype=np.int64))
     )
     assert len(nodes) == len(weights) == 0

@@ -17,7 +17,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
-from probewise.effects import NamedEffect, first_of
+from probewise.effects import NamedEffect, name_of_first_copy
 
 ALIAS_COSINE = 0.9
 _LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # least nats per reading; less is rounding error
@@ -81,9 +81,9 @@ def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[A
     telling: dict[str, FloatArray] = {}
     chosen: dict[str, NamedEffect[Any]] = {}
     for name, effect in prepared.effects.items():
-        if name in prepared.on_noise or out_of_vocabulary((name,)) or first_of(name) is not None:
+        if name in prepared.on_noise or out_of_vocabulary((name,)) or name_of_first_copy(name) is not None:
             continue
-        templates = screening.templates.of(screening.about, effect.coarse())
+        templates = screening.templates.of(screening.about, effect.with_fewer_variants())
         blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))

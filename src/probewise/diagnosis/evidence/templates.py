@@ -16,7 +16,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence.bank import Bank
 from probewise.diagnosis.fitting.coordinates import effect_values
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.effects import NamedEffect, in_scans
+from probewise.effects import NamedEffect, scan_indicator
 from probewise.sensor import Stage
 
 _RUNS_AWAY = 1e9  # times the largest prediction: such a model has diverged, and its derivative is meaningless
@@ -56,7 +56,7 @@ class TemplateMemory:
         """Return the bank of coarse templates of several effects about one fit, labelled by name."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
-            own = [(effect.name, t) for effect in effects for t in self.of(found, effect.coarse()).columns]
+            own = [(effect.name, t) for effect in effects for t in self.of(found, effect.with_fewer_variants()).columns]
             self.banks[key] = Bank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
         return self.banks[key]
 
@@ -79,7 +79,7 @@ def effect_templates(
     if most is not None and most < len(entries):
         kept = np.linspace(0, len(entries) - 1, most).round().astype(np.int64)
         choice, entries = choice[kept], entries[kept]
-    gates = effect.gates(found.model.plan)
+    gates = effect.variant_masks(found.model.plan)
     if gates is not None:
         (everywhere,) = _predicted_changes(found, effect, gates.always[None, :, :], usable)
         columns = [everywhere * gates.opened[k][usable, None] for k in choice]
@@ -107,7 +107,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
     before = np.zeros(len(plan))
     before[usable] = found.predicted
-    inside = np.flatnonzero(in_scans(plan, effect.scans)) if effect.scans else slice(None)
+    inside = np.flatnonzero(scan_indicator(plan, effect.scans)) if effect.scans else slice(None)
     there = plan.take(inside) if isinstance(inside, np.ndarray) else plan
     # Effects after the light integral reuse it.
     seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.theta_of(sensor, own), there)

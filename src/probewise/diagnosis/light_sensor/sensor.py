@@ -53,7 +53,7 @@ class LightSensor:
         return {
             name: effect
             for name, effect in able.items()
-            if (null.admits(effect) if null is not None else not effect.is_of_the_ssf(plan))
+            if (null.admits(effect) if null is not None else not effect.is_absorbed_by_ssf(plan))
         }
 
     def proposals(self) -> dict[str, NamedEffect[Any]]:

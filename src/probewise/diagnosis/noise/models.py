@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.diagnosis.noise.flat import Flat
 from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
-from probewise.effects import NoiseEffect, NoiseRows, lattice_step
+from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
 from probewise.sensor.stages import NoiseLevel, columns_of_effects
@@ -85,7 +85,7 @@ class NoiseModel:
         sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12)) or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
-        rows = NoiseRows(predicted, sd, self.recording.plan.scan[self.recording.usable])
+        rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable])
         banks = [self._nodes(effect, residuals / sd, rows) for effect in self.effects]
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
         for bank, log_each in banks:
@@ -104,7 +104,7 @@ class NoiseModel:
             return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
         return NoiseNodes(settings, laws, log_weights)
 
-    def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: NoiseRows) -> tuple[FloatArray, FloatArray]:
+    def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
         """Return the nodes of one effect and their log prior weights."""
         if effect.name in self.likely:
             return self.likely[effect.name]

@@ -144,7 +144,7 @@ def sample_model(
     null = found.model.sensor
     chain = null.chain(recording.plan, effects, n_nodes=ACCURATE_NODES)
     own = {
-        effect.name: effect.spread(
+        effect.name: effect.redraw_by_variant(
             effect_values(effect, z[:, found.model.coordinates_of(effect.name)]), weights[effect.name], rng=rng
         )
         for effect in found.model.effects

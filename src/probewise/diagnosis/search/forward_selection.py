@@ -25,7 +25,7 @@ from probewise.diagnosis.search.constants import (
 )
 from probewise.diagnosis.search.state import SearchState, rivals_of
 from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
-from probewise.effects import AGAIN, first_of
+from probewise.effects import AGAIN, name_of_first_copy
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +85,7 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
     """Store the log evidence of pairs of effects about a null, by templates, under the noise models of `steering`."""
     for noise, evidence in null.steering():
         singles = state.scores(null, evidence.law, null)
-        alone = [name for name in singles if first_of(name) is None]
+        alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:PAIRED]
         if not ranked or log_mean(singles[ranked[0]]) < PAIRED_FROM:
             continue
@@ -110,7 +110,7 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     out = dict(proposals)
     for noise, evidence in parent.steering():
         for name, own in state.scores(parent, evidence.law, null).items():
-            first = first_of(name)
+            first = name_of_first_copy(name)
             if name in parent.names or (first is not None and first not in parent.names):
                 continue
             names = tuple(sorted((*parent.names, name)))
@@ -161,7 +161,7 @@ def _both_copies(state: SearchState, null: WeighedFit) -> list[Names]:
     While only one of two waves is fitted, the other looks like noise with memory, which may hide both.
     """
     plain = state.noises.certain
-    pairs = [(first, name) for name in state.effects if (first := first_of(name)) is not None]
+    pairs = [(first, name) for name in state.effects if (first := name_of_first_copy(name)) is not None]
     return [
         (first, again)
         for first, again in pairs
@@ -180,7 +180,9 @@ def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[P
         return []
     scores = state.scores(plain, plain.law, plain)
     odds = {
-        name: log_mean(own) + state.prior.log_mean((name,)) for name, own in scores.items() if first_of(name) is None
+        name: log_mean(own) + state.prior.log_mean((name,))
+        for name, own in scores.items()
+        if name_of_first_copy(name) is None
     }
     ranked = sorted(odds, key=lambda name: -odds[name])[:LEADING_PLAINLY]
     return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_mean(())]

@@ -46,9 +46,9 @@ class Noises:
         seen = 0 < Quantisation.seen_above * rough_sd(self.recording) < self._step
         rounded = {Quantisation.name: np.array([self._step])} if Quantisation.name in self.effects and seen else {}
         shown = {
-            name: effect.certain_parameters
+            name: effect.parameters_known_before_fit
             for name, effect in self.effects.items()
-            if effect.certain_parameters is not None
+            if effect.parameters_known_before_fit is not None
         }
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
         self.certain = tuple(sorted(self._known))

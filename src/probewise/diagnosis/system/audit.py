@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, audits_and_cosines
 from probewise.diagnosis.system.apparatus import ON_NOISE, SimulatorApparatus
-from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, first_of
+from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, name_of_first_copy
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
@@ -50,7 +50,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
     system = system.with_converged_step(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
     about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
-    forms = {name: form for name, form in forms_of(about).items() if first_of(name) is None}
+    forms = {name: form for name, form in forms_of(about).items() if name_of_first_copy(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
     on_noise: dict[str, NamedEffect[Any]] = {str(kind.name): kind() for kind in kinds}
     if len(own.scan_names) > 1:

@@ -137,7 +137,7 @@ def _bounds_of_insignificant(
     null, screening = searched.null, searched.screening
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(null.found, best.law)
-    templates = screening.templates.of(screening.about, effect.coarse())
+    templates = screening.templates.of(screening.about, effect.with_fewer_variants())
     middle = len(templates.columns) // 2
     effect = templates.variant(middle)
     values = effect.prior.from_unit_cube(rng.random((N_SAMPLES, len(effect.prior.names))))
@@ -164,7 +164,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     effect = prepared.effects[name]
     if name in prepared.on_noise and cast(NoiseEffect, effect).changes_the_mean:
         everywhere = found.model.predict(found.z[None, :])[0]
-        return float(np.linalg.norm(cast(NoiseEffect, effect).change(everywhere))) / found.sd
+        return float(np.linalg.norm(cast(NoiseEffect, effect).change_of_readings(everywhere))) / found.sd
     if name in searched.certain:
         step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of(name)]
         return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))

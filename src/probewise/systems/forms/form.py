@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects import first_of
+from probewise.effects import name_of_first_copy
 from probewise.effects.vocabulary import Gates, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.sensor import Stage
@@ -141,7 +141,7 @@ class Form:
         """Number of equivalent modes: two for a wave, whose phase spans two turns; four if two waves may swap."""
         if self.joined is None:
             return 1
-        return 2 if first_of(self.name) is None else 4
+        return 2 if name_of_first_copy(self.name) is None else 4
 
     @property
     def scans(self) -> tuple[str, ...]:
@@ -170,11 +170,11 @@ class Form:
             out.append(replace(self, marginals={**self.marginals, last: Uniform(low, high)}, entries=entries))
         return tuple(out)
 
-    def coarse(self) -> Form:
+    def with_fewer_variants(self) -> Form:
         """Return the form with a thinned set of change points."""
         return self if self.change_points is None else replace(self, change_points=self.change_points.thinned())
 
-    def gates(self, plan: Any) -> Gates | None:
+    def variant_masks(self, plan: Any) -> Gates | None:
         """Return the ungated form, and the change points at the middle of each interval."""
         if self.change_points is None or not self.change_points.gated:
             return None
@@ -183,7 +183,7 @@ class Form:
         along = self.change_points.along(plan)
         return Gates(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.change_points.at)]))
 
-    def spread(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+    def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw the change point from all intervals by weight."""
         if self.change_points is None:
             return theta

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
+from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -174,7 +174,7 @@ def _wave_forms(about: About, name: str) -> Iterator[Form]:
     act = _on_column(name, change)
     waves = wave_numbers(np.sort(values), [np.arange(len(values))], _most_waves(about), _ROWS_OF_A_WAVE)
     guess = 1e-4 * float(np.nanstd(values))
-    typical = about.typical(Stage.INPUT, act, sine_and_cosine(guess, 1 / waves), guess)
+    typical = about.typical(Stage.INPUT, act, sine_and_cosine_entries(guess, 1 / waves), guess)
     if typical is None:
         return
     marginals = {
@@ -189,13 +189,13 @@ def _wave_forms(about: About, name: str) -> Iterator[Form]:
         (name, name, "rad"),
         (name,),
         act,
-        sine_and_cosine(typical, 1 / waves),
+        sine_and_cosine_entries(typical, 1 / waves),
         (0,),
         lambda m, s: (
             f"{name} has a periodic error with an amplitude of {with_unit(m[0], s[0], '')} "
             f"and a period of {with_unit(m[1], s[1], '')}, both in units of {name}"
         ),
-        joined=amplitude_and_phase,
+        joined=starting_point_of_wave,
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailedPrior
-from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
+from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform, Uniform
 from probewise.systems.forms.form import ChangePoints, with_unit
 from probewise.systems.table import RunTable
@@ -158,12 +158,12 @@ def wave(table: RunTable, time_unit: str) -> Modulation:
             "hz": wave_number_prior(waves),
             "phase": PHASE,
         },
-        entries=lambda size: sine_and_cosine(size, waves),
+        entries=lambda size: sine_and_cosine_entries(size, waves),
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
             f"{what} oscillates with an amplitude of {with_unit(mean[0], sd[0], unit)} and a period of "
             f"{1 / mean[1]:.4g} {time_unit}"
         ),
         covariates=("time",),
-        joined=amplitude_and_phase,
+        joined=starting_point_of_wave,
     )

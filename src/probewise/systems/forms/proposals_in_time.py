@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
+from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -88,7 +88,7 @@ def _swept_wave(about: About) -> Iterator[Form]:
     for hz in waves:
         n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
         settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
-    entries = sine_and_cosine(about.sd, *np.transpose(settings))
+    entries = sine_and_cosine_entries(about.sd, *np.transpose(settings))
     typical = about.typical(Stage.OFFSET, act, entries, about.sd)
     if typical is None:
         return
@@ -113,7 +113,7 @@ def _swept_wave(about: About) -> Iterator[Form]:
             f"goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
             "proposal, not a known effect"
         ),
-        joined=amplitude_and_phase,
+        joined=starting_point_of_wave,
         expression=f"a {text}",
     )
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.waves import PHASE, amplitude_and_phase, sine_and_cosine
+from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import About
@@ -121,7 +121,7 @@ def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * u[str(time)] + phase))
 
     guess = 1e-5 * _rate_scale(about, state)
-    typical = about.typical(Stage.RATE, act, sine_and_cosine(guess, waves), guess)
+    typical = about.typical(Stage.RATE, act, sine_and_cosine_entries(guess, waves), guess)
     if typical is None:
         return
     marginals = {
@@ -136,13 +136,13 @@ def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
         (unit, f"1/{about.time_unit}", "rad"),
         ("time",),
         act,
-        sine_and_cosine(typical, waves),
+        sine_and_cosine_entries(typical, waves),
         (0,),
         lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {with_unit(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
         ),
-        joined=amplitude_and_phase,
+        joined=starting_point_of_wave,
     )
 
 

@@ -50,7 +50,7 @@ class MeterStop(NoiseEffect):
         return None
 
     @property
-    def certain_parameters(self) -> FloatArray:
+    def parameters_known_before_fit(self) -> FloatArray:
         """The level, (1,)."""
         return np.array([self.level])
 
@@ -64,7 +64,7 @@ class MeterStop(NoiseEffect):
         """Return the noise as it is."""
         return value
 
-    def change(self, predicted: FloatArray) -> FloatArray:
+    def change_of_readings(self, predicted: FloatArray) -> FloatArray:
         """Return the change of the readings by the stop, for predictions without it, any shape."""
         beyond = np.maximum if self.is_ceiling else np.minimum
         return -beyond(predicted - self.level, 0.0)

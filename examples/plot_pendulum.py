@@ -18,7 +18,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from probewise.diagnosis import diagnose_system
-from probewise.systems import Law, RunTable, Simulator, write_run_table
+from probewise.systems import Law, RunTable, Simulator, run_table_csv
 
 seed = 4
 print(f"seed {seed}")
@@ -53,7 +53,7 @@ parser = argparse.ArgumentParser()
 parser.add_argument("--out", type=Path)
 out = parser.parse_args(sys.argv[1:] if sys.argv[0].endswith("plot_pendulum.py") else []).out
 if out is not None:
-    out.write_text(write_run_table(RunTable(swings, "t_s", "release")), encoding="utf-8")
+    out.write_text(run_table_csv(RunTable(swings, "t_s", "release")), encoding="utf-8")
 
 # %%
 # The simulator: a law of motion, here from Python; ``simulators/pendulum.py`` says the same in a file.

@@ -16,7 +16,7 @@ from probewise.recordings import paper_plan
 from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels
 from probewise.sensor.gaussian import mean_albedo_under_gaussians
 from probewise.systems import Noise, RunTable, Simulator, System, read_simulator
-from probewise.systems.forms import About
+from probewise.systems.forms import ReferenceFit
 from probewise.world.systems import draw_system
 
 PAGE = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text(encoding="utf-8")
@@ -78,8 +78,8 @@ def test_a_form():
     simulator = Simulator(
         "y", "V", {"k": (0, 4)}, simulate=lambda p, u: p["k"] + 0 * u["t_s"], time="t_s", run="run", noise=Noise(sd=0.1)
     )
-    about = About(System.of(simulator, table), table, np.zeros(1), 0.1)
-    (form,) = example("_creep", "probewise.systems.forms.readings")(about)
+    about = ReferenceFit(System.of(simulator, table), table, np.zeros(1), 0.1)
+    (form,) = example("_creep_form", "probewise.systems.forms.readings")(about)
     found = about.system.chain(table, [form]).predict(np.array([[2.0, 0.3]]), table)[0]
     np.testing.assert_allclose(found, 2.0 + 0.3 * np.log10(1 + t_s))
 

@@ -5,13 +5,13 @@ import pytest
 from heater import FILE, runs
 
 from probewise.cli import main
-from probewise.systems import write_run_table
+from probewise.systems import run_table_csv
 
 
 def refused(capsys, tmp_path, file, *arguments, table=None, more=()):
     (tmp_path / "heater.py").write_text(file)
     data = tmp_path / "data.csv"
-    data.write_text(table if table is not None else write_run_table(runs()))
+    data.write_text(table if table is not None else run_table_csv(runs()))
     out = tmp_path / "out"
     simulator = str(tmp_path / "heater.py")
     assert main(["diagnose", str(data), *more, "--simulator", simulator, "--out", str(out), *arguments]) == 2
@@ -53,7 +53,7 @@ def test_a_mistake_in_the_file_is_one_line(capsys, tmp_path, change, said):
 
 
 def cell(row, column, text):
-    lines = [line.split(",") for line in write_run_table(runs()).splitlines()]
+    lines = [line.split(",") for line in run_table_csv(runs()).splitlines()]
     lines[row - 1][lines[0].index(column)] = text
     return "\n".join(map(",".join, lines)) + "\n"
 

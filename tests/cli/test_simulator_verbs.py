@@ -11,15 +11,15 @@ from heater import FILE, runs
 from probewise.cli import main
 from probewise.diagnosis import diagnosis_schema
 from probewise.recordings import parse_strict_json
-from probewise.systems import write_run_table
+from probewise.systems import run_table_csv
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("heater")
     (out / "heater.py").write_text(FILE)
-    (out / "data.csv").write_text(write_run_table(runs(rng=np.random.default_rng(2))))
-    (out / "new.csv").write_text(write_run_table(runs((20.0, 23.0), names="45", rng=np.random.default_rng(3))))
+    (out / "data.csv").write_text(run_table_csv(runs(rng=np.random.default_rng(2))))
+    (out / "new.csv").write_text(run_table_csv(runs((20.0, 23.0), names="45", rng=np.random.default_rng(3))))
     return out
 
 

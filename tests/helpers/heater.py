@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 
 from probewise.systems import FittedSystem, Noise, RunTable, Simulator, System
-from probewise.systems.forms import About, forms_of
-from probewise.systems.forms.rebinding import recorded
+from probewise.systems.forms import ReferenceFit, forms_of
+from probewise.systems.forms.rebinding import extract_recorded
 
 FILE = """\
 import numpy as np
@@ -55,7 +55,7 @@ def runs(starts=(20.0, 21.0, 19.0), *, names="123", rng=None, n=12) -> RunTable:
 
 TABLE = runs()
 SIMULATOR = dataclasses.replace(heater(), fingerprint="abc", source="heater.py")
-ABOUT = About(System.of(SIMULATOR, TABLE), TABLE, np.array([0.5, -0.4, 0.0, 0.2, -0.2]), 0.05)
+ABOUT = ReferenceFit(System.of(SIMULATOR, TABLE), TABLE, np.array([0.5, -0.4, 0.0, 0.2, -0.2]), 0.05)
 
 
 def fitted(effects=(), *, seed=0):
@@ -71,6 +71,6 @@ def fitted(effects=(), *, seed=0):
         samples=samples,
         noise_sd=np.full(500, 0.05),
         effects=tuple(effect.name for effect in chain.effects),
-        known=recorded(ABOUT) if effects else None,
+        known=extract_recorded(ABOUT) if effects else None,
         level=(20.0, 30.0),
     )

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.systems import Law, RunTable
-from probewise.systems.all_steps import Trajectories, integrate_near, steps_of
+from probewise.systems.all_steps import TrajectoryCache, integrate_near, steps_of
 from probewise.systems.motion import Limit, Motion, RowsInRuns, integrate_states
 
 
@@ -46,7 +46,7 @@ class _Case:
     def __init__(self, effect=_plain, law=LAW, table=None):
         self.table, self.effect, self.law = _table() if table is None else table, effect, law
         self.columns = {k: v for k, v in self.table.columns.items() if k not in ("y", "run")}
-        self.memory = Trajectories()
+        self.memory = TrajectoryCache()
 
     def problem(self, theta):
         def of_some(samples):
@@ -83,7 +83,7 @@ def test_near_a_known_trajectory_a_derivative_costs_a_fraction_of_stepping():
     found, cost = case.near(theta)
     slopes, expected = (np.diff(v["phi"], axis=0) / 1e-5 for v in (found, case.stepped(theta)))
     np.testing.assert_allclose(slopes, expected, atol=1e-5)
-    assert cost < 0.2 * len(steps_of(case.table, 0.02).gap)
+    assert cost < 0.2 * len(steps_of(case.table, 0.02).gap_of_step)
 
 
 def test_a_sample_that_diverges_is_as_infinite_as_in_steps():

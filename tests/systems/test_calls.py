@@ -5,7 +5,7 @@ import pytest
 
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.priors import Uniform
-from probewise.systems import CountedCalls, Law, RunTable, Simulator, System
+from probewise.systems import Law, ProgressWithCallCount, RunTable, Simulator, System
 
 X = np.linspace(0, 1, 11)
 
@@ -106,7 +106,7 @@ def test_the_same_call_is_made_once():
 def test_every_call_is_told():
     system, table = _system(_with_a_loop)
     told = []
-    CountedCalls(lambda stage, done=0, total=0, note="": told.append((stage, note)), system.caller)("fitting")
+    ProgressWithCallCount(lambda stage, done=0, total=0, note="": told.append((stage, note)), system.caller)("fitting")
     n_calls = system.caller.n_calls
     system.chain(table, ()).predict(system.theta(system.starts[-1:]), table)
     assert told[-1] == ("fitting", f"{n_calls + 1} of at most 20,000 calls of simulate")

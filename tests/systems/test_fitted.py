@@ -10,7 +10,7 @@ from heater import ABOUT, SIMULATOR, TABLE, fitted
 from probewise.errors import FileError, ParameterError
 from probewise.systems import FittedSystem
 from probewise.systems.forms import forms_of
-from probewise.systems.forms.rebinding import rebind_forms, recorded
+from probewise.systems.forms.rebinding import extract_recorded, rebind_forms
 
 
 def test_what_is_written_is_read_back_bit_for_bit():
@@ -49,7 +49,7 @@ def test_fewer_than_500_samples_are_refused():
 def test_every_form_that_is_bound_again_does_what_it_did():
     """About the fit and from what is in the file, with any parameters: the same readings, to the last bit."""
     forms = forms_of(ABOUT)
-    again = rebind_forms(forms, SIMULATOR, recorded(ABOUT))
+    again = rebind_forms(forms, SIMULATOR, extract_recorded(ABOUT))
     assert again.keys() == forms.keys()
     rng = np.random.default_rng(3)
     for name, form in forms.items():

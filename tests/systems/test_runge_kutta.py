@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.systems.motion import Limit, Motion, Stepper
-from probewise.systems.runge_kutta import FOURTH_ORDER, Stepping, eighth_order
+from probewise.systems.runge_kutta import FOURTH_ORDER, StepSchedule, eighth_order
 from probewise.systems.simulator import Law
 
 EIGHTH_ORDER = eighth_order()
@@ -47,9 +47,9 @@ def test_each_stage_is_where_its_coefficients_add_up_to(method):
     ],
 )
 def test_the_method_is_the_one_whose_accuracy_costs_least(in_gap, method, steps):
-    stepping = Stepping.of(np.array(in_gap))
-    assert stepping.method is method
-    np.testing.assert_array_equal(stepping.in_gap, steps)
+    schedule = StepSchedule.from_fourth_order(np.array(in_gap))
+    assert schedule.method is method
+    np.testing.assert_array_equal(schedule.n_steps, steps)
 
 
 def test_a_state_that_meets_its_bound_within_a_step_of_eighth_order_stays_there():

@@ -59,14 +59,14 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
 def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: Stage) -> None:
     """Write diagnosis.json, the calibrated and the repaired simulator, the next rows to take and the figures."""
     from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
-    from probewise.systems import write_fitted_system, write_run_table
+    from probewise.systems import run_table_csv, write_fitted_system
 
     stage.write_json("diagnosis.json", diagnosis_json(diagnosis))
     write_fitted_system(repaired_of(diagnosis), stage / "repaired.json")
     write_fitted_system(calibrated_of(diagnosis), stage / "calibrated.json")
     if diagnosis.next_measurement is not None:
         asked = cast("RunTable", diagnosis.next_measurement.plan)
-        stage.write(diagnosis.apparatus.words.next_plan, write_run_table(asked))
+        stage.write(diagnosis.apparatus.words.next_plan, run_table_csv(asked))
     stage.write_figures(drawn)
 
 

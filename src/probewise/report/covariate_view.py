@@ -159,7 +159,7 @@ def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None)
         at = np.full(len(plan), np.nan)
         at[rows] = plan.time_s[rows]
         whole = scan if plan.run is not None else None
-        return CovariateView(at, axis_label(diagnosis, "time" if plan.has_time else "row", whole), place=place)
+        return CovariateView(at, axis_label(diagnosis, "time" if plan.has_varying_time else "row", whole), place=place)
     x_mm, y_mm = plan.x_mm[rows], plan.y_mm[rows]
     along, label = (x_mm, "X (mm)") if np.ptp(x_mm) >= np.ptp(y_mm) else (y_mm, "Y (mm)")
     if not is_along_line(plan, rows):

@@ -178,7 +178,7 @@ def _draw_residuals(diagnosis: Diagnosis) -> bytes:
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
     models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]
-    time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_time else "time")
+    time = axis_label(diagnosis, "row" if isinstance(plan, RunTable) and not plan.has_varying_time else "time")
     covariates = ((time, plan.time_s), (axis_label(diagnosis, "level"), diagnosis.repair.before.readings))
     return svg(
         residuals_against_covariates(

@@ -38,7 +38,7 @@ def figures(fit: SystemFit) -> dict[str, bytes]:
 
 def _columns_to_draw(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
     own = fit.fitted.simulator
-    time = f"{plan.time} ({own.time_unit})" if plan.has_time else "row of the table"
+    time = f"{plan.time} ({own.time_unit})" if plan.has_varying_time else "row of the table"
     out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]
     inputs = {name: v for name, v in plan.covariates.items() if name not in (own.reading, own.noise.sd)}
     varying = {name: v for name, v in inputs.items() if len(np.unique(v[np.isfinite(v)])) >= _LEAST_VALUES}

@@ -1,20 +1,26 @@
 """A user's simulator over a table of readings, and the chain of effects that it may leave out."""
 
-from probewise.systems.calls import CountedCalls
+from probewise.systems.calls import ProgressWithCallCount
 from probewise.systems.file import read_simulator
 from probewise.systems.fitted import FittedSystem, read_fitted_system, samples_csv, write_fitted_system
 from probewise.systems.joining import join_tables
 from probewise.systems.prediction import SystemPrediction, as_recording, predict_system, write_system_prediction
 from probewise.systems.simulator import Extra, Law, Noise, Simulator, table_for
 from probewise.systems.system import System, SystemChain
-from probewise.systems.table import RunRecording, RunTable, read_run_table, write_run_table
+from probewise.systems.table import RunRecording, RunTable, read_run_table, run_table_csv
+
+CountedCalls = ProgressWithCallCount
+"""The old name of `ProgressWithCallCount`."""
+
+write_run_table = run_table_csv
+"""The old name of `run_table_csv`."""
 
 __all__ = [
-    "CountedCalls",
     "Extra",
     "FittedSystem",
     "Law",
     "Noise",
+    "ProgressWithCallCount",
     "RunRecording",
     "RunTable",
     "Simulator",
@@ -27,9 +33,9 @@ __all__ = [
     "read_fitted_system",
     "read_run_table",
     "read_simulator",
+    "run_table_csv",
     "samples_csv",
     "table_for",
     "write_fitted_system",
-    "write_run_table",
     "write_system_prediction",
 ]

@@ -19,16 +19,16 @@ from scipy.linalg.lapack import dtbtrs
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.systems.motion import (
-    Given,
+    LawInputs,
     Motion,
     RowsInRuns,
     Stepper,
-    gaps_of,
+    initial_states,
     integrate_states,
-    starts_of,
     states_by_step,
+    time_gaps,
 )
-from probewise.systems.runge_kutta import Stepping
+from probewise.systems.runge_kutta import StepSchedule
 from probewise.systems.table import RunTable
 
 _CHORDS = 4  # iterations with the Jacobian of a known trajectory
@@ -51,30 +51,30 @@ Problem = Callable[[IntArray], tuple[Motion, Mapping[str, FloatArray], Mapping[s
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """The steps of an integration, for all runs together: arrays (n_steps * n_runs,), the runs within a step."""
+    """The steps of an integration, which takes each step for all runs together."""
 
     places: RowsInRuns
     max_step: float
 
     @cached_property
-    def stepping(self) -> Stepping:
-        """The steps from each position of the runs to the next, and their method."""
-        return self.places.stepping(self.max_step)
+    def schedule(self) -> StepSchedule:
+        """Number of steps from each position in the runs to the next, and their method."""
+        return self.places.step_schedule(self.max_step)
 
     @property
-    def in_gap(self) -> IntArray:
-        """Number of steps from each position of the runs to the next, (n_places - 1,)."""
-        return self.stepping.in_gap
+    def n_steps_by_gap(self) -> IntArray:
+        """Number of steps from each position in the runs to the next, (n_places - 1,)."""
+        return self.schedule.n_steps
 
     @cached_property
-    def gap(self) -> IntArray:
+    def gap_of_step(self) -> IntArray:
         """Position in the runs of the row before each step, (n_steps,)."""
-        return np.repeat(np.arange(len(self.in_gap)), self.in_gap)
+        return np.repeat(np.arange(len(self.n_steps_by_gap)), self.n_steps_by_gap)
 
     @cached_property
-    def number(self) -> IntArray:
-        """Number of steps before each position, (n_places,)."""
-        return np.concatenate([[0], np.cumsum(self.in_gap)])
+    def n_steps_before(self) -> IntArray:
+        """Number of steps before each position in the runs, (n_places,)."""
+        return np.concatenate([[0], np.cumsum(self.n_steps_by_gap)])
 
     @property
     def n_runs(self) -> int:
@@ -82,20 +82,21 @@ class Steps:
         return int(self.places.row_at_place.shape[1])
 
     @cached_property
-    def begin(self) -> FloatArray:
-        """Share of the gap between two rows at which each step begins."""
-        share = (np.arange(len(self.gap)) - self.number[self.gap]) / self.in_gap[self.gap]
+    def begin_share(self) -> FloatArray:
+        """Share of the gap between rows at which each step begins, (n_steps * n_runs,): the runs of a step in turn."""
+        gap = self.gap_of_step
+        share = (np.arange(len(gap)) - self.n_steps_before[gap]) / self.n_steps_by_gap[gap]
         return np.repeat(share, self.n_runs)
 
     @cached_property
-    def length(self) -> FloatArray:
-        """Share of the gap between two rows that each step takes."""
-        return np.repeat(1.0 / self.in_gap[self.gap], self.n_runs)
+    def length_share(self) -> FloatArray:
+        """Share of the gap between rows that each step takes, (n_steps * n_runs,): the runs of a step in turn."""
+        return np.repeat(1.0 / self.n_steps_by_gap[self.gap_of_step], self.n_runs)
 
-    def at_rows(self, states: FloatArray) -> FloatArray:
+    def states_at_rows(self, states: FloatArray) -> FloatArray:
         """Select states (n_states, n_samples, n_steps + 1, n_runs) at every row: (n_states, n_samples, n_points)."""
-        place, run = self.places.place
-        return np.asarray(states[:, :, self.number[place], run])
+        place, run = self.places.place_and_run
+        return np.asarray(states[:, :, self.n_steps_before[place], run])
 
 
 @lru_cache(maxsize=16)
@@ -106,7 +107,7 @@ def steps_of(table: RunTable, max_step: float) -> Steps:
 
 @dataclass(frozen=True, eq=False)
 class KnownTrajectory:
-    """A trajectory: its parameters, states (n_states, n_steps + 1, n_runs), and its Jacobian once it was needed."""
+    """A solved trajectory: parameters (n_params,), states (n_states, n_steps + 1, n_runs), the Jacobian once needed."""
 
     theta: FloatArray
     states: FloatArray
@@ -114,18 +115,19 @@ class KnownTrajectory:
 
 
 @dataclass(eq=False)
-class Trajectories:
-    """Cache of trajectories, by steps and by effects; `useless` for a law that cannot evaluate all steps at once."""
+class TrajectoryCache:
+    """Cache of trajectories, by steps and by effects; `useless` if the law cannot evaluate all steps at once."""
 
     known: dict[tuple[Hashable, Hashable], list[KnownTrajectory]] = field(default_factory=dict)
     useless: bool = False
 
-    def near(
+    def nearest_known(
         self, steps: Hashable, effects: Hashable, theta: FloatArray, n_own: int
     ) -> tuple[list[KnownTrajectory], IntArray]:
-        """Return known trajectories of the same steps, and for each sample, theta (n_samples, n_params), the nearest.
+        """Return the cached trajectories of these steps and effects, and the number of the nearest to each sample.
 
-        Those of other effects are compared by the first `n_own` parameters, if there is none of the same.
+        Samples are theta, (n_samples, n_params); the numbers are (n_samples,). Where there is no trajectory with these
+        effects, those with others are taken, compared by the first `n_own` parameters.
         """
         own, width = self.known.get((steps, effects), []), theta.shape[1]
         if not own:
@@ -138,7 +140,7 @@ class Trajectories:
         return own, np.argmin(np.einsum("skp,skp->sk", apart, apart), axis=1)
 
     def keep(self, steps: Hashable, effects: Hashable, more: Sequence[KnownTrajectory]) -> None:
-        """Add trajectories to the cache, and drop those used least recently."""
+        """Add trajectories to the cache; drop the oldest of steps and effects that were added to least recently."""
         if not more:
             return
         own = self.known.pop((steps, effects), [])  # those used last come last
@@ -155,7 +157,7 @@ class Trajectories:
 
 @dataclass(frozen=True, eq=False)
 class SolvedSteps:
-    """States (n_states, n_samples, n_steps + 1, n_runs), which samples converged, and figures of the iteration.
+    """States (n_states, n_samples, n_steps + 1, n_runs), the mask `done` of the converged samples, and the cost.
 
     `bands` are Jacobians of some samples by their number; `moved` (n_samples,) is the change from the trajectory that a
     sample began from, in the largest state; `n_evaluated` is the number of steps evaluated, of all samples and runs.
@@ -167,8 +169,8 @@ class SolvedSteps:
     moved: FloatArray
     n_evaluated: int
 
-    def known(self, theta: FloatArray) -> list[KnownTrajectory]:
-        """Return the converged trajectories that are far enough from the known ones to be cached."""
+    def new_trajectories(self, theta: FloatArray) -> list[KnownTrajectory]:
+        """Return the converged trajectories of samples theta that are far enough from known ones to be cached."""
         worth = np.flatnonzero(self.done & (self.moved > _FAR))[:_MOST_NEW]
         return [
             KnownTrajectory(theta[k].copy(), self.states[:, k].copy(), [self.bands[k]] if k in self.bands else [])
@@ -177,9 +179,9 @@ class SolvedSteps:
 
 
 def integrate_near(
-    problem: Problem, steps: Steps, memory: Trajectories, *, effects: Hashable, theta: FloatArray, n_own: int
+    problem: Problem, steps: Steps, memory: TrajectoryCache, *, effects: Hashable, theta: FloatArray, n_own: int
 ) -> tuple[dict[str, FloatArray], int]:
-    """Integrate samples theta (n_samples, n_params): all steps at once if few, near known trajectories if there are.
+    """Integrate samples, theta (n_samples, n_params); a few samples near known trajectories take all steps at once.
 
     Parameters
     ----------
@@ -194,26 +196,26 @@ def integrate_near(
 
     Returns
     -------
-    Every state at every row, (n_samples, n_points), and the number of steps that it cost, of however many samples.
+    Every state at every row, (n_samples, n_points), and the cost in steps, each of all samples together.
     """
-    n_samples, n_steps = len(theta), len(steps.gap)
+    n_samples, n_steps = len(theta), len(steps.gap_of_step)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
         motion, parameters, columns = problem(np.arange(n_samples))
         return integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step), n_steps
     states, left, cost = None, np.arange(n_samples), 0
-    known, nearest = memory.near(steps, effects, theta, n_own)
+    known, nearest = memory.nearest_known(steps, effects, theta, n_own)
     if known:
         try:
             with np.errstate(all="ignore"):
-                solved = solve(problem, steps, known, nearest)
+                solved = solve_all_steps(problem, steps, known, nearest)
             states, left = solved.states, np.flatnonzero(~solved.done)
             cost = -(-solved.n_evaluated // _WORTH_A_STEP)
-            memory.keep(steps, effects, solved.known(theta))
+            memory.keep(steps, effects, solved.new_trajectories(theta))
         except Exception:  # rates that take no more columns than there are runs
             memory.useless = True
     if left.size:
         motion, parameters, columns = problem(left)
-        every = states_by_step(motion, steps.places, parameters, columns, steps.stepping)
+        every = states_by_step(motion, steps.places, parameters, columns, steps.schedule)
         there = np.stack([[*s.values()] for s in every], axis=2)
         if states is None:
             states = there
@@ -227,10 +229,10 @@ def integrate_near(
             [KnownTrajectory(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()],
         )
     assert states is not None
-    return dict(zip(problem(np.arange(1))[0].law.states, steps.at_rows(states), strict=True)), cost
+    return dict(zip(problem(np.arange(1))[0].law.states, steps.states_at_rows(states), strict=True)), cost
 
 
-def solve(problem: Problem, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray) -> SolvedSteps:
+def solve_all_steps(problem: Problem, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray) -> SolvedSteps:
     """Solve for the states at the end of every step, each sample from the known trajectory nearest to it.
 
     Parameters
@@ -244,39 +246,39 @@ def solve(problem: Problem, steps: Steps, known: Sequence[KnownTrajectory], near
     """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
     search = _NewtonState(problem, steps, guess.copy())
-    _share_jacobians(search, known, nearest)
+    _iterate_with_shared_jacobians(search, known, nearest)
     # A chord that led away is no better a start than the trajectory that it began from.
     astray = search.active & ~(search.rate < 1)
     search.states[:, astray, 1:] = guess[:, astray, 1:]
     search.change[~search.done] = np.inf
-    bands = _own_jacobians(search)
-    moved = _largest_change(search.states - guess, guess)
+    bands = _iterate_with_own_jacobians(search)
+    moved = _largest_relative_change(search.states - guess, guess)
     return SolvedSteps(search.states, search.done, bands, moved, search.n_evaluated)
 
 
-def _share_jacobians(search: _NewtonState, known: Sequence[KnownTrajectory], nearest: IntArray) -> None:
+def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTrajectory], nearest: IntArray) -> None:
     """Take chord iterations, each with the Jacobian of the known trajectory nearest to a sample."""
     for _ in range(_CHORDS):
         active = search.active & ((search.rate < _SLOW) | ~np.isfinite(search.change))
         samples = np.flatnonzero(active)
         if not samples.size:
             return
-        missed = search.missed(samples)
+        missed = search.step_residuals(samples)
         correction = np.empty_like(missed)
         for number in np.unique(nearest[samples]).tolist():
             own = nearest[samples] == number
             if not known[number].bands:
                 at = known[number].states[:, None]
-                known[number].bands.append(search.bands(samples[own][:1], at)[0])
-            correction[:, own] = _solution(known[number].bands[0], missed[:, own], shared=True)
+                known[number].bands.append(search.jacobian_bands(samples[own][:1], at)[0])
+            correction[:, own] = _solved_corrections(known[number].bands[0], missed[:, own], shared=True)
         search.correct(samples, correction)
         far = ~(search.change < _FAR)
         if samples.size == len(nearest) and far.sum() * search.steps.n_runs > _FEW_FAR:
             search.possible &= ~far
 
 
-def _own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
-    """Take Newton iterations of the samples that have not converged; return the last Jacobian of each."""
+def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
+    """Take Newton iterations of the samples that have not converged; return the last Jacobian of each, by number."""
     last: dict[int, FloatArray] = {}
     for k in range(_NEWTONS):
         if k == _HOPELESS:
@@ -284,8 +286,8 @@ def _own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
         samples = np.flatnonzero(search.active)
         if not samples.size:
             break
-        bands = search.bands(samples, search.states[:, samples])
-        correction = _solution(np.concatenate(bands), search.missed(samples), shared=False)
+        bands = search.jacobian_bands(samples, search.states[:, samples])
+        correction = _solved_corrections(np.concatenate(bands), search.step_residuals(samples), shared=False)
         last |= dict(zip(samples.tolist(), bands, strict=True))
         search.correct(samples, correction)
     return last
@@ -307,40 +309,40 @@ class _NewtonState:
         self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
         self._chosen = np.zeros(0, dtype=np.int64)
         motion, parameters, _ = self.problem(np.arange(n_samples))
-        start = motion.at_end_of_step({}, starts_of(motion.law, self.steps.places, parameters, n_samples))
+        start = motion.correct_step_end({}, initial_states(motion.law, self.steps.places, parameters, n_samples))
         self.states[:, :, 0] = np.stack(list(start.values()))
 
     @property
     def active(self) -> BoolArray:
-        """Samples that have not converged and may yet."""
+        """Mask of the samples that have not converged and may yet, (n_samples,)."""
         return self.possible & ~self.done
 
-    def ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
-        """Return the states at the end of every step, from those at its begin: (n_states, n, n_steps, n_runs)."""
+    def states_at_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
+        """Return the states to which each step leads from those at its beginning, (n_states, n, n_steps, n_runs)."""
         if not np.array_equal(samples, self._chosen):
-            self._chosen, self._end = samples, _every_step(self.problem, self.steps, samples)
+            self._chosen, self._end = samples, _stepping_function(self.problem, self.steps, samples)
         self.n_evaluated += states[0, :, 1:].size
         return self._end(states[:, :, :-1])
 
-    def missed(self, samples: IntArray) -> FloatArray:
-        """Return by how much the next state misses the end of each step, (n_states, n, n_steps, n_runs)."""
+    def step_residuals(self, samples: IntArray) -> FloatArray:
+        """Return the end of each step minus the state that should equal it, (n_states, n, n_steps, n_runs)."""
         states = self.states[:, samples]
-        return self.ends(samples, states) - states[:, :, 1:]
+        return self.states_at_ends(samples, states) - states[:, :, 1:]
 
-    def bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
-        """Return the Jacobian of each of some samples about states (n_states, n, n_steps + 1, n_runs), by `_banded`."""
-        at_end, columns = self.ends(samples, states), []
+    def jacobian_bands(self, samples: IntArray, states: FloatArray) -> list[FloatArray]:
+        """Return each sample's Jacobian about states (n_states, n, n_steps + 1, n_runs), as `_bands_of_jacobian`."""
+        at_end, columns = self.states_at_ends(samples, states), []
         for values in states:
             nudge = _NUDGE * np.maximum(np.abs(values).max(axis=(1, 2), keepdims=True), 1e-300)
             before = values.copy()
             values += nudge
-            columns.append((self.ends(samples, states) - at_end) / nudge)
+            columns.append((self.states_at_ends(samples, states) - at_end) / nudge)
             values[:] = before
-        return _banded(np.stack(columns, axis=1))
+        return _bands_of_jacobian(np.stack(columns, axis=1))
 
     def correct(self, samples: IntArray, correction: FloatArray) -> None:
         """Add a correction (n_states, n, n_steps, n_runs) to some samples' states, and see who has converged."""
-        change = _largest_change(correction, self.states[:, samples])
+        change = _largest_relative_change(correction, self.states[:, samples])
         self.states[:, samples, 1:] += correction
         with np.errstate(all="ignore"):
             rate = np.where(np.isfinite(self.change[samples]), change / self.change[samples], 0.0)
@@ -350,32 +352,32 @@ class _NewtonState:
         self.change[samples], self.rate[samples] = change, rate
 
 
-def _every_step(problem: Problem, steps: Steps, samples: IntArray) -> Callable[[FloatArray], FloatArray]:
-    """Return a function of the states at the begin of every step that gives those at its end."""
+def _stepping_function(problem: Problem, steps: Steps, samples: IntArray) -> Callable[[FloatArray], FloatArray]:
+    """Return the function that maps the states at the beginning of each step to those at its end."""
     motion, parameters, columns = problem(samples)
     n_states = len(motion.law.states)
     first = {state: np.zeros((len(samples), steps.n_runs)) for state in motion.law.states}
-    between = Given.of(motion, steps.places, parameters, columns, first).throughout(steps.gap)
-    passing = gaps_of(steps.places, columns)[:, steps.gap]
-    stepper = Stepper(motion, steps.stepping.method, between, passing.reshape(len(passing), -1))
+    between = LawInputs.of(motion, steps.places, parameters, columns, first).interpolator_of_steps(steps.gap_of_step)
+    passing = time_gaps(steps.places, columns)[:, steps.gap_of_step]
+    stepper = Stepper(motion, steps.schedule.method, between, passing.reshape(len(passing), -1))
 
-    def ends(begins: FloatArray) -> FloatArray:
+    def states_after(begins: FloatArray) -> FloatArray:
         shape = begins.shape
         s = dict(zip(motion.law.states, begins.reshape(n_states, shape[1], -1), strict=True))
-        after = stepper.step(s, steps.begin, steps.length)
+        after = stepper.step(s, steps.begin_share, steps.length_share)
         return np.stack([np.broadcast_to(after[state], s[state].shape) for state in s]).reshape(shape)
 
-    return ends
+    return states_after
 
 
-def _largest_change(change: FloatArray, states: FloatArray) -> FloatArray:
-    """Return the largest change (n_states, n_samples, ...), in the largest state of its kind, (n_samples,)."""
+def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArray:
+    """Return each sample's largest change of a state, over the largest absolute value of that state, (n_samples,)."""
     size = np.maximum(np.abs(states).max(axis=(2, 3)), 1e-300)
     return np.asarray((np.abs(change).max(axis=(2, 3)) / size).max(axis=0))
 
 
-def _banded(slopes: FloatArray) -> list[FloatArray]:
-    """Return the system of all steps, for each sample the bands below its diagonal of ones, (n_unknowns, 2 n_states).
+def _bands_of_jacobian(slopes: FloatArray) -> list[FloatArray]:
+    """Return each sample's Jacobian of the system of all steps, its diagonal and lower bands, (n_unknowns, 2 n_states).
 
     `slopes` (n_states, n_states, n_samples, n_steps, n_runs) are those of a step's end by its begin. Unknowns are
     ordered by run, then by step, then by state.
@@ -388,7 +390,7 @@ def _banded(slopes: FloatArray) -> list[FloatArray]:
     return list(out.reshape(n_samples, -1, 2 * n_states))
 
 
-def _solution(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
+def _solved_corrections(bands: FloatArray, missed: FloatArray, *, shared: bool) -> FloatArray:
     """Solve for corrections (n_states, n_samples, n_steps, n_runs); samples share one Jacobian or each has its own."""
     n_states, n_samples, n_steps, n_runs = missed.shape
     right = missed.transpose(1, 3, 2, 0).reshape((n_samples, -1) if shared else (1, -1))

@@ -26,7 +26,7 @@ _SAME = 1e-9  # of the largest reading: tolerance between two ways of calling
 
 @dataclass(eq=False)
 class IntegrationTally:
-    """Counts the integration steps of a law, and the samples at which it raises an error."""
+    """Counts of a law's integration steps, and of the samples at which it raises an error."""
 
     n_failed: int = 0
     n_steps: int = 0
@@ -35,7 +35,7 @@ class IntegrationTally:
 
 @dataclass(eq=False)
 class Caller:
-    """Calls `simulate` for many samples, and counts the calls and the failures.
+    """Caller of a user's `simulate` for many samples; it counts the calls, and the samples that fail.
 
     Parameters
     ----------
@@ -73,7 +73,9 @@ class Caller:
         broadcasts: bool,
         name: str = "simulate",
     ) -> Caller:
-        """Determine how a function can be called, from trial calls at some samples (n_samples, 1 or n_points).
+        """Return a caller that calls a function in the fastest way that it takes, by trial calls at some samples.
+
+        The parameters of `samples` are (n_samples, 1 or n_points).
 
         Raises
         ------
@@ -97,7 +99,7 @@ class Caller:
                 return together
         except Exception:
             pass
-        by_row = frozenset(per_run) | _taken_by_row(one, samples, columns, alone, per_run)
+        by_row = frozenset(per_run) | _names_taken_by_row(one, samples, columns, alone, per_run)
         return cls(simulate, broadcasts=False, by_row=by_row, name=name)
 
     def __call__(
@@ -119,7 +121,7 @@ class Caller:
                         raise
                     self.n_failed += n_samples
                     return np.full((n_samples, n_points), np.nan)
-                return _of_shape(readings, (n_samples, n_points), self.name)
+                return _checked_readings(readings, (n_samples, n_points), self.name)
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
                 own = {name: _value_of_sample(values, k) for name, values in parameters.items()}
@@ -148,7 +150,7 @@ class Caller:
         if known is None:
             self._count_call()
             returned = np.array(self.simulate(dict(own), dict(columns)), dtype=np.float64)
-            known = _of_shape(returned, (n_points,), self.name)
+            known = _checked_readings(returned, (n_points,), self.name)
         self._known[key] = known
         while len(self._known) * n_points > _MOST_REMEMBERED and len(self._known) > 1:
             self._known.pop(next(iter(self._known)))
@@ -165,18 +167,18 @@ class Caller:
         if not vary:
             return self._cached_call(own, columns, n_points)
         self.interpolated.update(vary)
-        nodes = [_nodes(own[name]) for name in vary]
+        nodes = [_chebyshev_nodes(own[name]) for name in vary]
         out = np.zeros(n_points)
         for at in itertools.product(*(range(len(each)) for each in nodes)):
             fixed = {name: float(each[i]) for name, each, i in zip(vary, nodes, at, strict=True)}
             share = np.ones(n_points)
             for name, each, i in zip(vary, nodes, at, strict=True):
-                share = share * _lagrange(each, i, own[name])
+                share = share * _lagrange_basis(each, i, own[name])
             out += share * self._call_for_one_sample({**own, **fixed}, columns, n_points)
         return out
 
 
-class CountedCalls:
+class ProgressWithCallCount:
     """A progress function that adds the number of calls of `simulate` to each stage, updated at every call.
 
     Parameters
@@ -204,13 +206,14 @@ class CountedCalls:
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
 
 
-def _taken_by_row(
+def _names_taken_by_row(
     one: Caller,
     samples: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
     alone: FloatArray,
     per_run: tuple[str, ...],
 ) -> frozenset[str]:
+    """Return the names of parameters that may be arrays (n_points,) in a call for one sample, by trial."""
     n_points = alone.shape[1]
     taken = []
     for name, values in samples.items():
@@ -232,7 +235,8 @@ def _value_of_sample(values: FloatArray, k: int) -> Any:
     return float(own[0]) if own.shape == (1,) else own
 
 
-def _nodes(values: FloatArray) -> FloatArray:
+def _chebyshev_nodes(values: FloatArray) -> FloatArray:
+    """Return five interpolation nodes over the range of values; one if they are equal."""
     low, high = float(np.min(values)), float(np.max(values))
     if low == high:
         return np.array([low])
@@ -240,7 +244,8 @@ def _nodes(values: FloatArray) -> FloatArray:
     return low + (high - low) * places
 
 
-def _lagrange(nodes: FloatArray, i: int, at: FloatArray) -> FloatArray:
+def _lagrange_basis(nodes: FloatArray, i: int, at: FloatArray) -> FloatArray:
+    """Return the Lagrange polynomial that is 1 at node i and 0 at the others, at `at`, (n_points,)."""
     others = np.delete(nodes, i)
     return np.asarray(np.prod((at[:, None] - others) / (nodes[i] - others), axis=1))
 
@@ -254,7 +259,8 @@ def _nearly_equal(first: FloatArray, second: FloatArray) -> bool:
     )
 
 
-def _of_shape(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:
+def _checked_readings(readings: FloatArray, wanted: tuple[int, ...], name: str) -> FloatArray:
+    """Return the readings broadcast to the wanted shape; raise ShapeError if they do not fit it."""
     if readings.shape == wanted:
         return readings
     if readings.ndim == len(wanted):

@@ -13,7 +13,7 @@ from probewise._kinds import require_path
 from probewise.errors import FileError, ParameterError
 from probewise.recordings.python_file import error_on_one_line, run_python_text
 from probewise.recordings.text import read_text
-from probewise.systems.simulator import Extra, Law, Noise, Simulator, marginal_of
+from probewise.systems.simulator import Extra, Law, Noise, Simulator, parse_prior
 
 _NAMES = (
     "reading",
@@ -48,7 +48,7 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     text = read_text(path, "a Python file that describes a simulator")
     said = run_python_text(text, path)
     try:
-        return _simulator(said, path, text)
+        return _build_simulator(said, path, text)
     except ParameterError as error:
         found = f"{error.name} is {error.value!r}" if error.value is not None else f"{error.name} is missing"
         like = get_close_matches(error.name, said.keys() - set(_NAMES), 1) if error.value is None else []
@@ -62,7 +62,7 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
         ) from error
 
 
-def _simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
+def _build_simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
     given = said.get("parameters")
     if not isinstance(given, Mapping):
         raise ParameterError("parameters", given, 'a dict from names to priors: {"gain": (0, 10)}')
@@ -73,59 +73,59 @@ def _simulator(said: Mapping[str, Any], path: Path, text: str) -> Simulator:
             raise ParameterError("states", states, 'a dict from states to where they start: {"temp_c": 20.0}')
         law = Law(
             states,
-            _function(said, "rates"),
-            _function(said, "observe") if "observe" in said else None,
+            _checked_function(said, "rates"),
+            _checked_function(said, "observe") if "observe" in said else None,
             said.get("hold", "previous"),
             said.get("max_step_s"),
         )
     return Simulator(
-        reading=_text(said, "reading"),
-        unit=_text(said, "unit"),
-        parameters={name: marginal_of(name, prior) for name, prior in given.items()},
-        simulate=_function(said, "simulate") if "simulate" in said else None,
+        reading=_checked_text(said, "reading"),
+        unit=_checked_text(said, "unit"),
+        parameters={name: parse_prior(name, prior) for name, prior in given.items()},
+        simulate=_checked_function(said, "simulate") if "simulate" in said else None,
         law=law,
-        time=_text(said, "time") if said.get("time") is not None else None,
-        time_unit=_text(said, "time_unit") if "time_unit" in said else "s",
-        run=_text(said, "run") if said.get("run") is not None else None,
-        per_run=_texts(said, "per_run"),
-        controls=_texts(said, "controls"),
+        time=_checked_text(said, "time") if said.get("time") is not None else None,
+        time_unit=_checked_text(said, "time_unit") if "time_unit" in said else "s",
+        run=_checked_text(said, "run") if said.get("run") is not None else None,
+        per_run=_checked_texts(said, "per_run"),
+        controls=_checked_texts(said, "controls"),
         noise=Noise.of(said.get("noise", {})),
-        extra={name: _extra_input(name, each) for name, each in _mapping(said, "extra").items()},
+        extra={name: _checked_extra(name, each) for name, each in _checked_mapping(said, "extra").items()},
         vectorized=bool(said.get("vectorized", False)),
         source=path.name,
         fingerprint=hashlib.sha256(text.encode()).hexdigest()[:16],
     )
 
 
-def _text(said: Mapping[str, Any], name: str) -> str:
+def _checked_text(said: Mapping[str, Any], name: str) -> str:
     value = said.get(name)
     if not isinstance(value, str) or not value:
         raise ParameterError(name, value, f'a text: {name} = "..."')
     return value
 
 
-def _texts(said: Mapping[str, Any], name: str) -> tuple[str, ...]:
+def _checked_texts(said: Mapping[str, Any], name: str) -> tuple[str, ...]:
     value = said.get(name, ())
     if isinstance(value, str) or not all(isinstance(each, str) for each in value):
         raise ParameterError(name, value, f'a list of names: {name} = ["..."]')
     return tuple(value)
 
 
-def _mapping(said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+def _checked_mapping(said: Mapping[str, Any], name: str) -> Mapping[str, Any]:
     value = said.get(name, {})
     if not isinstance(value, Mapping):
         raise ParameterError(name, value, "a dict")
     return value
 
 
-def _function(said: Mapping[str, Any], name: str) -> Any:
+def _checked_function(said: Mapping[str, Any], name: str) -> Any:
     value = said.get(name)
     if not callable(value):
         raise ParameterError(name, value, f"a function: def {name}(...)")
     return value
 
 
-def _extra_input(name: str, given: object) -> Extra:
+def _checked_extra(name: str, given: object) -> Extra:
     if not isinstance(given, Mapping) or given.keys() != {"prior", "null", "says"}:
         raise ParameterError(f"extra[{name!r}]", given, 'a dict with "prior", "null" and "says"')
-    return Extra(marginal_of(name, given["prior"]), float(given["null"]), str(given["says"]))
+    return Extra(parse_prior(name, given["prior"]), float(given["null"]), str(given["says"]))

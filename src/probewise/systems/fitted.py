@@ -48,9 +48,9 @@ class FittedSystem(NamedSamples):
     effects
         Names of the effects, including noise effects.
     absent
-        By effect, whether it is absent in each sample, (n_samples,).
+        By effect, the mask of the samples in which it is absent, (n_samples,).
     level
-        Smallest and largest predicted reading of the recording.
+        Smallest and largest of the readings predicted for the recording.
     max_step
         Largest integration step, if there is a law.
     known
@@ -60,7 +60,7 @@ class FittedSystem(NamedSamples):
     source
         Name of the recording's file.
     notes
-        Why the result should be used with care.
+        Reasons to use the result with care.
     version
         Version of the package.
     """
@@ -126,7 +126,7 @@ class FittedSystem(NamedSamples):
             "absent": {name: np.flatnonzero(without).tolist() for name, without in self.absent.items()},
             "noise": {"mean": float(self.noise_sd.mean()), "sd": self.noise_sd.tolist()},
             "level": list(self.level),
-            "bound_about": None if self.known is None else _known_json(self.known),
+            "bound_about": None if self.known is None else _recorded_to_json(self.known),
             "notes": list(self.notes),
             "samples": self.samples.tolist(),
         }
@@ -164,7 +164,7 @@ class FittedSystem(NamedSamples):
                 samples=samples,
                 noise_sd=np.array(document["noise"]["sd"], dtype=np.float64),
                 effects=tuple(document["effects"]),
-                absent={name: _marked_samples(rows, len(samples)) for name, rows in document["absent"].items()},
+                absent={name: _mask_of_samples(rows, len(samples)) for name, rows in document["absent"].items()},
                 level=(float(document["level"][0]), float(document["level"][1])),
                 max_step=math.inf if own["max_step"] is None else float(own["max_step"]),
                 known=None if known is None else _recorded_from_json(known, simulator),
@@ -206,19 +206,19 @@ def require_fitted_system(fitted: object) -> None:
     require_kind("fitted", fitted, FittedSystem, allowed)
 
 
-def _known_json(known: Recorded) -> dict[str, Any]:
+def _recorded_to_json(known: Recorded) -> dict[str, Any]:
     table = known.table
     return {
         "time": table.time,
         "run": table.run,
-        "columns": {name: _column_json(values) for name, values in table.columns.items()},
+        "columns": {name: _column_to_json(values) for name, values in table.columns.items()},
         "predicted": known.predicted.tolist(),
         "states": {name: values.tolist() for name, values in known.states.items()},
         "held": list(known.held),
     }
 
 
-def _column_json(values: NDArray[Any]) -> list[Any]:
+def _column_to_json(values: NDArray[Any]) -> list[Any]:
     """Convert a column to JSON; missing numbers are null."""
     if values.dtype != np.float64:
         return [str(value) for value in values.tolist()]
@@ -241,7 +241,8 @@ def _column_from_json(values: list[Any]) -> NDArray[Any]:
     return np.array([math.nan if value is None else value for value in values], dtype=np.float64)
 
 
-def _marked_samples(rows: list[int], n_samples: int) -> BoolArray:
+def _mask_of_samples(rows: list[int], n_samples: int) -> BoolArray:
+    """Return the mask, (n_samples,), of the samples with these numbers."""
     out = np.zeros(n_samples, dtype=np.bool_)
     out[np.array(rows, dtype=np.int64)] = True
     return out

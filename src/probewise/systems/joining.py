@@ -35,7 +35,7 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
     Raises
     ------
     ParameterError
-        If two tables are the same, or a column has numbers in one and texts in another.
+        If there is no table, two are the same, or a column of numbers in the first has texts in another.
     """
     if not tables:
         raise ParameterError("tables", (), "one or more")
@@ -56,7 +56,7 @@ def join_tables(tables: Sequence[RunTable], sources: Sequence[str]) -> tuple[Run
         for name in first.columns
     }
     run = first.run or unused_name(_FILE, columns)
-    columns[run] = np.array(list(_runs(tables, sources, named=first.run is not None)))
+    columns[run] = np.array(list(_run_names_by_row(tables, sources, named=first.run is not None)))
     return replace(first, columns=columns, run=run), tuple(notes)
 
 
@@ -83,8 +83,8 @@ def _joined_column(
     return np.concatenate(out)
 
 
-def _runs(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> Iterable[str]:
-    """Name the run of each row as in its table, with a number appended if another table's run has that name."""
+def _run_names_by_row(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) -> Iterable[str]:
+    """Yield the name of each row's run, with a number appended if a run of an earlier table has that name."""
     taken: set[str] = set()
     for table, source in zip(tables, sources, strict=True):
         own = {}
@@ -96,7 +96,7 @@ def _runs(tables: Sequence[RunTable], sources: Sequence[str], *, named: bool) ->
 
 
 def unused_name(name: str, taken: Iterable[str]) -> str:
-    """Return an unused name: this one, or with a number appended."""
+    """Return the name, with a number appended if it is among those taken."""
     known = set(taken)
     numbered = (f"{name} ({k})" for k in itertools.count(2))
     return next(n for n in itertools.chain([name], numbered) if n not in known)

@@ -1,4 +1,4 @@
-"""One-line messages for errors in a user's functions: which function, where, and what is allowed."""
+"""Errors of a user's functions as a FileError on one line: which function, where, and what is allowed."""
 
 from __future__ import annotations
 
@@ -15,19 +15,21 @@ from probewise.systems.simulator import Simulator
 _LONGEST = 160
 
 
-def mistake_in(what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]) -> FileError:
-    """Build the message for an error that `simulate`, `rates` or `observe` raises at every call.
+def user_function_error(
+    what: str, error: Exception, simulator: Simulator, columns: Mapping[str, NDArray[Any]]
+) -> FileError:
+    """Return a FileError for an exception that `simulate`, `rates` or `observe` raises at every call.
 
     Parameters
     ----------
     what
-        The function.
+        Name of the function.
     error
         The exception.
     simulator, columns
         The simulator, and the columns passed to the function.
     """
-    where = _function_files(simulator)
+    where = _files_of_user_functions(simulator)
     lines = [f.lineno for f in traceback.extract_tb(error.__traceback__) if f.filename in where]
     said = " ".join(str(error).split())
     said = said if len(said) <= _LONGEST else f"{said[: _LONGEST - 3]}..."
@@ -40,15 +42,15 @@ def mistake_in(what: str, error: Exception, simulator: Simulator, columns: Mappi
             f"columns {names or 'none'}, parameters {', '.join((*simulator.parameters, *simulator.extra))}{states}"
         )
     elif texts and isinstance(error, TypeError | ValueError):
-        shown = ", ".join(f"{name} ({_first_text(columns[name])!r})" for name in texts[:4])
+        shown = ", ".join(f"{name} ({_first_non_numeric_cell(columns[name])!r})" for name in texts[:4])
         allowed = f"calculations with numeric columns; these contain text: {shown}"
     else:
         allowed = f"a function that returns a reading for each of the {_n_rows(columns)} rows somewhere in the prior"
     return FileError(simulator.source or what, found, allowed, row=lines[-1] if lines else None)
 
 
-def _function_files(simulator: Simulator) -> set[str]:
-    """Return the files that hold the user's functions."""
+def _files_of_user_functions(simulator: Simulator) -> set[str]:
+    """Return the names of the files that hold the user's functions."""
     functions: list[Any] = [simulator.simulate]
     if simulator.law is not None:
         functions += [simulator.law.rates, simulator.law.observe]
@@ -56,8 +58,8 @@ def _function_files(simulator: Simulator) -> set[str]:
     return {code.co_filename for code in codes if code is not None}
 
 
-def _first_text(values: NDArray[Any]) -> str:
-    """Return the first cell that is not a number, or ""."""
+def _first_non_numeric_cell(values: NDArray[Any]) -> str:
+    """Return the first cell that is not a number; the first cell if all are numbers, "" if there is none."""
     for cell in values.tolist():
         try:
             float(cell)

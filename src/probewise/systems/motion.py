@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError
-from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, Stepping, Terms
+from probewise.systems.runge_kutta import FOURTH_ORDER, N_LONGER, RungeKutta, StepSchedule, Terms
 from probewise.systems.simulator import Law
 from probewise.systems.table import RunTable
 
@@ -35,7 +35,7 @@ class Limit:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A law with the contributions of effects: terms of rates, dry friction, bounds.
+    """A law with the contributions of effects: additional terms of rates, dry friction, bounds.
 
     `friction` is, by state, the size of the force against its motion, (n_samples, 1): a state at rest sticks until the
     other terms of its rate exceed it.
@@ -47,24 +47,24 @@ class Motion:
     limits: tuple[Limit, ...] = ()
 
     def with_term(self, state: str, term: Term) -> Motion:
-        """Add a term to the rate of a state."""
+        """Return the motion with a term added to the rate of a state."""
         return replace(self, terms=(*self.terms, (state, term)))
 
     def with_friction(self, state: str, size: FloatArray) -> Motion:
-        """Add dry friction to a state."""
+        """Return the motion with dry friction of this size, (n_samples, 1), added to a state."""
         known = dict(self.friction)
         known[state] = known[state] + size if state in known else size
         return replace(self, friction=known)
 
     def with_limit(self, limit: Limit) -> Motion:
-        """Add a bound to a state."""
+        """Return the motion with a bound of a state added."""
         return replace(self, limits=(*self.limits, limit))
 
     @cached_property
     def _is_bare(self) -> bool:
         return not (self.terms or self.friction or self.limits)
 
-    def ways(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
+    def friction_directions(self, s: Mapping[str, Any], p: Mapping[str, Any], u: Mapping[str, Any]) -> dict[str, Any]:
         """Return the direction of motion of each state with friction during the next step: 1, -1, or 0 if it sticks."""
         if not self.friction:
             return {}
@@ -96,8 +96,8 @@ class Motion:
                 out[other] = out[other] + share * np.where(stopped, rate, 0.0)
         return out
 
-    def at_end_of_step(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
-        """Correct states at the end of a step: clip to bounds, and stop states that friction brought to rest."""
+    def correct_step_end(self, ways: Mapping[str, Any], after: dict[str, Any]) -> dict[str, Any]:
+        """Clip the states after a step to their bounds, stop those that friction brought to rest, and return them."""
         for state, way in ways.items():
             after[state] = np.where(way * after[state] < 0, 0.0, after[state])
         for limit in self.limits:
@@ -139,20 +139,22 @@ class RowsInRuns:
         return np.diff(self.table.time_s[self.row_at_place], axis=0)
 
     @cached_property
-    def place(self) -> tuple[IntArray, IntArray]:
-        """Position and run of each row, (n_points,) each."""
+    def place_and_run(self) -> tuple[IntArray, IntArray]:
+        """Position in its run, and number of its run, of each row, (n_points,) each."""
         place = np.empty(len(self.table), dtype=np.int64)
         for rows in self.table.rows_by_scan():
             place[rows] = np.arange(len(rows))
         return place, self.table.scan
 
-    def stepping(self, max_step: float) -> Stepping:
-        """Return the steps from each position to the next: as many as `max_step` asks for at fourth order."""
+    def step_schedule(self, max_step: float) -> StepSchedule:
+        """Return the number of steps from each position to the next, as `max_step` asks for, and their method."""
         longest = self.gaps.max(axis=1, initial=0.0)
-        return Stepping.of(np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64))
+        return StepSchedule.from_fourth_order(
+            np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
+        )
 
 
-def integrate(
+def integrate_readings(
     motion: Motion,
     places: RowsInRuns,
     parameters: Mapping[str, FloatArray],
@@ -160,7 +162,7 @@ def integrate(
     *,
     max_step: float,
 ) -> FloatArray:
-    """Integrate by a Runge-Kutta method; return all readings, (n_samples, n_points).
+    """Integrate a law by a Runge-Kutta method; return the reading at every row, (n_samples, n_points).
 
     Parameters
     ----------
@@ -173,16 +175,16 @@ def integrate(
     columns
         (n_points,), or (n_samples, n_points) if an effect changes them.
     max_step
-        Largest step at fourth order, in the unit of time; see `Stepping.of`.
+        Largest step at fourth order, in the unit of time; see `StepSchedule.from_fourth_order`.
     """
     states = integrate_states(motion, places, parameters, columns, max_step=max_step)
-    return observed(motion.law, states, parameters, columns)
+    return readings_of_states(motion.law, states, parameters, columns)
 
 
-def observed(
+def readings_of_states(
     law: Law, states: Mapping[str, FloatArray], parameters: Mapping[str, Any], columns: Mapping[str, Any]
 ) -> FloatArray:
-    """Return the readings (n_samples, n_points) of states at every row, each of that shape."""
+    """Return a law's readings, (n_samples, n_points), from its states at every row, each of that shape."""
     first = next(iter(states.values()))
     if law.observe is None:
         return first
@@ -199,13 +201,13 @@ def integrate_states(
     *,
     max_step: float,
 ) -> dict[str, FloatArray]:
-    """Integrate like `integrate`, but return every state at every row, (n_samples, n_points)."""
+    """Integrate a law as `integrate_readings` does; return every state at every row, by name, (n_samples, n_points)."""
     motion = Motion(motion) if isinstance(motion, Law) else motion
-    stepping = places.stepping(max_step)
-    at_row = np.concatenate([[0], np.cumsum(stepping.in_gap)])
+    schedule = places.step_schedule(max_step)
+    at_row = np.concatenate([[0], np.cumsum(schedule.n_steps)])
     kept: dict[str, FloatArray] = {}
     k = 0
-    for number, s in enumerate(states_by_step(motion, places, parameters, columns, stepping)):
+    for number, s in enumerate(states_by_step(motion, places, parameters, columns, schedule)):
         if number != at_row[k]:
             continue
         for state, values in s.items():
@@ -213,7 +215,7 @@ def integrate_states(
                 kept[state] = np.empty((len(values), *places.row_at_place.shape))
             kept[state][:, k] = values
         k += 1
-    place, run = places.place
+    place, run = places.place_and_run
     return {state: values[:, place, run] for state, values in kept.items()}
 
 
@@ -222,24 +224,24 @@ def states_by_step(
     places: RowsInRuns,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, NDArray[Any]],
-    stepping: Stepping,
+    schedule: StepSchedule,
 ) -> Iterator[dict[str, FloatArray]]:
     """Integrate the motion: yield all states by name, (n_samples, n_runs) each, at the start and after each step."""
     n_samples = max((len(v) for v in (*parameters.values(), *columns.values()) if np.ndim(v) == 2), default=1)
-    start = starts_of(motion.law, places, parameters, n_samples)
-    gaps = gaps_of(places, columns)
-    s = motion.at_end_of_step({}, dict(start))
+    start = initial_states(motion.law, places, parameters, n_samples)
+    gaps = time_gaps(places, columns)
+    s = motion.correct_step_end({}, dict(start))
     with np.errstate(all="ignore"):
-        given_there = Given.of(motion, places, parameters, columns, start)
+        given_there = LawInputs.of(motion, places, parameters, columns, start)
         yield s
-        for k, n in enumerate(stepping.in_gap.tolist()):
-            stepper = Stepper(motion, stepping.method, given_there.between(k), gaps[:, k])
+        for k, n in enumerate(schedule.n_steps.tolist()):
+            stepper = Stepper(motion, schedule.method, given_there.interpolator_of_gap(k), gaps[:, k])
             for i in range(n):
                 s = stepper.step(s, i / n, 1 / n)
                 yield s
 
 
-def gaps_of(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
+def time_gaps(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArray:
     """Return the time from each position to the next by the time column, (1 or n_samples, n_places - 1, n_runs).
 
     An effect on the clock changes the time column, and so these gaps.
@@ -247,7 +249,7 @@ def gaps_of(places: RowsInRuns, columns: Mapping[str, NDArray[Any]]) -> FloatArr
     return np.asarray(np.diff(_values_at_rows(columns[str(places.table.time)], places.row_at_place), axis=1))
 
 
-def starts_of(
+def initial_states(
     law: Law, places: RowsInRuns, parameters: Mapping[str, FloatArray], n_samples: int
 ) -> dict[str, FloatArray]:
     """Return the states in which runs start, (n_samples, n_runs) each."""
@@ -263,10 +265,10 @@ def starts_of(
 
 @dataclass(frozen=True, eq=False)
 class Stepper:
-    """Steps of a motion by a method, within gaps of a length in time; `between` gives what is known there.
+    """Steps of a motion by a Runge-Kutta method within a gap between rows.
 
-    In its methods `begin` and `length` are shares of a gap: numbers, or arrays of as many as there are columns of
-    states.
+    `gap` is the gap's time; `between` is a function of a share of it that returns parameters and columns. In the
+    methods `begin` and `length` are shares of the gap: numbers, or one for each column of the states.
     """
 
     motion: Motion
@@ -275,7 +277,7 @@ class Stepper:
     gap: FloatArray
 
     def step(self, s: dict[str, Any], begin: Any, length: Any) -> dict[str, Any]:
-        """Advance by a share of a gap; split the step where friction brings a state to rest or lets it go.
+        """Return the states after a step; it is split where friction brings a state to rest or lets it go.
 
         A motion that may come to a halt within a step takes one of eighth order as several of fourth order.
         """
@@ -285,12 +287,12 @@ class Stepper:
             for k in range(N_LONGER):
                 s = shorter.step(s, begin + k * part, part)
             return s
-        ways = motion.ways(s, *between(begin))
-        after = self._unsplit(s, begin, length, ways)
+        ways = motion.friction_directions(s, *between(begin))
+        after = self._step_without_split(s, begin, length, ways)
         for state, way in ways.items():
             at_rest = way == 0
 
-            def margin(
+            def margin_to_transition(
                 at: Mapping[str, Any], share: Any, state: str = state, way: Any = way, at_rest: Any = at_rest
             ) -> Any:
                 """Return how much is left until the state comes to rest or breaks loose."""
@@ -300,37 +302,41 @@ class Stepper:
                 free = motion.rates(at, *between(share), {})[state]
                 return np.where(at_rest, motion.friction[state] - np.abs(free), moving)
 
-            first, last = margin(s, begin), margin(after, begin + length)
+            first, last = margin_to_transition(s, begin), margin_to_transition(after, begin + length)
             ends = last < 0
             if not ends.any():
                 continue
             until = np.where(ends, _zero_between(0.0, first, 1.0, last), 1.0)
-            there = self._unsplit(s, begin, until * length, ways)
-            left = margin(there, begin + until * length)
+            there = self._step_without_split(s, begin, until * length, ways)
+            left = margin_to_transition(there, begin + until * length)
             closer = np.where(left > 0, _zero_between(until, left, 1.0, last), _zero_between(0.0, first, until, left))
             until = np.where(ends, closer, 1.0)
-            there = self._unsplit(s, begin, until * length, ways)
+            there = self._step_without_split(s, begin, until * length, ways)
             there[state] = np.where(ends, 0.0, there[state])
-            anew = motion.ways(there, *between(begin + until * length))
+            anew = motion.friction_directions(there, *between(begin + until * length))
             free = motion.rates(after, *between(begin + length), {})[state]
             anew[state] = np.where(ends & at_rest, np.sign(free), anew[state])
-            after = self._unsplit(there, begin + until * length, (1 - until) * length, anew)
+            after = self._step_without_split(there, begin + until * length, (1 - until) * length, anew)
             ways = anew
-        return motion.at_end_of_step(ways, after) if ways or motion.limits else after
+        return motion.correct_step_end(ways, after) if ways or motion.limits else after
 
-    def _unsplit(self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]) -> dict[str, Any]:
-        """Take one step of the method, with friction against fixed directions."""
+    def _step_without_split(
+        self, s: Mapping[str, Any], begin: Any, length: Any, ways: Mapping[str, Any]
+    ) -> dict[str, Any]:
+        """Return the states after one step of the method, with friction against the fixed directions `ways`."""
         method, width, given = self.method, self.gap * length, self.between(begin)
         rates = [self.motion.rates(s, *given, ways)]
         for k, terms in enumerate(method.stages[1:], 1):
             if method.c[k] != method.c[k - 1]:
                 given = self.between(begin + method.c[k] * length)
-            rates.append(self.motion.rates(_moved(s, width, terms, rates), *given, ways))
-        return _moved(s, width, method.weights, rates)
+            rates.append(self.motion.rates(_advanced_states(s, width, terms, rates), *given, ways))
+        return _advanced_states(s, width, method.weights, rates)
 
 
-def _moved(s: Mapping[str, Any], width: Any, terms: Terms, rates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Move states for a time along a weighted sum of rates."""
+def _advanced_states(
+    s: Mapping[str, Any], width: Any, terms: Terms, rates: Sequence[Mapping[str, Any]]
+) -> dict[str, Any]:
+    """Return states moved for the time `width` along a weighted sum of rates."""
     (first, weight), *others = terms
     if not others:  # of one stage, as all of fourth order are: one product less
         share = weight * width
@@ -354,10 +360,11 @@ Pair = tuple[Mapping[str, Any], Mapping[str, Any]]
 
 
 @dataclass(frozen=True, eq=False)
-class Given:
-    """Parameters and columns at the positions of runs: those held over a gap, and those interpolated linearly.
+class LawInputs:
+    """Parameters and columns of a law at the positions in runs: some held over a gap, some interpolated linearly.
 
-    Arrays are (1 or n_samples, n_places, n_runs).
+    `constant` and `moving` are parameters, `held` and `sloping` are columns, (1 or n_samples, n_places, n_runs); a
+    constant parameter has no axis of places.
     """
 
     constant: Mapping[str, Any]  # parameters
@@ -373,8 +380,8 @@ class Given:
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
         start: Mapping[str, FloatArray],
-    ) -> Given:
-        """Arrange parameters and columns, (n_points,) or (n_samples, n_points), for a law that begins at `start`."""
+    ) -> LawInputs:
+        """Arrange parameters, and the columns that the law reads at `start`, (n_points,) or (n_samples, n_points)."""
         rows, law, time = places.row_at_place, motion.law, places.table.time
         constant: dict[str, Any] = {}
         moving: dict[str, FloatArray] = {}
@@ -394,14 +401,17 @@ class Given:
             (sloping if slopes else held)[name] = _values_at_rows(columns[name], rows)
         return cls(constant, moving, held, sloping)
 
-    def between(self, k: int) -> Callable[[Any], Pair]:
-        """Return a function of the share of the gap from position k to the next, which gives parameters and columns."""
+    def interpolator_of_gap(self, k: int) -> Callable[[Any], Pair]:
+        """Return the function that maps a share of the gap from position k to the next to parameters and columns."""
         moving = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.moving.items()}
         sloping = {name: (v[:, k], v[:, k + 1] - v[:, k]) for name, v in self.sloping.items()}
-        return _values_within_gap(self.constant, moving, {name: v[:, k] for name, v in self.held.items()}, sloping)
+        return _interpolator(self.constant, moving, {name: v[:, k] for name, v in self.held.items()}, sloping)
 
-    def throughout(self, gap: IntArray) -> Callable[[Any], Pair]:
-        """Return `between` for many steps at once, that go on from the positions `gap` (n_steps,); runs are within."""
+    def interpolator_of_steps(self, gap: IntArray) -> Callable[[Any], Pair]:
+        """Return the same function for many steps at once, in the gaps from the positions `gap`, (n_steps,).
+
+        Its arrays have a column for each step and run, the runs of a step in turn.
+        """
 
         def flat(values: Any) -> Any:
             return values.reshape(len(values), -1)
@@ -413,7 +423,7 @@ class Given:
         moving = {name: rising(v) for name, v in self.moving.items()}
         sloping = {name: rising(v) for name, v in self.sloping.items()}
         held = {name: flat(v[:, gap]) for name, v in self.held.items()}
-        return _values_within_gap(constant, moving, held, sloping)
+        return _interpolator(constant, moving, held, sloping)
 
 
 class _ReadTracker(dict[str, Any]):
@@ -450,13 +460,16 @@ class _ReadTracker(dict[str, Any]):
         return super().items()
 
 
-def _values_within_gap(
+def _interpolator(
     constant: Mapping[str, Any],
     moving: Mapping[str, tuple[Any, Any]],
     held: Mapping[str, Any],
     sloping: Mapping[str, tuple[Any, Any]],
 ) -> Callable[[Any], Pair]:
-    """Return a function of the share of a gap: parameters and columns, of which some rise linearly (low, rise)."""
+    """Return the function that maps a share of a gap to parameters and columns.
+
+    Those in `moving` and `sloping` are pairs, of the value at the beginning of the gap and its rise over the gap.
+    """
     if not (moving or sloping):
         throughout = constant, held
         return lambda share: throughout

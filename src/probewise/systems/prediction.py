@@ -26,7 +26,7 @@ from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
-from probewise.systems.table import RunRecording, RunTable, relative_sd_of
+from probewise.systems.table import RunRecording, RunTable, relative_sds_of
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
@@ -61,7 +61,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     Raises
     ------
     ParameterError
-        If the column of the readings holds texts.
+        If the column of the readings holds texts, or a declared sd is not positive where there is a reading.
     """
     low, high = simulator.noise.range
     own = replace(
@@ -74,7 +74,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     if readings is None:
         readings = np.full(len(table), np.nan)
     elif readings.dtype != np.float64:
-        bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_float(cell)), 0)
+        bad = next((k for k, cell in enumerate(readings.tolist()) if not _is_float_or_empty(cell)), 0)
         found = f"{readings[bad]!s} in row {bad + 2}"
         raise ParameterError(
             f"reading {simulator.reading!r}", found, "a number in each row, or nothing where it is missing"
@@ -92,7 +92,7 @@ def as_recording(simulator: Simulator, table: RunTable) -> RunRecording:
     return recording
 
 
-def _is_float(text: str) -> bool:
+def _is_float_or_empty(text: str) -> bool:
     try:
         float(text)
     except ValueError:
@@ -137,10 +137,10 @@ def predict_system(
     recording = as_recording(fitted.simulator, table_for(fitted.simulator, table))
     own = cast(RunTable, recording.plan)
     system = replace(System.of(fitted.simulator, own), max_step=fitted.max_step)
-    chain = system.chain(own, bound_effects(fitted, own))
+    chain = system.chain(own, bind_effects(fitted, own))
     theta, is_drawn = _samples_for_chain(fitted, chain, rng=rng)
     n_samples, per_block = len(theta), max(1, _BLOCK // max(1, len(own)))
-    lost = _unpredictable_rows(chain, theta, own)
+    lost = _unpredictable_mask(chain, theta, own)
     mixture = PredictiveMixture(recording.readings, recording.usable & ~lost, own.instrumentation.step)
     n_failed = 0
     between = _kernel_width(chain, theta, own) if is_drawn else None
@@ -176,8 +176,8 @@ def predict_system(
     return SystemPrediction(own, recording.readings, mean, sd, scores, n_samples, n_failed)
 
 
-def _unpredictable_rows(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
-    """Return which rows cannot be predicted because a value is missing, (n_points,)."""
+def _unpredictable_mask(chain: SystemChain, theta: FloatArray, table: RunTable) -> BoolArray:
+    """Return the mask of the rows that cannot be predicted because a value is missing, (n_points,)."""
     missing = (
         np.any([~np.isfinite(values) for values in table.covariates.values()], axis=0) if table.covariates else False
     )
@@ -187,11 +187,17 @@ def _unpredictable_rows(chain: SystemChain, theta: FloatArray, table: RunTable) 
     return np.asarray(~there.any(axis=0) if there.any() else np.zeros(len(table), dtype=np.bool_))
 
 
-def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
-    """Bind the effects of a fitted simulator to the runs of a table."""
+def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]]:
+    """Bind the effects of a fitted simulator to the runs of a table, in their order.
+
+    Raises
+    ------
+    ParameterError
+        If a column that an effect reads is missing, or this version has no such effect.
+    """
     forms: Mapping[str, Any] = {}
     if fitted.known is not None:
-        lacking = _columns_read(fitted.effects, fitted.known.table) - set(table.columns)
+        lacking = _target_columns(fitted.effects, fitted.known.table) - set(table.columns)
         if lacking:
             name = min(lacking)
             raise ParameterError(
@@ -217,8 +223,8 @@ def bound_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any
     return cast(list[NamedEffect[Any]], out)
 
 
-def _columns_read(effects: Sequence[str], table: RunTable) -> set[str]:
-    """Return the columns of the recording that are targets of effects."""
+def _target_columns(effects: Sequence[str], table: RunTable) -> set[str]:
+    """Return the names of the recording's columns that effects are bound to, from the effects' names."""
     return {part for name in effects for part in name.split(":")[1:] if part in table.columns}
 
 
@@ -240,11 +246,11 @@ def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> Flo
 def _samples_for_chain(
     fitted: FittedSystem, chain: SystemChain, *, rng: np.random.Generator
 ) -> tuple[FloatArray, bool]:
-    """Arrange the samples by the columns of a chain, with draws of parameters of runs outside the recording.
+    """Arrange the samples by the columns of a chain, and draw the parameters of runs outside the recording.
 
     Returns
     -------
-    The samples, and whether anything was drawn.
+    The samples, (n_samples, n_params), and whether any parameter was drawn.
     """
     at = {name: k for k, name in enumerate(fitted.names)}
     n, system = len(fitted.samples), chain.system
@@ -267,7 +273,7 @@ def _samples_for_chain(
 def draw_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArray:
     """Draw the value of a new run given those of other runs: (n_samples, n_runs) -> (n_samples,).
 
-    Mean and variance of the runs are unknown; the prior of the variance is worth two more runs with the same scatter.
+    Mean and variance of the runs are unknown; the prior of the variance counts as two more runs with the same scatter.
     """
     n_runs = known.shape[1]
     spread = known.std(axis=1, ddof=1) if n_runs > 1 else np.abs(known[:, 0])
@@ -284,7 +290,7 @@ def _noise_level(
     if isinstance(declared, str) and fitted.known is not None:
         values = fitted.known.table.covariates[declared]
         typical = float(np.median(values[np.isfinite(values) & (values > 0)]))
-        sd = sd * relative_sd_of(table, declared, typical)
+        sd = sd * relative_sds_of(table, declared, typical)
     level = NoiseLevel(sd, np.zeros((1, 1)), seen=seen)
     for effect, columns in columns_of_effects(chain.effects, chain.system.n_params):
         if effect.stage is Stage.NOISE:

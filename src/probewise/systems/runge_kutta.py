@@ -32,16 +32,16 @@ class RungeKutta:
 
     @cached_property
     def stages(self) -> tuple[Terms, ...]:
-        """The sums of earlier rates that lead to each stage."""
-        return tuple(map(_terms, self.a))
+        """For each stage, the numbers and weights of the earlier rates that lead to it."""
+        return tuple(map(_nonzero_terms, self.a))
 
     @cached_property
     def weights(self) -> Terms:
-        """The sum of rates that leads to the end of the step."""
-        return _terms(self.b)
+        """Numbers and weights of the rates that lead to the end of the step."""
+        return _nonzero_terms(self.b)
 
 
-def _terms(weights: tuple[float, ...]) -> Terms:
+def _nonzero_terms(weights: tuple[float, ...]) -> Terms:
     return tuple((k, weight) for k, weight in enumerate(weights) if weight)
 
 
@@ -53,7 +53,10 @@ N_LONGER = 3
 
 @cache
 def eighth_order() -> RungeKutta:
-    """Return the method (Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 1993, section II.10)."""
+    """Return the method of eighth order.
+
+    Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 1993, section II.10.
+    """
     from scipy.integrate import DOP853  # takes long, and laws alone need it
 
     a = tuple(tuple(row[:k].tolist()) for k, row in enumerate(DOP853.A))
@@ -61,19 +64,19 @@ def eighth_order() -> RungeKutta:
 
 
 @dataclass(frozen=True, eq=False)
-class Stepping:
+class StepSchedule:
     """The number of steps in each gap between rows, (n_gaps,), and the method that takes them."""
 
-    in_gap: IntArray
+    n_steps: IntArray
     method: RungeKutta
 
     @classmethod
-    def of(cls, in_gap: IntArray) -> Stepping:
-        """Take these numbers of fourth-order steps, or a third as many of eighth order where that costs as much.
+    def from_fourth_order(cls, n_steps: IntArray) -> StepSchedule:
+        """Take these numbers of fourth-order steps, (n_gaps,), or a third as many, rounded up, of eighth order.
 
-        In gaps that need a single step, fourth order suffices.
+        Eighth order is taken where it costs at most 1.5 times as many evaluations, as in gaps that need several steps.
         """
-        fewer = np.asarray(-(-in_gap // N_LONGER), dtype=np.int64)
-        if N_LONGER * fewer.sum() <= _DEARER * in_gap.sum():
+        fewer = np.asarray(-(-n_steps // N_LONGER), dtype=np.int64)
+        if N_LONGER * fewer.sum() <= _DEARER * n_steps.sum():
             return cls(fewer, eighth_order())
-        return cls(in_gap, FOURTH_ORDER)
+        return cls(n_steps, FOURTH_ORDER)

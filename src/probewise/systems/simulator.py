@@ -56,12 +56,12 @@ class Noise:
 
     @classmethod
     def of(cls, given: object) -> Noise:
-        """Build from a user's dict with some of "sd", "step", "range", "zero".
+        """Build from a user's dict with some of "sd", "step", "range", "zero"; a Noise is returned as it is.
 
         Raises
         ------
         ParameterError
-            If it is anything else.
+            If it is anything else, or a value is out of range.
         """
         if isinstance(given, Noise):
             return given
@@ -200,7 +200,7 @@ class Simulator:
         require_mapping("parameters", self.parameters, "the prior of each by name: {'tau_s': ('log', 1, 1000)}")
         if not self.parameters:
             raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
-        object.__setattr__(self, "parameters", {n: marginal_of(n, prior) for n, prior in self.parameters.items()})
+        object.__setattr__(self, "parameters", {n: parse_prior(n, prior) for n, prior in self.parameters.items()})
         object.__setattr__(self, "per_run", require_texts("per_run", self.per_run, "names of parameters"))
         object.__setattr__(self, "controls", require_texts("controls", self.controls, "names of columns"))
         object.__setattr__(self, "noise", Noise.of(self.noise))
@@ -238,7 +238,7 @@ def require_simulator(simulator: object) -> None:
     require_kind("simulator", simulator, Simulator, f"{allowed}; then comes the table")
 
 
-def marginal_of(name: str, given: object) -> Marginal:
+def parse_prior(name: str, given: object) -> Marginal:
     """Parse a user's prior: (low, high), ("log", low, high), ("normal", mean, sd), or a prior object.
 
     Raises

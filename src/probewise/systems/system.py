@@ -17,10 +17,10 @@ from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import columns_of_effects, names_of_effects
-from probewise.systems.all_steps import Trajectories, integrate_near, steps_of
+from probewise.systems.all_steps import TrajectoryCache, integrate_near, steps_of
 from probewise.systems.calls import Caller, IntegrationTally
-from probewise.systems.mistakes import mistake_in
-from probewise.systems.motion import Motion, RowsInRuns, integrate, observed
+from probewise.systems.mistakes import user_function_error
+from probewise.systems.motion import Motion, RowsInRuns, integrate_readings, readings_of_states
 from probewise.systems.simulator import Simulator
 from probewise.systems.table import RunTable
 
@@ -47,7 +47,7 @@ class System:
     first
         Coordinates of an earlier fit, used as the start.
     tally
-        Counts samples at which a law raises an error.
+        Counts of a law's integration steps, and of samples at which it raises an error.
     trajectories
         Cache of trajectories of the law, from which nearby ones are solved.
     """
@@ -58,7 +58,7 @@ class System:
     caller: Caller | None = None
     first: FloatArray | None = None
     tally: IntegrationTally = field(default_factory=IntegrationTally)
-    trajectories: Trajectories = field(default_factory=Trajectories, repr=False)
+    trajectories: TrajectoryCache = field(default_factory=TrajectoryCache, repr=False)
 
     @classmethod
     def of(cls, simulator: Simulator, table: RunTable) -> System:
@@ -84,7 +84,7 @@ class System:
         bare = cls(simulator, table.scan_names)
         if simulator.simulate is not None:
             tried = bare.theta(bare.starts[:_N_TRIED])
-            columns = given_columns(simulator, table)
+            columns = columns_without_reading(simulator, table)
             try:
                 caller = Caller.probed(
                     simulator.simulate,
@@ -96,39 +96,41 @@ class System:
             except ProbewiseError:
                 raise
             except Exception as error:
-                raise mistake_in("simulate", error, simulator, columns) from error
+                raise user_function_error("simulate", error, simulator, columns) from error
             return replace(bare, caller=caller)
         gaps = RowsInRuns(table).gaps
         typical = float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
         assert simulator.law is not None
         system = replace(bare, max_step=simulator.law.max_step_s or typical)
-        system.try_law(table)
+        system.require_working_law(table)
         return system
 
-    def try_law(self, table: RunTable) -> None:
-        """Integrate the law at some points of the prior.
+    def require_working_law(self, table: RunTable) -> None:
+        """Raise an error unless the law integrates to finite readings at some point of the prior.
 
         Raises
         ------
         FileError
-            If it raises an error at all of them.
+            If it raises an error at all points that are tried.
         ParameterError
-            If there is no finite reading at any.
+            If there is no finite reading at any of them.
         """
-        columns, law = given_columns(self.simulator, table), self.simulator.law
+        columns, law = columns_without_reading(self.simulator, table), self.simulator.law
         assert law is not None
         readings: list[FloatArray] = []
         wrong: Exception | None = None
         for z in self.starts:
             try:
                 parameters = self.parameters(self.theta(z[None, :]), table)
-                readings.append(integrate(Motion(law), RowsInRuns(table), parameters, columns, max_step=self.max_step))
+                readings.append(
+                    integrate_readings(Motion(law), RowsInRuns(table), parameters, columns, max_step=self.max_step)
+                )
             except ProbewiseError:
                 raise
             except Exception as error:
                 wrong = wrong or error
         if not readings and wrong is not None:
-            raise mistake_in("rates", wrong, self.simulator, columns) from wrong
+            raise user_function_error("rates", wrong, self.simulator, columns) from wrong
         if not np.isfinite(readings).any():
             raise ParameterError(
                 "rates", "NaN at every place of the prior that was tried", "finite states and readings"
@@ -149,7 +151,7 @@ class System:
         return Product(self.marginals)
 
     def parameters(self, theta: FloatArray, table: RunTable) -> dict[str, FloatArray]:
-        """Return parameters by name: (n_samples, 1), or (n_samples, n_points) for parameters per run."""
+        """Return parameters by name: (n_samples, 1), or (n_samples, n_points) for those per run; extras at null."""
         own, out = self.simulator, {}
         at = {name: k for k, name in enumerate(self.marginals)}
         for name in own.parameters:
@@ -161,7 +163,7 @@ class System:
         return out | {name: np.full((1, 1), extra.null) for name, extra in own.extra.items()}
 
     def with_runs(self, table: RunTable) -> System:
-        """Add the runs of another table; their parameters per run have the prior."""
+        """Return the system with the runs of another table added; their parameters per run have the prior."""
         return replace(self, runs=tuple(dict.fromkeys((*self.runs, *table.scan_names))))
 
     @property
@@ -171,7 +173,7 @@ class System:
 
     @property
     def n_gaussians(self) -> int:
-        """None: it has no SSF."""
+        """0: it has no SSF."""
         return 0
 
     @property
@@ -196,7 +198,7 @@ class System:
 
     @cached_property
     def starts(self) -> FloatArray:
-        """Return starting points: an earlier fit, or the prior's centre and quasi-random points, (n, n_params)."""
+        """Coordinates to fit from, (n_starts, n_params): an earlier fit, or the prior's centre and scattered points."""
         if self.first is not None:
             return self.first[None, :]
         # Roberts's sequence (additive recurrence by the root of x^(d+1) = x + 1): uniform in any number of dimensions.
@@ -208,7 +210,7 @@ class System:
 
     @property
     def least_readings(self) -> int:
-        """Three readings per shared parameter and one per parameter of a run."""
+        """Three readings per shared parameter and one per parameter of a run; at least 12."""
         n_own = len(self.simulator.per_run) * len(self.runs)
         return max(12, 3 * (self.n_params - n_own) + n_own)
 
@@ -231,7 +233,7 @@ class System:
         return self.prior.from_unit_cube(ndtr(z))
 
     def chain(self, plan: Any, effects: Sequence[NamedEffect[Any]], *, n_nodes: int = 0) -> SystemChain:
-        """Add effects; the table and `n_nodes` are not used."""
+        """Return the system with effects, ordered by stage; the table and `n_nodes` are not used."""
         return SystemChain(self, tuple(sorted(effects, key=lambda e: (e.stage, e.name))))
 
     def with_converged_step(
@@ -243,7 +245,7 @@ class System:
         tolerance: float,
         or_finest: bool = False,
     ) -> System:
-        """Halve the integration step until predictions change by less than a tolerance (rms).
+        """Return the system with its integration step halved until predictions change by less than a tolerance (rms).
 
         Parameters
         ----------
@@ -287,10 +289,10 @@ class System:
 
     def _has_affordable_steps(self, places: RowsInRuns) -> bool:
         """Return whether the integration takes at most 4,096 steps more than there are rows in the longest run."""
-        return bool(places.stepping(self.max_step).in_gap.sum() <= _MOST_STEPS + len(places.row_at_place))
+        return bool(places.step_schedule(self.max_step).n_steps.sum() <= _MOST_STEPS + len(places.row_at_place))
 
 
-def given_columns(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
+def columns_without_reading(simulator: Simulator, table: RunTable) -> dict[str, NDArray[Any]]:
     """Return the columns passed to `simulate` and `rates`: all except the reading, which they predict."""
     return {name: values for name, values in table.columns.items() if name != simulator.reading}
 
@@ -308,45 +310,45 @@ class SystemChain:
         return (*self.system.prior.names, *names_of_effects(self.effects))
 
     def predict(self, theta: FloatArray, plan: Any) -> FloatArray:
-        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        """Return noise-free readings: theta (n_samples, n_params) -> (n_samples, n_points)."""
         return self.readings_of_view(self.simulated_view(theta, plan), theta, plan)
 
     def simulated_view(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
         system = self.system
-        columns: Mapping[str, NDArray[Any]] = given_columns(system.simulator, plan)
-        columns = self._applied(Stage.INPUT, columns, theta, plan)
-        parameters = self._applied(Stage.PARAMETER, system.parameters(theta, plan), theta, plan)
+        columns: Mapping[str, NDArray[Any]] = columns_without_reading(system.simulator, plan)
+        columns = self._apply_stage(Stage.INPUT, columns, theta, plan)
+        parameters = self._apply_stage(Stage.PARAMETER, system.parameters(theta, plan), theta, plan)
         if system.caller is not None:
             readings = system.caller(parameters, columns)
         else:
-            readings = self._integrated(parameters, columns, theta, plan)
+            readings = self._integrated_readings(parameters, columns, theta, plan)
         return np.array(np.broadcast_to(readings, (len(theta), len(plan))))
 
-    def _integrated(
+    def _integrated_readings(
         self,
         parameters: Mapping[str, FloatArray],
         columns: Mapping[str, NDArray[Any]],
         theta: FloatArray,
         plan: RunTable,
     ) -> FloatArray:
-        """Integrate the law with its effects; NaN for samples at which it raises an error."""
+        """Integrate the law with its effects; return readings, (n_samples, n_points), NaN for samples that raise."""
         system, law = self.system, self.system.simulator.law
         assert law is not None
 
-        def of_some(samples: IntArray) -> tuple[Motion, dict[str, FloatArray], dict[str, NDArray[Any]]]:
-            def own(values: Any) -> Any:
+        def problem_of_samples(samples: IntArray) -> tuple[Motion, dict[str, FloatArray], dict[str, NDArray[Any]]]:
+            def of_samples(values: Any) -> Any:
                 return values[samples] if np.ndim(values) == 2 and len(values) > 1 else values
 
             return (
-                self._applied(Stage.RATE, Motion(law), theta[samples], plan),
-                {name: own(values) for name, values in parameters.items()},
-                {name: own(values) for name, values in columns.items()},
+                self._apply_stage(Stage.RATE, Motion(law), theta[samples], plan),
+                {name: of_samples(values) for name, values in parameters.items()},
+                {name: of_samples(values) for name, values in columns.items()},
             )
 
         try:
             states, cost = integrate_near(
-                of_some,
+                problem_of_samples,
                 steps_of(plan, system.max_step),
                 system.trajectories,
                 effects=(system.runs, self.effects),
@@ -354,7 +356,7 @@ class SystemChain:
                 n_own=system.n_params,
             )
             system.tally.n_steps += cost
-            return observed(law, states, parameters, columns)
+            return readings_of_states(law, states, parameters, columns)
         except ProbewiseError:
             raise
         except Exception:
@@ -362,13 +364,13 @@ class SystemChain:
                 system.tally.n_failed += 1
                 return np.full((1, len(plan)), np.nan)
 
-        def of_one(values: Any, k: int) -> Any:
+        def of_sample(values: Any, k: int) -> Any:
             return values[min(k, len(values) - 1)][None] if np.ndim(values) == 2 else values
 
         each = [
-            self._integrated(
-                {name: of_one(values, k) for name, values in parameters.items()},
-                {name: of_one(values, k) for name, values in columns.items()},
+            self._integrated_readings(
+                {name: of_sample(values, k) for name, values in parameters.items()},
+                {name: of_sample(values, k) for name, values in columns.items()},
                 theta[k : k + 1],
                 plan,
             )
@@ -378,19 +380,19 @@ class SystemChain:
 
     def readings_of_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""
-        for effect, columns in self._columns:
+        for effect, columns in self._columns_of_effects:
             if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
 
     look, read = simulated_view, readings_of_view  # their earlier names
 
-    def _applied(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
-        for effect, columns in self._columns:
+    def _apply_stage(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
+        for effect, columns in self._columns_of_effects:
             if effect.stage is stage:
                 value = effect.apply(value, theta[:, columns], plan)
         return value
 
     @cached_property
-    def _columns(self) -> list[tuple[AnyEffect, slice]]:
+    def _columns_of_effects(self) -> list[tuple[AnyEffect, slice]]:
         return columns_of_effects(self.effects, self.system.n_params)

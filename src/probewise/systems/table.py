@@ -48,7 +48,7 @@ class RunTable:
         if not hasattr(self.columns, "items"):
             allowed = "columns by name: a dict of arrays, or a data frame; of a file: read_run_table('DATA.csv', ...)"
             raise ParameterError("table", self.columns, allowed)
-        columns = {name: _as_column(name, values) for name, values in self.columns.items()}
+        columns = {name: _checked_column(name, values) for name, values in self.columns.items()}
         if not columns:
             raise ParameterError("columns", (), "one or more")
         n_points = len(next(iter(columns.values())))
@@ -72,9 +72,11 @@ class RunTable:
         return len(next(iter(self.columns.values())))
 
     @property
-    def has_time(self) -> bool:
+    def has_varying_time(self) -> bool:
         """Whether a time was recorded that is not the same in all rows."""
         return self.time is not None and float(np.ptp(self.time_s)) > 0
+
+    has_time = has_varying_time  # its earlier name
 
     @cached_property
     def time_s(self) -> FloatArray:
@@ -82,7 +84,7 @@ class RunTable:
         return frozen(np.arange(float(len(self))) if self.time is None else self.columns[self.time])
 
     @cached_property
-    def _runs(self) -> tuple[IntArray, tuple[str, ...]]:
+    def _run_of_row_and_names(self) -> tuple[IntArray, tuple[str, ...]]:
         if self.run is None:
             return np.zeros(len(self), dtype=np.int64), (_ONE_RUN,)
         texts = [number_text(v) if isinstance(v, float) else str(v) for v in self.columns[self.run].tolist()]
@@ -93,16 +95,16 @@ class RunTable:
     @property
     def scan(self) -> IntArray:
         """Number of each row's run, from 0 in the order in which they begin, (n_points,)."""
-        return self._runs[0]
+        return self._run_of_row_and_names[0]
 
     @property
     def scan_names(self) -> tuple[str, ...]:
         """Names of the runs."""
-        return self._runs[1]
+        return self._run_of_row_and_names[1]
 
     @cached_property
     def covariates(self) -> dict[str, FloatArray]:
-        """Numeric columns that were logged or set, without time and run."""
+        """Columns of numbers, not all missing, without time and run; the reading is one of them."""
         kept = {k: v for k, v in self.columns.items() if k not in (self.time, self.run)}
         numbers = {name: values for name, values in kept.items() if values.dtype == np.float64}
         return {name: values for name, values in numbers.items() if np.isfinite(values).any()}
@@ -117,11 +119,11 @@ class RunTable:
         return [np.flatnonzero(self.scan == k) for k in range(len(self.scan_names))]
 
     def take(self, rows: IntArray | BoolArray) -> RunTable:
-        """Keep these rows, in their order."""
+        """Return a table of these rows, given by numbers or by a mask, in their order."""
         return replace(self, columns={name: values[rows] for name, values in self.columns.items()})
 
     def with_columns(self, columns: Mapping[str, FloatArray]) -> RunTable:
-        """Replace or add columns."""
+        """Return a table with these columns replaced or added."""
         return replace(self, columns={**self.columns, **columns})
 
 
@@ -145,11 +147,11 @@ class RunRecording(Recording):
         if not self.sd_column:
             return np.ones(len(self.plan))
         table = cast(RunTable, self.plan)
-        return relative_sd_of(table, self.sd_column)
+        return relative_sds_of(table, self.sd_column)
 
 
-def relative_sd_of(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
-    """Scale a column of sds by the typical one, by default its median, (n_points,); 1 without a column."""
+def relative_sds_of(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
+    """Return a column of sds over the typical one, by default its median, (n_points,); 1 where there is none."""
     values = table.covariates.get(column, np.full(len(table), np.nan))
     there = np.isfinite(values) & (values > 0)
     if not there.any():
@@ -157,7 +159,7 @@ def relative_sd_of(table: RunTable, column: str, typical: float | None = None) -
     return np.where(there, values, 1.0) / np.where(there, np.median(values[there]) if typical is None else typical, 1.0)
 
 
-def _as_column(name: str, values: Any) -> NDArray[Any]:
+def _checked_column(name: str, values: Any) -> NDArray[Any]:
     array = np.asarray(values)
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
@@ -192,7 +194,7 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
     return RunTable(columns, time, run)
 
 
-def write_run_table(table: RunTable) -> str:
+def run_table_csv(table: RunTable) -> str:
     """Return a table as CSV text, with numbers in full precision."""
     return csv_text(
         {

@@ -8,7 +8,7 @@ from probewise.challenge.systems.held_out import predicted_runs
 from probewise.diagnosis import ModelSamples
 from probewise.priors import Normal, Uniform
 from probewise.systems import RunTable, Simulator, System
-from probewise.systems.forms import About, forms_of
+from probewise.systems.forms import ReferenceFit, forms_of
 
 X = np.array([0.0, 1.0, 2.0])
 
@@ -20,7 +20,7 @@ def _samples(per_run, effect=""):
         simulate=lambda p, data: p["start"] + p["slope"] * data["x"],
     )  # fmt: skip
     system = System.of(simulator, table)
-    about = About(system, table, np.zeros(system.n_params), 0.1)
+    about = ReferenceFit(system, table, np.zeros(system.n_params), 0.1)
     effects = [forms_of(about)[effect]] if effect else []
     theta = np.tile([2.0, 1.0, 1.5][: system.n_params] + [0.5, -0.5] * len(effects), (50, 1))
     own = tuple(form.name for form in effects)

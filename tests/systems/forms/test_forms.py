@@ -6,7 +6,7 @@ from scipy.special import ndtr
 
 from probewise.effects import is_out_of_vocabulary
 from probewise.systems import Extra, Law, Noise, RunTable, Simulator, System
-from probewise.systems.forms import About, forms_of
+from probewise.systems.forms import ReferenceFit, forms_of
 from probewise.systems.forms.proposals import proposals
 from probewise.systems.motion import Motion
 
@@ -41,7 +41,7 @@ def _simulator(**more):
 
 def _about(simulator):
     system = System.of(simulator, TABLE)
-    return About(system, TABLE, np.zeros(system.n_params), SD)
+    return ReferenceFit(system, TABLE, np.zeros(system.n_params), SD)
 
 
 ABOUT = _about(_simulator())
@@ -157,7 +157,7 @@ def test_an_input_that_is_held_comes_late_also_where_rows_are_far_apart_and_clos
     law = Law({"x": 0.0}, lambda s, p, c: {"x": p["rate"] * (c["u"] - s["x"])}, max_step_s=0.02)
     simulator = Simulator("y", "V", {"rate": (0.5, 1.5)}, law=law, time="t_s", noise=Noise(sd=1e-3))
     system = System.of(simulator, table)
-    about = About(system, table, np.zeros(1), 1e-3)
+    about = ReferenceFit(system, table, np.zeros(1), 1e-3)
     form = forms_of(about)["input_delay:u"]
     theta = np.concatenate([about.theta[0], [tau]])[None, :]
     found = system.chain(table, [form]).predict(theta, table)[0]
@@ -264,9 +264,9 @@ def test_a_loop_that_holds_its_input_is_told_from_a_formula_of_the_row():
         return out
 
     loop = _about(Simulator("y", "V", {"tau_s": (0.5, 2.0)}, simulate=simulate, time="t_s", noise=Noise(sd=SD)))
-    assert loop.holds("drive")
-    assert not loop.holds("room_c")
-    assert not ABOUT.holds("drive")
+    assert loop.is_held_between_rows("drive")
+    assert not loop.is_held_between_rows("room_c")
+    assert not ABOUT.is_held_between_rows("drive")
 
 
 def _proposed(ending, about=ABOUT):
@@ -332,7 +332,7 @@ def test_a_law_is_tried_with_as_many_waves_as_its_rows_tell_apart():
         {"t_s": times, "run": np.repeat([1.0, 2.0], 200), "y": np.zeros(400)}, time="t_s", run="run"
     )  # fmt: skip
     system = System.of(simulator, table)
-    tried = forms_of(About(system, table, np.zeros(system.n_params), SD))["periodic_forcing:x"].bank()[:, 0, 1]
+    tried = forms_of(ReferenceFit(system, table, np.zeros(system.n_params), SD))["periodic_forcing:x"].bank()[:, 0, 1]
     assert np.diff(tried).max() <= 0.52 / 6.0
     assert tried[-1] == pytest.approx(0.5 / np.diff(times)[0])
 

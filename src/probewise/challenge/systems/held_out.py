@@ -15,8 +15,8 @@ from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.effects.density import log_gaussian_density
 from probewise.errors import NotConvergedError
 from probewise.systems import RunTable
-from probewise.systems.forms import About
-from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms, recorded
+from probewise.systems.forms import ReferenceFit
+from probewise.systems.forms.rebinding import extract_recorded, has_value_per_run, rebind_forms
 from probewise.systems.prediction import draw_for_new_run
 from probewise.systems.system import SystemChain
 from probewise.world.systems import SystemCase, right_predictions
@@ -67,7 +67,7 @@ def log_densities_of_runs(
 
 
 def predicted_runs(
-    samples: ModelSamples, about: About, table: RunTable, *, rng: np.random.Generator
+    samples: ModelSamples, about: ReferenceFit, table: RunTable, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Predict new runs: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
 
@@ -87,7 +87,7 @@ def predicted_runs(
     chain = cast(SystemChain, samples.chain)
     system = chain.system.with_runs(table)
     own = [effect.name for effect in chain.effects if has_value_per_run(effect.name)]
-    longer = rebind_forms(own, system.simulator, recorded(about), more_runs=table.scan_names)
+    longer = rebind_forms(own, system.simulator, extract_recorded(about), more_runs=table.scan_names)
     effects = tuple(longer.get(effect.name, effect) for effect in chain.effects)
     wider = replace(chain, system=system, effects=effects)
     of_run = [name for name in wider.names if name not in chain.names]

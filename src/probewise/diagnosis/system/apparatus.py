@@ -30,7 +30,7 @@ from probewise.effects import (
 )
 from probewise.recordings.plan import Plan, Recording
 from probewise.systems import RunTable, System
-from probewise.systems.forms import About, forms_of
+from probewise.systems.forms import ReferenceFit, forms_of
 from probewise.systems.forms.proposals import proposals
 from probewise.systems.forms.stop import MeterStop
 
@@ -70,7 +70,7 @@ class SimulatorApparatus:
         The undeclared stop of the meter, if the readings show one.
     """
 
-    about: About
+    about: ReferenceFit
     stop: MeterStop | None = None
 
     @property
@@ -160,7 +160,7 @@ class SimulatorApparatus:
     def covariates_by_row(self, predicted: FloatArray) -> dict[str, FloatArray]:
         """Return every covariate at each row, (n_points,), for these predictions; that of runs is last."""
         table, own = self.about.table, self.system.simulator
-        out = {"time" if table.has_time else "row": table.time_s, "level": predicted}
+        out = {"time" if table.has_varying_time else "row": table.time_s, "level": predicted}
         out |= {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}
         out["previous"] = _change_within_runs(predicted, table)

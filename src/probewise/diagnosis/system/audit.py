@@ -17,7 +17,7 @@ from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, name_of_first
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.systems import RunTable, Simulator, System, as_recording, table_for
-from probewise.systems.forms import About, driving_columns, forms_of
+from probewise.systems.forms import ReferenceFit, driving_columns, forms_of
 
 _STANDS_STILL = 0.02  # noise sds by which predictions may change when the integration step is halved
 _NOISE = 0.01  # of the range of the readings, if no noise is declared
@@ -49,7 +49,7 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     z, predicted, where = _typical_point(system, own)
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
     system = system.with_converged_step(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
-    about = About(system, own.with_columns({simulator.reading: predicted}), z, sd)
+    about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
     forms = {name: form for name, form in forms_of(about).items() if name_of_first_copy(name) is None}
     kinds = [kind for kind in ON_NOISE if kind not in NUISANCES.values()]
     on_noise: dict[str, NamedEffect[Any]] = {str(kind.name): kind() for kind in kinds}
@@ -100,12 +100,12 @@ def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: Float
     return _NOISE * float(np.ptp(predicted)), "a hundredth of the range of the readings, since none is declared"
 
 
-def _reasons_for_absence(about: About) -> dict[str, str]:
+def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
     """Return, for every effect of the vocabulary, the reason to give if it cannot act in this table."""
     own, table = about.system.simulator, about.table
     nothing = "it leaves no trace here"
-    timeless = "no time was recorded" if not table.has_time else nothing
-    too_few = nothing if about.tells_runs_apart else "runs have too few rows"
+    timeless = "no time was recorded" if not table.has_varying_time else nothing
+    too_few = nothing if about.can_fit_value_per_run else "runs have too few rows"
     one_run = "there is one run" if len(table.scan_names) == 1 else too_few
     out = {"offset_drift": timeless, "gain_drift": timeless, "offset_step": nothing, "gain_step": nothing}
     out |= {"offset_per_run": one_run, "gain_per_run": one_run, "nonlinearity": nothing, "saturation": nothing}

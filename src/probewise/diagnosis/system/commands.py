@@ -83,7 +83,7 @@ def _changed_runs(
             {k: v[::-1] for k, v in own.items()},
             1.0,
         )
-    if table.has_time:
+    if table.has_varying_time:
         yield "slow", f"take {of} again, twice as slowly", {}, 2.0
     n = len(rows)
     share = np.linspace(0.0, 1.0, n)

@@ -21,10 +21,10 @@ from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
-from probewise.systems import CountedCalls, RunRecording, RunTable, Simulator, System, as_recording, table_for
+from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.calls import IntegrationTally
-from probewise.systems.forms import About
-from probewise.systems.forms.readings import since_start_of_run
+from probewise.systems.forms import ReferenceFit
+from probewise.systems.forms.readings import time_since_start_of_run
 from probewise.systems.forms.stop import MeterStop, find_meter_stop
 
 _STANDS_STILL = 0.02  # noise sds, rms, that predictions may move by when the step of the integration is halved
@@ -125,7 +125,7 @@ def prepare_system(
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
-    apparatus = SimulatorApparatus(About(system, table, found.z, sd, misfit=misfit), stop)
+    apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop)
     begun = replace(system, first=found.z)
     told("building the effects")
     effects = apparatus.effects(recording, begun) if bound else {}
@@ -134,7 +134,7 @@ def prepare_system(
 
 def _with_call_count(progress: Progress, system: System) -> Progress:
     """Let the progress show the number of calls of `simulate`, if the system has this function."""
-    return progress if system.caller is None else CountedCalls(progress, system.caller)
+    return progress if system.caller is None else ProgressWithCallCount(progress, system.caller)
 
 
 def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
@@ -289,9 +289,9 @@ def _fits_of_lengthened_runs(model: Model, recording: Recording) -> list[FloatAr
     first quarter of a run there are few.
     """
     system, table = cast(System, model.sensor), cast(RunTable, recording.plan)
-    if not (system.in_bulk and table.has_time):
+    if not (system.in_bulk and table.has_varying_time):
         return []
-    since = since_start_of_run(table)
+    since = time_since_start_of_run(table)
     starts = list(system.starts)
     for share in _BEGINNINGS:
         begun = since <= share * since.max()

@@ -14,9 +14,9 @@ from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Recording
-from probewise.systems import FittedSystem, RunTable, System, write_run_table
-from probewise.systems.forms import About
-from probewise.systems.forms.rebinding import Recorded, recorded
+from probewise.systems import FittedSystem, RunTable, System, run_table_csv
+from probewise.systems.forms import ReferenceFit
+from probewise.systems.forms.rebinding import Recorded, extract_recorded
 
 
 def repaired_of(diagnosis: Diagnosis) -> FittedSystem:
@@ -49,9 +49,9 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
     )
 
 
-def bound_about(about: About, model: ModelSamples) -> Recorded | None:
+def bound_about(about: ReferenceFit, model: ModelSamples) -> Recorded | None:
     """Return what a model needs of the recording: the fit that set its effects' scales, and declared noise sds."""
-    return recorded(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
+    return extract_recorded(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
 
 
 def fitted_system(
@@ -81,7 +81,7 @@ def fitted_system(
         level=(float(np.min(level)), float(np.max(level))),
         max_step=system.max_step,
         known=known,
-        recording=hashlib.sha256(write_run_table(cast(RunTable, recording.plan)).encode()).hexdigest()[:16],
+        recording=hashlib.sha256(run_table_csv(cast(RunTable, recording.plan)).encode()).hexdigest()[:16],
         source=recording.source,
         notes=recording.notes,
     )

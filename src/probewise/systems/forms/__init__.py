@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from probewise.effects import AGAIN
 from probewise.systems.forms import inputs, parameters, rates, readings
-from probewise.systems.forms.about import About
+from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.extras import forms_of_extras
 from probewise.systems.forms.form import Form
 from probewise.systems.forms.inputs import driving_columns, forms_on_inputs
@@ -16,14 +16,17 @@ from probewise.systems.forms.parameters import forms_on_parameters
 from probewise.systems.forms.rates import forms_on_rates
 from probewise.systems.forms.readings import forms_on_readings
 
-__all__ = ["WORDS", "About", "Form", "driving_columns", "forms_of"]
+__all__ = ["WORDS", "Form", "ReferenceFit", "driving_columns", "forms_of"]
+
+About = ReferenceFit
+"""The old name of `ReferenceFit`."""
 
 WORDS: Mapping[str, str] = MappingProxyType(readings.WORDS | inputs.WORDS | parameters.WORDS | rates.WORDS)
 """A noun phrase for each form, with places for its targets."""
 
 
-def forms_of(about: About) -> dict[str, Form]:
-    """Bind every form that could be detectable in this table, by name."""
+def forms_of(about: ReferenceFit) -> dict[str, Form]:
+    """Bind every form that could be detectable about this fit; return them by name, waves also as a second copy."""
     named = [*forms_on_readings(about), *forms_on_inputs(about), *forms_on_parameters(about), *forms_on_rates(about)]
     found = [*named, *forms_of_extras(about)]
     waves = [replace(form, name=form.name + AGAIN) for form in found if form.joined is not None]

@@ -1,4 +1,4 @@
-"""The reference fit for binding forms: the sensitivity of its readings sets the scale of each form."""
+"""The reference fit about which forms are bound: how its readings respond to a form sets the form's prior."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.motion import RowsInRuns, integrate_states
-from probewise.systems.system import System, given_columns
+from probewise.systems.system import System, columns_without_reading
 from probewise.systems.table import RunTable
 
 _ANY = Uniform(0.0, 1.0)  # prior of a trial form, not used
@@ -25,11 +25,11 @@ _LEAST, _MOST = 0.05, 1e4  # rms change in noise sds between which sizes without
 
 
 @dataclass(frozen=True, eq=False)
-class About:
-    """The reference fit about which forms are bound: coordinates z (n_params,), and the sd of a reading.
+class ReferenceFit:
+    """The reference fit about which forms are bound: coordinates `z` (n_params,), and the `sd` of a reading.
 
-    The typical size of a form changes the readings here by one sd, so that no quantity needs a declared range.
-    `misfit` is the rms of the fit's residuals, in sds: what is left out may be larger by it.
+    A form of typical size changes its readings by one sd (rms), so that no quantity needs a declared range. `misfit` is
+    the rms of the fit's residuals in sds: amplitudes may be larger by this factor.
     """
 
     system: System
@@ -55,20 +55,20 @@ class About:
         system = self.system
         if system.simulator.law is None:
             return {}
-        columns = given_columns(system.simulator, self.table)
+        columns = columns_without_reading(system.simulator, self.table)
         parameters = system.parameters(self.theta, self.table)
         found = integrate_states(
             system.simulator.law, RowsInRuns(self.table), parameters, columns, max_step=system.max_step
         )
         return {state: values[0] for state, values in found.items()}
 
-    def drives(self, state: str, other: str) -> bool:
-        """Return whether the rate of another state depends on a state, somewhere in this table."""
+    def drives_rate_of(self, state: str, other: str) -> bool:
+        """Return whether the rate of the state `other` depends on `state` at some row of the table."""
         law = self.system.simulator.law
         if law is None:
             return False
         parameters = self.system.parameters(self.theta, self.table)
-        columns = given_columns(self.system.simulator, self.table)
+        columns = columns_without_reading(self.system.simulator, self.table)
         there = {name: values[None, :] for name, values in self.states.items()}
         nudged = there | {state: there[state] + _NUDGE * np.ptp(there[state])}
         with np.errstate(all="ignore"):
@@ -76,8 +76,8 @@ class About:
         return bool(np.any(np.abs(apart) > 0))
 
     @property
-    def tells_runs_apart(self) -> bool:
-        """Whether there are several runs, with enough rows that one value per run does not fit every reading."""
+    def can_fit_value_per_run(self) -> bool:
+        """Whether there are several runs, with at least three rows each on average."""
         n_runs = len(self.table.scan_names)
         return n_runs > 1 and len(self.table) >= _ROWS_OF_A_RUN * n_runs
 
@@ -87,40 +87,43 @@ class About:
         return self.system.simulator.time_unit
 
     @property
-    def unit(self) -> str:
+    def reading_unit(self) -> str:
         """Unit of a reading."""
         return self.system.simulator.unit
 
     @property
     def duration(self) -> float:
-        """Time from the first row to the last, in the unit of time."""
+        """Range of the times of the rows, in the unit of time; 1 if no time passes."""
         return float(np.ptp(self.table.time_s)) or 1.0
 
     @cached_property
-    def gap(self) -> float:
-        """Median time from a row to the next of its run."""
+    def median_gap(self) -> float:
+        """Median time from a row to the next of its run, in the unit of time; 1 if no time passes."""
         gaps = np.concatenate([np.diff(self.table.time_s[rows]) for rows in self.table.rows_by_scan()])
         gaps = gaps[gaps > 0]
         return float(np.median(gaps)) if gaps.size else 1.0
 
-    def holds(self, column: str) -> bool:
-        """Return whether the model holds a column from row to row: a reading depends on it at earlier rows alone."""
+    def is_held_between_rows(self, column: str) -> bool:
+        """Return whether the model holds a column from row to row: readings depend on its earlier rows alone."""
         if self.system.simulator.law is not None:
             return self.system.simulator.law.hold == "previous"
         rows = max(self.table.rows_by_scan(), key=len)
         there = np.zeros(len(self.table))
         there[rows[len(rows) // 2]] = _NUDGE * float(np.nanstd(self.table.covariates[column]))
-        change = self.change(
+        change = self.change_of_readings(
             Stage.INPUT, lambda value, theta, table: {**value, column: value[column] + theta * there}, np.ones((1, 1))
         )[0]
         return bool(np.any(change[rows] != 0) and not np.any(change[there > 0]))
 
-    def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
-        """Return the rms change of the readings by each setting (n_settings, n_params), in sds; NaN if not finite."""
-        with np.errstate(over="ignore", invalid="ignore"):  # a setting may carry a law away: it is not finite
-            return np.asarray(np.sqrt(np.mean(self.change(stage, act, settings) ** 2, axis=1)) / self.sd)
+    def rms_change(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+        """Return the rms change of the readings by each setting, (n_settings,), in sds; NaN or infinite if it diverges.
 
-    def change(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+        `settings` (n_settings, n_params) are values of a trial form's parameters.
+        """
+        with np.errstate(over="ignore", invalid="ignore"):  # a setting may carry a law away: it is not finite
+            return np.asarray(np.sqrt(np.mean(self.change_of_readings(stage, act, settings) ** 2, axis=1)) / self.sd)
+
+    def change_of_readings(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         """Return the change of the readings by each setting (n_settings, n_params): (n_settings, n_points)."""
         trial = Form(
             "trial",
@@ -137,33 +140,33 @@ class About:
         theta = np.concatenate([np.repeat(self.theta, len(settings), axis=0), settings], axis=1)
         return np.asarray(chain.predict(theta, self.table) - self.predicted)
 
-    def typical(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
-        """Find the amplitude at which the readings change by one sd; None if they do not change.
+    def typical_amplitude(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
+        """Find the amplitude at which the readings change by one sd (median over entries); None if they do not change.
 
-        `entries` (n_entries, n_columns, n_params) have the amplitude `guess`.
+        `entries` (n_entries, n_columns, n_params) have the amplitude `guess`, to which the change is proportional.
         """
         settings = entries.reshape(-1, entries.shape[-1])
-        rms = self.rms(stage, act, settings[:: max(len(settings) // 16, 1)])
+        rms = self.rms_change(stage, act, settings[:: max(len(settings) // 16, 1)])
         rms = rms[np.isfinite(rms)]
         if not rms.size or rms.max() <= _UNSEEN:
             return None
         return _TYPICAL * guess / float(np.median(rms[rms > _UNSEEN]))
 
-    def amplitude(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
-        """Return the prior of an amplitude of this typical size: as large as the misfit may need."""
+    def amplitude_prior(self, typical: float, *, positive: bool = False) -> HeavyTailedPrior:
+        """Return the prior of an amplitude of this typical size, the wider the larger the misfit."""
         plain = HeavyTailedPrior(typical, positive=positive)
         return replace(plain, largest=plain.largest * max(self.misfit, 1.0))
 
-    def sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
-        """Find the range of sizes (n_tried,) that change the readings by a plausible amount; None if there is none."""
-        rms = self.rms(stage, act, tried[:, None])
+    def range_of_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
+        """Return the least and the largest tried size, (n_tried,), that changes the readings plausibly; or None."""
+        rms = self.rms_change(stage, act, tried[:, None])
         there = np.flatnonzero(np.isfinite(rms) & (rms > _LEAST) & (rms < _MOST * max(self.misfit, 1.0)))
         if not there.size:
             return None
         low, high = int(there.min()), int(there.max())
         return float(tried[low]), float(tried[min(high + 1, len(tried) - 1)] if high == low else tried[high])
 
-    def log_uniform(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
-        """Return a log-uniform prior over that range of sizes."""
-        between = self.sizes(stage, act, tried)
+    def log_uniform_prior(self, stage: Stage, act: Act, tried: FloatArray) -> LogUniform | None:
+        """Return a log-uniform prior over the range of tried sizes that change the readings plausibly; or None."""
+        between = self.range_of_sizes(stage, act, tried)
         return None if between is None or not between[0] < between[1] else LogUniform(*between)

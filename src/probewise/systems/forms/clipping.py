@@ -16,18 +16,18 @@ _N_LEVELS = 10  # of either
 
 @dataclass(frozen=True, eq=False)
 class ClippingLevels:
-    """Clipping levels between `low` and `high`: above `middle` a ceiling, otherwise a floor."""
+    """Clipping levels between `low` and `high`: a ceiling above `least_ceiling`, otherwise a floor."""
 
     low: float
     high: float
 
     @property
-    def middle(self) -> float:
-        """Level above which the clipping is a ceiling."""
+    def least_ceiling(self) -> float:
+        """Level above which clipping is from above, a ceiling, and below which it is from below, a floor."""
         return self.low + _LOWER_PART * (self.high - self.low)
 
     @property
-    def levels(self) -> FloatArray:
+    def trial_levels(self) -> FloatArray:
         """Trial levels for the template bank, (n_levels,): dense at both ends."""
         range_ = self.high - self.low
         ceilings = self.high - range_ * np.geomspace(_LEAST, 0.97 * (1 - _LOWER_PART), _N_LEVELS)
@@ -39,11 +39,11 @@ class ClippingLevels:
         return Uniform(self.low, self.high)
 
     @property
-    def out_of_reach(self) -> float:
+    def level_out_of_reach(self) -> float:
         """A level out of reach, which has no effect."""
         return self.high + (self.high - self.low)
 
 
 def clipping_levels(low: float, high: float) -> ClippingLevels | None:
-    """Build from a range of values; None if they are constant."""
+    """Return the clipping levels within a range of values; None if it is empty."""
     return ClippingLevels(low, high) if low < high else None

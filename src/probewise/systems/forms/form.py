@@ -39,14 +39,14 @@ class ChangePoints:
     gated: bool
     column: str = ""
 
-    def along(self, table: RunTable) -> FloatArray:
-        """Return the variable that is compared with the change point, (n_points,)."""
+    def variable_at_rows(self, table: RunTable) -> FloatArray:
+        """Return the column, row number or time that is compared with the change point, (n_points,)."""
         if self.column:
             return table.covariates[self.column]
         return np.arange(float(len(table))) if self.by_row else table.time_s
 
     def thinned(self) -> ChangePoints:
-        """Keep a subset of positions that is dense enough to detect a change."""
+        """Return change points at a subset of the positions, at most 48 intervals, enough to detect a change."""
         stride = -(-(len(self.at) - 1) // _FEW)
         return replace(self, at=(*self.at[:-1:stride], self.at[-1]))
 
@@ -159,7 +159,7 @@ class Form:
         return ()
 
     def variants(self) -> tuple[Form, ...]:
-        """Return its alternatives, or a variant for each interval between readings in which a change point may lie."""
+        """Return the form and its alternatives, or one variant for each interval in which its change point may lie."""
         if self.change_points is None:
             return (replace(self, alternatives=()), *self.alternatives) if self.alternatives else (self,)
         last = list(self.marginals)[-1]
@@ -175,16 +175,16 @@ class Form:
         return self if self.change_points is None else replace(self, change_points=self.change_points.thinned())
 
     def variant_masks(self, plan: Any) -> Gates | None:
-        """Return the ungated form, and the change points at the middle of each interval."""
+        """Return the masks of the rows after each change point, at the middle of its interval; None if not gated."""
         if self.change_points is None or not self.change_points.gated:
             return None
         always = self.entries[0].copy()
         always[:, -1] = -np.inf
-        along = self.change_points.along(plan)
+        along = self.change_points.variable_at_rows(plan)
         return Gates(always, np.array([along > 0.5 * (low + high) for low, high in pairwise(self.change_points.at)]))
 
     def redraw_by_variant(self, theta: FloatArray, weights: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw the change point from all intervals by weight."""
+        """Redraw the change point of each sample: an interval with probability `weights`, then a position within it."""
         if self.change_points is None:
             return theta
         at = np.array(self.change_points.at)
@@ -193,7 +193,7 @@ class Form:
         return np.concatenate([theta[:, :-1], drawn[:, None]], axis=1)
 
 
-def with_unit(mean: float, sd: float, unit: str) -> str:
-    """Write mean ± sd with a unit, rounded according to the sd."""
+def mean_with_sd(mean: float, sd: float, unit: str) -> str:
+    """Return "mean ± sd unit", rounded to two significant digits of the sd, or mean to three where it is below 1e-7."""
     digits = value_with_sd(mean, sd) if sd > 1e-7 else f"{mean:.3g} ± {sd:.1g}"
     return f"{digits} {unit}" if unit not in ("", "1") else digits

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.effects import HeavyTailedPrior
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform, Uniform
-from probewise.systems.forms.form import ChangePoints, with_unit
+from probewise.systems.forms.form import ChangePoints, mean_with_sd
 from probewise.systems.table import RunTable
 
 _MOST_MOMENTS = 512
@@ -22,12 +22,13 @@ _ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial waves of
 
 @dataclass(frozen=True, eq=False)
 class Modulation:
-    """A function of the rows: `over(theta, table)` (n_samples, n_points), 0 where the amplitude is 0.
+    """Variation of a quantity over the rows: `at_rows(theta, table)`, (n_samples, n_points), is 0 at amplitude 0.
 
-    `marginals` is a function of the amplitude's prior; `units` and `says` of the unit of the varying quantity.
+    `marginals` is a function of the amplitude's prior, `entries` of its typical size, `units` of the quantity's unit,
+    `says` of the quantity's name and unit and the parameters' mean and sd.
     """
 
-    over: Callable[[FloatArray, RunTable], FloatArray]
+    at_rows: Callable[[FloatArray, RunTable], FloatArray]
     marginals: Callable[[HeavyTailedPrior], Mapping[str, Any]]
     entries: Callable[[float], FloatArray]
     units: Callable[[str], tuple[str, ...]]
@@ -42,53 +43,53 @@ def _single_entry(size: float) -> FloatArray:
     return np.full((1, 1, 1), size)
 
 
-def drift(table: RunTable, time_unit: str) -> Modulation:
+def linear_drift(table: RunTable, time_unit: str) -> Modulation:
     """Linear drift in time as recorded: a t."""
     return Modulation(
-        over=lambda theta, rows: theta[:, :1] * rows.time_s,
+        at_rows=lambda theta, rows: theta[:, :1] * rows.time_s,
         marginals=lambda a: {"a": a},
         entries=_single_entry,
         units=lambda unit: (f"{unit}/{time_unit}",),
-        says=lambda what, unit, mean, sd: f"{what} drifts by {with_unit(mean[0], sd[0], unit)} per {time_unit}",
+        says=lambda what, unit, mean, sd: f"{what} drifts by {mean_with_sd(mean[0], sd[0], unit)} per {time_unit}",
         covariates=("time",),
     )
 
 
-def column(name: str, table: RunTable) -> Modulation:
+def proportional_to_column(name: str, table: RunTable) -> Modulation:
     """Variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
     values = table.covariates[name]
     middle = float(np.nanmean(values))
 
-    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
+    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.nan_to_num(rows.covariates[name] - middle))
 
     return Modulation(
-        over=over,
+        at_rows=at_rows,
         marginals=lambda a: {"a": a},
         entries=_single_entry,
         units=lambda unit: (f"{unit} per {name}",),
-        says=lambda what, unit, mean, sd: f"{what} changes by {with_unit(mean[0], sd[0], unit)} per unit of {name}",
+        says=lambda what, unit, mean, sd: f"{what} changes by {mean_with_sd(mean[0], sd[0], unit)} per unit of {name}",
         covariates=(name,),
     )
 
 
-def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
+def step_at_change_point(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
     """Step at a change point: a 1(t > t0), in time if recorded, else in row number."""
-    by_row = not table.has_time
+    by_row = not table.has_varying_time
     along = np.unique(np.arange(float(len(table))) if by_row else table.time_s)
     stride = -(-(len(along) - 1) // _MOST_MOMENTS)
     at = tuple(np.append(along[:-1:stride], along[-1]).tolist())
     change_points, name = ChangePoints(at, by_row, gated), "at_row" if by_row else "at_s"
 
-    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
-        return np.asarray(theta[:, :1] * (change_points.along(rows) > theta[:, 1:2]))
+    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
+        return np.asarray(theta[:, :1] * (change_points.variable_at_rows(rows) > theta[:, 1:2]))
 
     def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
-        when = f"row {mean[1]:.0f}" if by_row else with_unit(mean[1], sd[1], time_unit)
-        return f"{what} jumps by {with_unit(mean[0], sd[0], unit)} at {when} and stays there"
+        when = f"row {mean[1]:.0f}" if by_row else mean_with_sd(mean[1], sd[1], time_unit)
+        return f"{what} jumps by {mean_with_sd(mean[0], sd[0], unit)} at {when} and stays there"
 
     return Modulation(
-        over=over,
+        at_rows=at_rows,
         marginals=lambda a: {"a": a, name: Uniform(at[0], at[-1])},
         entries=lambda size: np.array([[[size, 0.5 * (at[0] + at[-1])]]]),
         units=lambda unit: (unit, "row" if by_row else time_unit),
@@ -98,11 +99,11 @@ def step(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
     )
 
 
-def per_run(table: RunTable) -> Modulation:
+def value_per_run(table: RunTable) -> Modulation:
     """One value per run: a_run; 0 for runs outside the recording."""
     names = table.scan_names
 
-    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
+    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         known = {name: k for k, name in enumerate(names)}
         at = np.array([known.get(name, len(names)) for name in rows.scan_names])
         values = np.concatenate([theta, np.zeros((len(theta), 1))], axis=1)
@@ -110,10 +111,10 @@ def per_run(table: RunTable) -> Modulation:
 
     def says(what: str, unit: str, mean: FloatArray, sd: FloatArray) -> str:
         far = int(np.argmax(np.abs(mean)))
-        return f"{what} differs from run to run, most in run {names[far]}: by {with_unit(mean[far], sd[far], unit)}"
+        return f"{what} differs from run to run, most in run {names[far]}: by {mean_with_sd(mean[far], sd[far], unit)}"
 
     return Modulation(
-        over=over,
+        at_rows=at_rows,
         marginals=lambda a: {f"values[{name}]": a for name in names},
         entries=lambda size: size * np.eye(len(names))[None, :, :],
         units=lambda unit: (unit,) * len(names),
@@ -123,8 +124,13 @@ def per_run(table: RunTable) -> Modulation:
     )
 
 
-def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES, rows_each: int = 2) -> FloatArray:
-    """Return trial wave numbers along a covariate: up to one wave in `rows_each` rows, twice as dense as resolvable."""
+def trial_wave_numbers(
+    values: FloatArray, groups: list[Any], most: int = _MOST_WAVES, rows_each: int = 2
+) -> FloatArray:
+    """Return trial wave numbers along a covariate, rising, in steps of half the resolution 1 / range.
+
+    They go up to one wave in `rows_each` rows; there are 8 to `most`. `groups` are the rows of each run.
+    """
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
     gaps = gaps[gaps > 1e-9 * max(reach, 1e-300)]
@@ -134,8 +140,8 @@ def wave_numbers(values: FloatArray, groups: list[Any], most: int = _MOST_WAVES,
     return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
 
 
-def most_waves_of_a_law(n_points: int) -> int:
-    """Return how many trial waves of one form a law is solved for: two times as many solutions."""
+def most_trial_waves_of_law(n_points: int) -> int:
+    """Return how many trial waves of one form a law can afford; it is solved for the sine and the cosine of each."""
     return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, _MOST_WAVES))
 
 
@@ -144,15 +150,15 @@ def wave_number_prior(waves: FloatArray) -> LogUniform:
     return LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02))
 
 
-def wave(table: RunTable, time_unit: str) -> Modulation:
+def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
     """One sinusoid in time: a sin(2 pi hz t + phase)."""
-    waves = wave_numbers(table.time_s, table.rows_by_scan())
+    waves = trial_wave_numbers(table.time_s, table.rows_by_scan())
 
-    def over(theta: FloatArray, rows: RunTable) -> FloatArray:
+    def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * rows.time_s + theta[:, 2:3]))
 
     return Modulation(
-        over=over,
+        at_rows=at_rows,
         marginals=lambda a: {
             "a": replace(a, positive=True),
             "hz": wave_number_prior(waves),
@@ -161,7 +167,7 @@ def wave(table: RunTable, time_unit: str) -> Modulation:
         entries=lambda size: sine_and_cosine_entries(size, waves),
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
-            f"{what} oscillates with an amplitude of {with_unit(mean[0], sd[0], unit)} and a period of "
+            f"{what} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], unit)} and a period of "
             f"{1 / mean[1]:.4g} {time_unit}"
         ),
         covariates=("time",),

@@ -8,42 +8,42 @@ import numpy as np
 
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
-from probewise.systems.forms.about import About
+from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.forms.modulations import Modulation
-from probewise.systems.forms.readings import modulated
+from probewise.systems.forms.readings import modulated_form
 
 
-def forms_on_parameters(about: About) -> Iterator[Form]:
+def forms_on_parameters(about: ReferenceFit) -> Iterator[Form]:
     """Yield the ways in which each parameter may vary: drift, step, per run, with a column."""
     system, table = about.system, about.table
     own = system.simulator
     values = system.parameters(about.theta, table)
     over: dict[str, Modulation] = {}
-    if table.has_time:
-        over["drifts"] = modulations.drift(table, about.time_unit)
-    over["steps"] = modulations.step(table, about.time_unit, gated=False)
+    if table.has_varying_time:
+        over["drifts"] = modulations.linear_drift(table, about.time_unit)
+    over["steps"] = modulations.step_at_change_point(table, about.time_unit, gated=False)
     columns = [c for c, v in table.covariates.items() if c not in (own.reading, own.noise.sd) and np.nanstd(v) > 0]
     for name in own.parameters:
         guess = 1e-4 * (float(np.abs(values[name]).max()) or 1.0)
         each = dict(over)
-        if name not in own.per_run and about.tells_runs_apart:
-            each["differs"] = modulations.per_run(table)
+        if name not in own.per_run and about.can_fit_value_per_run:
+            each["differs"] = modulations.value_per_run(table)
         for kind, how in each.items():
             size = guess / (about.duration if kind == "drifts" else 1.0)
-            yield from modulated(
-                about, f"{kind}:{name}", Stage.PARAMETER, how, _shift_parameter(name, how), size, name, ""
+            yield from modulated_form(
+                about, f"{kind}:{name}", Stage.PARAMETER, how, _parameter_shifter(name, how), size, name, ""
             )
         for column in columns:
-            how = modulations.column(column, table)
+            how = modulations.proportional_to_column(column, table)
             size = guess / float(np.nanstd(table.covariates[column]))
-            yield from modulated(
-                about, f"depends:{name}:{column}", Stage.PARAMETER, how, _shift_parameter(name, how), size, name, ""
+            yield from modulated_form(
+                about, f"depends:{name}:{column}", Stage.PARAMETER, how, _parameter_shifter(name, how), size, name, ""
             )
 
 
-def _shift_parameter(name: str, how: Modulation) -> Act:
-    return lambda value, theta, table: {**value, name: value[name] + how.over(theta, table)}
+def _parameter_shifter(name: str, how: Modulation) -> Act:
+    return lambda value, theta, table: {**value, name: value[name] + how.at_rows(theta, table)}
 
 
 WORDS = {

@@ -16,8 +16,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.priors import Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.about import About
-from probewise.systems.forms.form import Act, ChangePoints, Form, with_unit
+from probewise.systems.forms.about import ReferenceFit
+from probewise.systems.forms.form import Act, ChangePoints, Form, mean_with_sd
 from probewise.systems.forms.proposals_in_time import proposals_in_time
 from probewise.systems.forms.proposals_of_columns import proposals_of_columns
 from probewise.systems.motion import Motion
@@ -29,15 +29,15 @@ _SAME = 0.9999  # cosine of two terms over the rows above which only the shorter
 
 
 @dataclass(frozen=True)
-class _Atom:
-    """A column, a state or the level, shifted by `middle` and scaled by `scale`."""
+class _ScaledVariable:
+    """A column, a state or the reading in a formula: minus `middle`, over `scale`."""
 
     name: str
     middle: float
     scale: float
     unit: str
 
-    def of(self, values: Any) -> Any:
+    def scaled(self, values: Any) -> Any:
         return (values - self.middle) / self.scale
 
     @property
@@ -49,33 +49,33 @@ class _Atom:
 
 @dataclass(frozen=True)
 class _Term:
-    """A function of some atoms; `text` is its formula without the amplitude, `scale` divides its values."""
+    """A function of scaled variables, over `scale`; `text` is its formula without the amplitude."""
 
     text: str
-    atoms: tuple[_Atom, ...]
+    variables: tuple[_ScaledVariable, ...]
     function: Callable[..., Any]
     scale: float = 1.0
 
-    def of(self, look_up: Callable[[str], Any]) -> Any:
-        return self.function(*(atom.of(look_up(atom.name)) for atom in self.atoms)) / self.scale
+    def evaluate(self, look_up: Callable[[str], Any]) -> Any:
+        return self.function(*(variable.scaled(look_up(variable.name)) for variable in self.variables)) / self.scale
 
 
-def proposals(about: About) -> Iterator[Form]:
-    """Yield the terms that could be added to the reading, and to the rate of each state."""
-    yield from _of_reading(about)
-    columns = _columns(about)
+def proposals(about: ReferenceFit) -> Iterator[Form]:
+    """Yield a form for each term that could be added to the reading or to the rate of a state."""
+    yield from _reading_proposals(about)
+    columns = _varying_covariates(about)
     for name in columns:
-        yield from _switch(about, name)
+        yield from _threshold_proposal(about, name)
     yield from proposals_of_columns(about, columns)
-    if about.table.has_time:
+    if about.table.has_varying_time:
         yield from proposals_in_time(about)
     for state in about.states:
-        yield from _of_rate(about, state)
-        yield from _one_sided(about, state)
+        yield from _rate_proposals(about, state)
+        yield from _one_sided_proposals(about, state)
 
 
-def _terms(atoms: list[_Atom]) -> Iterator[_Term]:
-    for x in atoms:
+def _terms_of_variables(variables: list[_ScaledVariable]) -> Iterator[_Term]:
+    for x in variables:
         name, own = x.text, x.scale
         yield _Term(f"{name}^2", (x,), lambda v: v**2, 1 / own**2)
         yield _Term(f"{name}^3", (x,), lambda v: v**3, 1 / own**3)
@@ -87,7 +87,7 @@ def _terms(atoms: list[_Atom]) -> Iterator[_Term]:
             rate = f"{k / own:.4g}"
             yield _Term(f"exp({rate} {name})", (x,), lambda v, k=k: np.exp(np.clip(k * v, -50, 50)))
         yield _Term(f"sin({1 / own:.4g} {name})", (x,), np.sin)
-    for x, z in itertools.combinations(atoms, 2):
+    for x, z in itertools.combinations(variables, 2):
         yield _Term(f"{x.text} {z.text}", (x, z), lambda v, w: v * w, 1 / (x.scale * z.scale))
         yield _Term(f"{x.text}^2 {z.text}", (x, z), lambda v, w: v**2 * w, 1 / (x.scale**2 * z.scale))
         yield _Term(f"{x.text} {z.text}^2", (x, z), lambda v, w: v * w**2, 1 / (x.scale * z.scale**2))
@@ -95,39 +95,40 @@ def _terms(atoms: list[_Atom]) -> Iterator[_Term]:
         yield _Term(f"{x.text} |{z.text}|", (x, z), lambda v, w: v * np.abs(w), 1 / (x.scale * z.scale))
 
 
-def _columns(about: About) -> dict[str, FloatArray]:
+def _varying_covariates(about: ReferenceFit) -> dict[str, FloatArray]:
+    """Return the covariates that vary and are never missing, without the reading and its declared sd."""
     own = about.system.simulator
     kept = {c: v for c, v in about.table.covariates.items() if c not in (own.reading, own.noise.sd)}
     return {c: v for c, v in kept.items() if np.isfinite(v).all() and np.ptp(v) > 0}
 
 
-def _atom(name: str, values: FloatArray, unit: str, *, centred: bool) -> _Atom:
+def _scaled_variable(name: str, values: FloatArray, unit: str, *, centred: bool) -> _ScaledVariable:
     middle = float(f"{np.mean(values):.6g}") if centred else 0.0
-    return _Atom(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0, unit)
+    return _ScaledVariable(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0, unit)
 
 
-def _of_reading(about: About) -> Iterator[Form]:
+def _reading_proposals(about: ReferenceFit) -> Iterator[Form]:
     own = about.system.simulator
-    columns = _columns(about)
-    if about.table.has_time and about.table.time is not None:
+    columns = _varying_covariates(about)
+    if about.table.has_varying_time and about.table.time is not None:
         columns[about.table.time] = about.table.time_s
-    atoms = [_atom(name, values, name, centred=True) for name, values in columns.items()]
-    level = _atom(own.reading, about.predicted, own.unit, centred=True)
+    variables = [_scaled_variable(name, values, name, centred=True) for name, values in columns.items()]
+    level = _scaled_variable(own.reading, about.predicted, own.unit, centred=True)
     known: list[FloatArray] = []
-    for term in _terms([*atoms, level]):
+    for term in _terms_of_variables([*variables, level]):
 
         def act(value: FloatArray, theta: FloatArray, table: RunTable, term: _Term = term) -> FloatArray:
             def look_up(name: str) -> Any:
                 return value if name == own.reading else table.time_s if name == table.time else table.covariates[name]
 
-            return np.asarray(value + theta[:, :1] * term.of(look_up))
+            return np.asarray(value + theta[:, :1] * term.evaluate(look_up))
 
         shape = act(about.predicted[None, :], np.ones((1, 1)), about.table)[0] - about.predicted
-        if _is_new(shape, known):
-            yield from _proposal(about, "reading", own.reading, Stage.OFFSET, act, term)
+        if _add_if_new(shape, known):
+            yield from _term_proposal(about, "reading", own.reading, Stage.OFFSET, act, term)
 
 
-def _switch(about: About, name: str) -> Iterator[Form]:
+def _threshold_proposal(about: ReferenceFit, name: str) -> Iterator[Form]:
     """Shift the reading where a column is above an unknown threshold."""
     own, values = about.system.simulator, np.unique(about.table.covariates[name])
     if len(values) <= 2:
@@ -138,7 +139,7 @@ def _switch(about: About, name: str) -> Iterator[Form]:
         return np.asarray(value + theta[:, :1] * (table.covariates[name] > theta[:, 1:2]))
 
     entry = np.array([[[about.sd, 0.5 * (at[0] + at[-1])]]])
-    typical = about.typical(Stage.OFFSET, act, entry, about.sd)
+    typical = about.typical_amplitude(Stage.OFFSET, act, entry, about.sd)
     if typical is None:
         return
     entry[..., 0] = typical
@@ -146,22 +147,22 @@ def _switch(about: About, name: str) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {"a": about.amplitude(typical), "at": Uniform(at[0], at[-1])},
+        {"a": about.amplitude_prior(typical), "at": Uniform(at[0], at[-1])},
         (own.unit, name),
         (name,),
         act,
         entry,
         (0,),
         lambda mean, sd: (
-            f"{own.reading} shifts by {with_unit(mean[0], sd[0], own.unit)} where {name} is above "
-            f"{with_unit(mean[1], sd[1], '')}: a proposal, not a known effect"
+            f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} where {name} is above "
+            f"{mean_with_sd(mean[1], sd[1], '')}: a proposal, not a known effect"
         ),
         change_points=ChangePoints(tuple(at), by_row=False, gated=True, column=name),
         expression=f"a {text}",
     )
 
 
-def _one_sided(about: About, state: str) -> Iterator[Form]:
+def _one_sided_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
     """Act on the rate of a state beyond a threshold of it, in proportion to how far beyond: a stop, a second spring."""
     values = about.states[state]
     low, high = float(values.min()), float(values.max())
@@ -174,18 +175,18 @@ def _one_sided(about: About, state: str) -> Iterator[Form]:
             return value.with_term(state, lambda s, p, u: a * np.maximum(sign * (s[state] - at), 0.0))
 
         def says(mean: FloatArray, sd: FloatArray, text: str = text) -> str:
-            sizes = f"a = {with_unit(mean[0], sd[0], '')}, at = {with_unit(mean[1], sd[1], '')}"
+            sizes = f"a = {mean_with_sd(mean[0], sd[0], '')}, at = {mean_with_sd(mean[1], sd[1], '')}"
             return f"the rate of {state} lacks a {text}, {sizes}: a proposal, not a known effect"
 
         entries = np.array([[[1e-6, at]] for at in np.quantile(values, _THRESHOLDS)])
-        typical = about.typical(Stage.RATE, act, entries, 1e-6)
+        typical = about.typical_amplitude(Stage.RATE, act, entries, 1e-6)
         if typical is None or not np.isfinite(typical):
             continue
         entries[:, :, 0] = typical
         yield Form(
             f"formula:rate:{state}:{text}",
             Stage.RATE,
-            {"a": about.amplitude(typical), "at": Uniform(low, high)},
+            {"a": about.amplitude_prior(typical), "at": Uniform(low, high)},
             ("", state),
             (f"state:{state}", "time"),
             act,
@@ -196,26 +197,32 @@ def _one_sided(about: About, state: str) -> Iterator[Form]:
         )
 
 
-def _of_rate(about: About, state: str) -> Iterator[Form]:
+def _rate_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
     states = about.states
-    atoms = [_atom(name, values, name, centred=False) for name, values in states.items() if np.ptp(values) > 0]
-    atoms += [_atom(name, values, name, centred=True) for name, values in _columns(about).items()]
+    variables = [
+        _scaled_variable(name, values, name, centred=False) for name, values in states.items() if np.ptp(values) > 0
+    ]
+    variables += [
+        _scaled_variable(name, values, name, centred=True) for name, values in _varying_covariates(about).items()
+    ]
     known: list[FloatArray] = []
-    for term in _terms(atoms):
+    for term in _terms_of_variables(variables):
         if term.text == f"sign({state})":
             continue  # dry friction, which has a name
 
         def act(value: Motion, theta: FloatArray, table: RunTable, term: _Term = term) -> Motion:
             a = theta[:, :1]
-            return value.with_term(state, lambda s, p, u: a * term.of(lambda name: s[name] if name in s else u[name]))
+            return value.with_term(
+                state, lambda s, p, u: a * term.evaluate(lambda name: s[name] if name in s else u[name])
+            )
 
-        shape = np.asarray(term.of(lambda name: states.get(name, about.table.covariates.get(name))))
-        if _is_new(shape, known):
-            yield from _proposal(about, "rate", state, Stage.RATE, act, term)
+        shape = np.asarray(term.evaluate(lambda name: states.get(name, about.table.covariates.get(name))))
+        if _add_if_new(shape, known):
+            yield from _term_proposal(about, "rate", state, Stage.RATE, act, term)
 
 
-def _is_new(shape: FloatArray, known: list[FloatArray]) -> bool:
-    """Return whether a term is neither constant nor a duplicate, and add it to `known`."""
+def _add_if_new(shape: FloatArray, known: list[FloatArray]) -> bool:
+    """Add a term's values at the rows to `known` unless constant or a duplicate; return whether it was added."""
     centred = shape - shape.mean()
     size = float(np.linalg.norm(centred))
     if not np.isfinite(size) or size <= 1e-9 * float(np.linalg.norm(shape)):
@@ -227,26 +234,26 @@ def _is_new(shape: FloatArray, known: list[FloatArray]) -> bool:
     return True
 
 
-def _proposal(about: About, side: str, target: str, stage: Stage, act: Act, term: _Term) -> Iterator[Form]:
+def _term_proposal(about: ReferenceFit, side: str, target: str, stage: Stage, act: Act, term: _Term) -> Iterator[Form]:
     guess = about.sd if stage is Stage.OFFSET else 1e-6
-    typical = about.typical(stage, act, np.full((1, 1, 1), guess), guess)
+    typical = about.typical_amplitude(stage, act, np.full((1, 1, 1), guess), guess)
     if typical is None or not np.isfinite(typical):
         return
     where = tuple(
         f"state:{c}" if c in about.states else "level" if c == about.system.simulator.reading else c
-        for c in dict.fromkeys(atom.name for atom in term.atoms)
+        for c in dict.fromkeys(variable.name for variable in term.variables)
     )
     text = f"a {term.text}"
     what = target if side == "reading" else f"the rate of {target}"
     yield Form(
         f"formula:{side}:{target}:{term.text}",
         stage,
-        {"a": about.amplitude(typical)},
+        {"a": about.amplitude_prior(typical)},
         ("",),
         where,
         act,
         np.full((1, 1, 1), typical),
         (0,),
-        lambda mean, sd: f"{what} lacks {text}, a = {with_unit(mean[0], sd[0], '')}: a proposal, not a known effect",
+        lambda mean, sd: f"{what} lacks {text}, a = {mean_with_sd(mean[0], sd[0], '')}: a proposal, not a known effect",
         expression=text,
     )

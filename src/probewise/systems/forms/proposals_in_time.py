@@ -10,10 +10,10 @@ from probewise._arrays import FloatArray
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.about import About
-from probewise.systems.forms.form import Form, with_unit
-from probewise.systems.forms.modulations import wave_number_prior, wave_numbers
-from probewise.systems.forms.readings import settling_times, since_start_of_run
+from probewise.systems.forms.about import ReferenceFit
+from probewise.systems.forms.form import Form, mean_with_sd
+from probewise.systems.forms.modulations import trial_wave_numbers, wave_number_prior
+from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
 from probewise.systems.table import RunTable
 
 _MOST_SQUARE_WAVES = 160  # periods of a square wave that are tried
@@ -24,17 +24,17 @@ _SWEEPS = 1.5  # changes of the frequency that are tried, per wave in the record
 _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart they are in the row of those
 
 
-def proposals_in_time(about: About) -> Iterator[Form]:
+def proposals_in_time(about: ReferenceFit) -> Iterator[Form]:
     """Yield what could be added to the reading along time."""
-    yield from _square_wave(about)
-    yield from _swept_wave(about)
-    yield from _two_settlings(about)
+    yield from _square_wave_proposal(about)
+    yield from _swept_wave_proposal(about)
+    yield from _two_settlings_proposal(about)
 
 
-def _square_wave(about: About) -> Iterator[Form]:
+def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     """Shift the reading during a share of every period: a wave with flat tops and edges of unknown steepness."""
     own, table = about.system.simulator, about.table
-    waves = wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
+    waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         a, hz, phase, share, edge = (theta[:, k : k + 1] for k in range(5))
@@ -44,7 +44,7 @@ def _square_wave(about: About) -> Iterator[Form]:
     phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
     grid = np.meshgrid(about.sd, waves, phases, shares, _SOFT, indexing="ij")
     entries = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
-    typical = about.typical(Stage.OFFSET, act, entries, about.sd)
+    typical = about.typical_amplitude(Stage.OFFSET, act, entries, about.sd)
     if typical is None:
         return
     entries[:, :, 0] = typical
@@ -53,7 +53,7 @@ def _square_wave(about: About) -> Iterator[Form]:
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
         {
-            "a": about.amplitude(typical),
+            "a": about.amplitude_prior(typical),
             "hz": wave_number_prior(waves),
             "phase": Uniform(-1.0, 1.0),
             "share": Uniform(0.03, 0.97),
@@ -65,17 +65,18 @@ def _square_wave(about: About) -> Iterator[Form]:
         entries,
         (0,),
         lambda mean, sd: (
-            f"{own.reading} shifts by {with_unit(mean[0], sd[0], own.unit)} during {with_unit(mean[3], sd[3], '')} of "
-            f"every {1 / mean[1]:.4g} {about.time_unit}: a proposal, not a known effect"
+            f"{own.reading} shifts by {mean_with_sd(mean[0], sd[0], own.unit)} during "
+            f"{mean_with_sd(mean[3], sd[3], '')} of every {1 / mean[1]:.4g} {about.time_unit}: "
+            "a proposal, not a known effect"
         ),
         expression=f"a {text}",
     )
 
 
-def _swept_wave(about: About) -> Iterator[Form]:
+def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     """Add a sinusoid whose frequency rises or falls steadily along the recording, by a machine that runs up, say."""
     own, table = about.system.simulator, about.table
-    waves = wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
+    waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
     begin, end = float(table.time_s.min()), float(table.time_s.max())
     middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
 
@@ -89,7 +90,7 @@ def _swept_wave(about: About) -> Iterator[Form]:
         n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
         settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
     entries = sine_and_cosine_entries(about.sd, *np.transpose(settings))
-    typical = about.typical(Stage.OFFSET, act, entries, about.sd)
+    typical = about.typical_amplitude(Stage.OFFSET, act, entries, about.sd)
     if typical is None:
         return
     entries[:, :, 0] = typical
@@ -98,7 +99,7 @@ def _swept_wave(about: About) -> Iterator[Form]:
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
         {
-            "a": about.amplitude(typical, positive=True),
+            "a": about.amplitude_prior(typical, positive=True),
             "hz": wave_number_prior(waves),
             "sweep": Uniform(-1.2, 1.2),
             "phase": PHASE,
@@ -109,8 +110,8 @@ def _swept_wave(about: About) -> Iterator[Form]:
         entries,
         (0,),
         lambda mean, sd: (
-            f"{own.reading} oscillates with an amplitude of {with_unit(mean[0], sd[0], own.unit)} and a frequency that "
-            f"goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
+            f"{own.reading} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], own.unit)} and a frequency "
+            f"that goes from {mean[1] * (1 - mean[2]):.4g} to {mean[1] * (1 + mean[2]):.4g} per {about.time_unit}: a "
             "proposal, not a known effect"
         ),
         joined=starting_point_of_wave,
@@ -118,16 +119,16 @@ def _swept_wave(about: About) -> Iterator[Form]:
     )
 
 
-def _two_settlings(about: About) -> Iterator[Form]:
+def _two_settlings_proposal(about: ReferenceFit) -> Iterator[Form]:
     """Let the reading settle with two time constants at the start of each run."""
     own = about.system.simulator
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         a, b, first, second = (theta[:, k : k + 1] for k in range(4))
-        since = since_start_of_run(rows)
+        since = time_since_start_of_run(rows)
         return np.asarray(value + a * np.exp(-since / first) + b * np.exp(-since / second))
 
-    between = settling_times(about)
+    between = settling_time_prior(about)
     taus = np.geomspace(1.5 * between.low, 0.5 * between.high, _N_SETTLING)
     entries = np.array(
         [
@@ -136,7 +137,7 @@ def _two_settlings(about: About) -> Iterator[Form]:
             for j in range(i + _APART, _N_SETTLING)
         ]
     )
-    typical = about.typical(Stage.OFFSET, act, entries, 1.0)
+    typical = about.typical_amplitude(Stage.OFFSET, act, entries, 1.0)
     if typical is None:
         return
     entries[:, :, :2] *= typical
@@ -144,16 +145,16 @@ def _two_settlings(about: About) -> Iterator[Form]:
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        {"a": about.amplitude(typical), "b": about.amplitude(typical), "tau1": between, "tau2": between},
+        {"a": about.amplitude_prior(typical), "b": about.amplitude_prior(typical), "tau1": between, "tau2": between},
         (own.unit, own.unit, about.time_unit, about.time_unit),
         ("time", "run"),
         act,
         entries,
         (0, 1),
         lambda mean, sd: (
-            f"{own.reading} is off by {with_unit(mean[0], sd[0], own.unit)} and {with_unit(mean[1], sd[1], own.unit)} "
-            f"at the start of each run, which settle with time constants of "
-            f"{with_unit(mean[2], sd[2], about.time_unit)} and {with_unit(mean[3], sd[3], about.time_unit)}: a "
+            f"{own.reading} is off by {mean_with_sd(mean[0], sd[0], own.unit)} and "
+            f"{mean_with_sd(mean[1], sd[1], own.unit)} at the start of each run, which settle with time constants of "
+            f"{mean_with_sd(mean[2], sd[2], about.time_unit)} and {mean_with_sd(mean[3], sd[3], about.time_unit)}: a "
             "proposal, not a known effect"
         ),
         expression=text,

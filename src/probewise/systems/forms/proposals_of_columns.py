@@ -10,22 +10,22 @@ from probewise._arrays import FloatArray
 from probewise.effects.vocabulary import single_column_entries
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
-from probewise.systems.forms.about import About
-from probewise.systems.forms.form import Form, with_unit
+from probewise.systems.forms.about import ReferenceFit
+from probewise.systems.forms.form import Form, mean_with_sd
 from probewise.systems.table import RunTable
 
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
 
-def proposals_of_columns(about: About, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
+def proposals_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
     """Yield what each of these columns could add to the reading, together with the reading or with its own past."""
     for name, values in columns.items():
-        yield from _varying_influence(about, name, values)
-        yield from _dose(about, name, values)
+        yield from _varying_influence_proposal(about, name, values)
+        yield from _dose_proposals(about, name, values)
 
 
-def _varying_influence(about: About, name: str, values: FloatArray) -> Iterator[Form]:
+def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
     """Let a column add to the reading by an amount that is a quadratic function of the reading."""
     own, level = about.system.simulator, about.predicted
     middle, half = 0.5 * float(level.max() + level.min()), 0.5 * float(np.ptp(level))
@@ -39,79 +39,79 @@ def _varying_influence(about: About, name: str, values: FloatArray) -> Iterator[
         return np.asarray(value + (a + b * z + c * z**2) * (rows.covariates[name] - centre) / spread)
 
     entries = np.eye(3)[None, :, :]
-    typical = about.typical(Stage.OFFSET, act, about.sd * entries, about.sd)
+    typical = about.typical_amplitude(Stage.OFFSET, act, about.sd * entries, about.sd)
     if typical is None:
         return
     text = f"(a + b z + c z^2) ({name} - {centre:.4g}) / {spread:.4g}, z = ({own.reading} - {middle:.4g}) / {half:.4g}"
     yield Form(
         f"formula:reading:{own.reading}:{text}",
         Stage.OFFSET,
-        dict.fromkeys("abc", about.amplitude(typical)),
+        dict.fromkeys("abc", about.amplitude_prior(typical)),
         (own.unit,) * 3,
         (name, "level"),
         act,
         typical * entries,
         (0, 1, 2),
         lambda mean, sd: (
-            f"{own.reading} rises with {name} by {with_unit(mean[0], sd[0], own.unit)} per sd in the middle of its "
-            f"range, {with_unit(float(mean @ (1, -1, 1)), float(np.hypot(*sd[1:])), own.unit)} at its low end and "
-            f"{with_unit(float(mean.sum()), float(np.hypot(*sd[1:])), own.unit)} at its high end: a proposal, not a "
+            f"{own.reading} rises with {name} by {mean_with_sd(mean[0], sd[0], own.unit)} per sd in the middle of its "
+            f"range, {mean_with_sd(float(mean @ (1, -1, 1)), float(np.hypot(*sd[1:])), own.unit)} at its low end and "
+            f"{mean_with_sd(float(mean.sum()), float(np.hypot(*sd[1:])), own.unit)} at its high end: a proposal, not a "
             "known effect"
         ),
         expression=text,
     )
 
 
-def _dose(about: About, name: str, values: FloatArray) -> Iterator[Form]:
+def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
     """Let the reading change with what a column has added up to since the start of the run, until it saturates."""
     own, table = about.system.simulator, about.table
     centre = float(f"{np.mean(values):.6g}")
     each: dict[str, Callable[[FloatArray], FloatArray]] = {f"|{name} - {centre:.4g}|": lambda c: np.abs(c - centre)}
     if values.min() >= 0 or values.max() <= 0:
         each[f"|{name}|"] = np.abs
-    summed = f"integral over {table.time}" if table.has_time else "sum over rows"
+    summed = f"integral over {table.time}" if table.has_varying_time else "sum over rows"
     for what, rate in each.items():
 
-        def dose(rows: RunTable, rate: Callable[[FloatArray], FloatArray] = rate) -> FloatArray:
-            return _sum_since_start_of_run(rate(rows.covariates[name]), rows)
+        def dose_at_rows(rows: RunTable, rate: Callable[[FloatArray], FloatArray] = rate) -> FloatArray:
+            return _integral_since_start_of_run(rate(rows.covariates[name]), rows)
 
         def act(
-            value: FloatArray, theta: FloatArray, rows: RunTable, dose: Callable[[RunTable], FloatArray] = dose
+            value: FloatArray, theta: FloatArray, rows: RunTable, dose: Callable[[RunTable], FloatArray] = dose_at_rows
         ) -> FloatArray:
             return np.asarray(value - theta[:, :1] * np.expm1(-dose(rows) / theta[:, 1:2]))
 
-        largest = float(dose(table).max())
+        largest = float(dose_at_rows(table).max())
         if not largest > 0:
             continue
         saturating = LogUniform(_LEAST_DOSE * largest, _MOST_DOSE * largest)
         tried = np.geomspace(1.5 * saturating.low, 0.7 * saturating.high, _N_DOSES)
-        typical = about.typical(Stage.OFFSET, act, single_column_entries(about.sd, tried), about.sd)
+        typical = about.typical_amplitude(Stage.OFFSET, act, single_column_entries(about.sd, tried), about.sd)
         if typical is None:
             continue
         text = f"1 - exp(-D / d), D the {summed} of {what} since the start of the run"
         yield Form(
             f"formula:reading:{own.reading}:{text}",
             Stage.OFFSET,
-            {"a": about.amplitude(typical), "d": saturating},
+            {"a": about.amplitude_prior(typical), "d": saturating},
             (own.unit, ""),
             (name, "time", "run"),
             act,
             single_column_entries(typical, tried),
             (0,),
             lambda mean, sd, what=what: (  # type: ignore[misc]  # the second name of a value, not a parameter
-                f"{own.reading} shifts in the end by {with_unit(mean[0], sd[0], own.unit)} as the {summed} of {what} "
-                f"grows in a run, by 63 % of it when that is {with_unit(mean[1], sd[1], '')}: a proposal, not a known "
-                "effect"
+                f"{own.reading} shifts in the end by {mean_with_sd(mean[0], sd[0], own.unit)} as the {summed} of "
+                f"{what} grows in a run, by 63 % of it when that is {mean_with_sd(mean[1], sd[1], '')}: a proposal, "
+                "not a known effect"
             ),
             expression=f"a ({text.split(',')[0]}),{text.split(',', 1)[1]}",
         )
 
 
-def _sum_since_start_of_run(values: FloatArray, rows: RunTable) -> FloatArray:
-    """Integrate values (n_points,) over time from the start of each row's run, or sum them over rows without a time."""
+def _integral_since_start_of_run(values: FloatArray, rows: RunTable) -> FloatArray:
+    """Return the integral of values over time from the start of each row's run, (n_points,); their sum without time."""
     out = np.zeros(len(rows))
     for own in rows.rows_by_scan():
-        if not rows.has_time:
+        if not rows.has_varying_time:
             out[own] = np.cumsum(values[own])
         elif own.size:
             widths = np.diff(rows.time_s[own], prepend=rows.time_s[own][0])

@@ -12,10 +12,10 @@ from probewise._arrays import FloatArray
 from probewise.effects.waves import PHASE, sine_and_cosine_entries, starting_point_of_wave
 from probewise.priors import Uniform
 from probewise.sensor import Stage
-from probewise.systems.forms.about import About
+from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
-from probewise.systems.forms.form import Form, with_unit
-from probewise.systems.forms.modulations import most_waves_of_a_law, wave_number_prior, wave_numbers
+from probewise.systems.forms.form import Form, mean_with_sd
+from probewise.systems.forms.modulations import most_trial_waves_of_law, trial_wave_numbers, wave_number_prior
 from probewise.systems.motion import Limit, Motion
 
 _N_SIZES = 9
@@ -25,37 +25,39 @@ Of = Callable[[Any, Any], Any]
 """Function of the state whose rate it is in and another state; returns a term of unit amplitude."""
 
 
-def forms_on_rates(about: About) -> Iterator[Form]:
+def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
     """Yield the terms that may be missing from the rate of each state."""
     for state, values in about.states.items():
         size = float(np.nanmax(np.abs(values))) or 1.0
         own = f"{state} per {about.time_unit}"
-        yield from _term(about, f"damping:{state}", state, state, lambda r: -r, size, f"a damping term -a {state}")
-        yield from _term(
+        yield from _rate_term_form(
+            about, f"damping:{state}", state, state, lambda r: -r, size, f"a damping term -a {state}"
+        )
+        yield from _rate_term_form(
             about, f"drag:{state}", state, state, lambda r: -np.abs(r) * r, size**2, f"a drag term -a |{state}| {state}"
         )
-        yield from _term(
+        yield from _rate_term_form(
             about, f"forcing:{state}", state, state, lambda r: 1.0 + 0.0 * r, 1.0, "a constant term a", unit=own
         )
-        yield from _friction(about, state, own)
-        yield from _periodic_forcing(about, state, own)
-        yield from _limit(about, state, values)
+        yield from _friction_form(about, state, own)
+        yield from _periodic_forcing_form(about, state, own)
+        yield from _limit_form(about, state, values)
         for other, there in about.states.items():
             scale = float(np.nanmax(np.abs(there))) or 1.0
-            yield from _term(
+            yield from _rate_term_form(
                 about, f"cubic:{state}:{other}", state, other, lambda r: -(r**3), scale**3, f"a term -a {other}^3"
             )
-            yield from _term(
+            yield from _rate_term_form(
                 about, f"quadratic:{state}:{other}", state, other, lambda r: -(r**2), scale**2, f"a term -a {other}^2"
             )
             if other != state:
-                yield from _term(
+                yield from _rate_term_form(
                     about, f"coupling:{state}:{other}", state, other, lambda r: -r, scale, f"a term -a {other}"
                 )
 
 
-def _term(
-    about: About,
+def _rate_term_form(
+    about: ReferenceFit,
     name: str,
     state: str,
     other: str,
@@ -68,30 +70,30 @@ def _term(
         a = theta[:, :1]
         return value.with_term(state, lambda s, p, u: a * term(s[other]))
 
-    guess = 1e-5 * _rate_scale(about, state) / scale
-    typical = about.typical(Stage.RATE, act, np.full((1, 1, 1), guess), guess)
+    guess = 1e-5 * _rms_rate(about, state) / scale
+    typical = about.typical_amplitude(Stage.RATE, act, np.full((1, 1, 1), guess), guess)
     if typical is None:
         return
     unit = f"rate of {state}" if unit is None else unit
     yield Form(
         name,
         Stage.RATE,
-        {"a": about.amplitude(typical)},
+        {"a": about.amplitude_prior(typical)},
         (unit,),
         (f"state:{other}", "time"),
         act,
         np.full((1, 1, 1), typical),
         (0,),
-        lambda mean, sd: f"the rate of {state} lacks {what}, a = {with_unit(mean[0], sd[0], '')}",
+        lambda mean, sd: f"the rate of {state} lacks {what}, a = {mean_with_sd(mean[0], sd[0], '')}",
     )
 
 
-def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
+def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
     def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
         return value.with_friction(state, theta[:, :1])
 
     # A drive and the friction against it may each be far larger than what is left of the two, which moves the state.
-    prior = about.log_uniform(Stage.RATE, act, _rate_scale(about, state) * np.geomspace(1e-6, 30.0, 31))
+    prior = about.log_uniform_prior(Stage.RATE, act, _rms_rate(about, state) * np.geomspace(1e-6, 30.0, 31))
     if prior is not None:
         entries = np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None]
         yield Form(
@@ -104,28 +106,28 @@ def _friction(about: About, state: str, unit: str) -> Iterator[Form]:
             entries,
             (),
             lambda mean, sd: (
-                f"dry friction slows {state} by {with_unit(mean[0], sd[0], '')} per {about.time_unit}, "
+                f"dry friction slows {state} by {mean_with_sd(mean[0], sd[0], '')} per {about.time_unit}, "
                 "and holds it at rest"
             ),
             absent={0: 0.0},
         )
 
 
-def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
+def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
     table = about.table
     time = table.time
-    waves = wave_numbers(table.time_s, table.rows_by_scan(), most_waves_of_a_law(len(table)))
+    waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), most_trial_waves_of_law(len(table)))
 
     def act(value: Motion, theta: FloatArray, rows: Any) -> Motion:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * u[str(time)] + phase))
 
-    guess = 1e-5 * _rate_scale(about, state)
-    typical = about.typical(Stage.RATE, act, sine_and_cosine_entries(guess, waves), guess)
+    guess = 1e-5 * _rms_rate(about, state)
+    typical = about.typical_amplitude(Stage.RATE, act, sine_and_cosine_entries(guess, waves), guess)
     if typical is None:
         return
     marginals = {
-        "a": about.amplitude(typical, positive=True),
+        "a": about.amplitude_prior(typical, positive=True),
         "hz": wave_number_prior(waves),
         "phase": PHASE,
     }
@@ -139,14 +141,14 @@ def _periodic_forcing(about: About, state: str, unit: str) -> Iterator[Form]:
         sine_and_cosine_entries(typical, waves),
         (0,),
         lambda mean, sd: (
-            f"the rate of {state} lacks a sinusoidal term with an amplitude of {with_unit(mean[0], sd[0], '')} "
+            f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "
             f"per {about.time_unit} and a period of {1 / mean[1]:.4g} {about.time_unit}"
         ),
         joined=starting_point_of_wave,
     )
 
 
-def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
+def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator[Form]:
     """Bind a bound of a state: the rate beyond it is lost, or a state downstream takes up a share (overflow)."""
     ends = clipping_levels(float(np.nanmin(values)), float(np.nanmax(values)))
     if ends is None:
@@ -155,7 +157,7 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
 
     def act(value: Motion, theta: FloatArray, table: Any) -> Motion:
         level = theta[:, :1]
-        above = level > ends.middle
+        above = level > ends.least_ceiling
         spilt = {other: theta[:, k : k + 1] for k, other in enumerate(others, 1) if theta[:, k].any()}
         ceiling = Limit(state, np.where(above, level, np.inf), spilt=spilt)
         floor = Limit(state, np.where(above, -np.inf, level), upper=False, spilt=spilt)
@@ -163,18 +165,22 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
 
     def entries(taking: str | None) -> FloatArray:
         shares = np.array([0.5 * (other == taking) for other in others])
-        return np.concatenate([ends.levels[:, None], np.tile(shares, (len(ends.levels), 1))], axis=1)[:, None, :]
+        return np.concatenate([ends.trial_levels[:, None], np.tile(shares, (len(ends.trial_levels), 1))], axis=1)[
+            :, None, :
+        ]
 
     def marginals(taking: str | None) -> dict[str, Any]:
         shares = {f"share[{other}]": Uniform(0.0, 1.0 if other == taking else _NO_SHARE) for other in others}
         return {"level": ends.prior, **shares}
 
-    def fixed(taking: str | None) -> tuple[str, ...]:
+    def names_of_fixed_shares(taking: str | None) -> tuple[str, ...]:
         return tuple(f"share[{other}]" for other in others if other != taking)
 
     def says(mean: FloatArray, sd: FloatArray) -> str:
-        way = "rises" if mean[0] > ends.middle else "falls"
-        return f"{state} {way} no further than {with_unit(mean[0], sd[0], '')}" + _said_of_spilling(others, mean, sd)
+        way = "rises" if mean[0] > ends.least_ceiling else "falls"
+        return f"{state} {way} no further than {mean_with_sd(mean[0], sd[0], '')}" + _spilling_in_words(
+            others, mean, sd
+        )
 
     alone = Form(
         f"limit:{state}",
@@ -186,28 +192,31 @@ def _limit(about: About, state: str, values: FloatArray) -> Iterator[Form]:
         entries(None),
         (),
         says,
-        absent={0: ends.out_of_reach},
-        fixed=fixed(None),
+        absent={0: ends.level_out_of_reach},
+        fixed=names_of_fixed_shares(None),
     )
-    if np.nanmax(about.rms(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
+    if np.nanmax(about.rms_change(Stage.RATE, act, alone.entries[:, 0]), initial=0.0) > 0.05:
         # Downstream only: states that drive each other, as an angle and its rate, are no vessels.
-        into = [other for other in others if about.drives(state, other) and not about.drives(other, state)]
+        into = [
+            other for other in others if about.drives_rate_of(state, other) and not about.drives_rate_of(other, state)
+        ]
         spilling = [
-            replace(alone, marginals=marginals(other), entries=entries(other), fixed=fixed(other)) for other in into
+            replace(alone, marginals=marginals(other), entries=entries(other), fixed=names_of_fixed_shares(other))
+            for other in into
         ]
         yield replace(alone, alternatives=tuple(spilling))
 
 
-def _said_of_spilling(others: Sequence[str], mean: FloatArray, sd: FloatArray) -> str:
-    """Say which states take up what a bound stops, by the shares after its level."""
+def _spilling_in_words(others: Sequence[str], mean: FloatArray, sd: FloatArray) -> str:
+    """Return a phrase on the states that take up what a bound stops; their shares follow its level in `mean`."""
     return "".join(
-        f"; {other} takes up {with_unit(mean[k], sd[k], '')} of the rest"
+        f"; {other} takes up {mean_with_sd(mean[k], sd[k], '')} of the rest"
         for k, other in enumerate(others, 1)
         if mean[k] > _NO_SHARE
     )
 
 
-def _rate_scale(about: About, state: str) -> float:
+def _rms_rate(about: ReferenceFit, state: str) -> float:
     """Return the rms rate of a state, from its values at the rows."""
     values, time = about.states[state], about.table.time_s
     rates = []

@@ -10,16 +10,16 @@ from probewise._arrays import FloatArray
 from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms import modulations
-from probewise.systems.forms.about import About
-from probewise.systems.forms.form import Act, Form, with_unit
+from probewise.systems.forms.about import ReferenceFit
+from probewise.systems.forms.form import Act, Form, mean_with_sd
 from probewise.systems.forms.modulations import Modulation
 from probewise.systems.table import RunTable
 
 _N_SIZES = 9
 
 
-def modulated(
-    about: About,
+def modulated_form(
+    about: ReferenceFit,
     name: str,
     stage: Stage,
     how: Modulation,
@@ -29,14 +29,14 @@ def modulated(
     unit: str,
     covariates: tuple[str, ...] = (),
 ) -> Iterator[Form]:
-    """Bind a modulation to the quantity that `act` changes; yield nothing if the readings do not change."""
+    """Yield the form in which the quantity that `act` changes varies by `how`; none if the readings do not change."""
     entries = how.entries(guess)
-    typical = about.typical(stage, act, entries, guess)
+    typical = about.typical_amplitude(stage, act, entries, guess)
     if typical is not None and np.isfinite(typical) and typical > 0:
         yield Form(
             name,
             stage,
-            how.marginals(about.amplitude(typical)),
+            how.marginals(about.amplitude_prior(typical)),
             how.units(unit),
             (*how.covariates, *covariates),
             act,
@@ -48,96 +48,103 @@ def modulated(
         )
 
 
-def forms_on_readings(about: About) -> Iterator[Form]:
+def forms_on_readings(about: ReferenceFit) -> Iterator[Form]:
     """Yield every form of the reading that could be detectable in this table."""
-    table, unit, zero = about.table, about.unit, about.system.simulator.noise.zero
+    table, unit, zero = about.table, about.reading_unit, about.system.simulator.noise.zero
     reading = about.system.simulator.reading
     span = float(np.ptp(about.predicted)) or about.sd
     over: dict[str, Modulation] = {}
-    if table.has_time:
-        over["drift"] = modulations.drift(table, about.time_unit)
-    over["step"] = modulations.step(table, about.time_unit, gated=True)
-    if about.tells_runs_apart:
-        over["per_run"] = modulations.per_run(table)
+    if table.has_varying_time:
+        over["drift"] = modulations.linear_drift(table, about.time_unit)
+    over["step"] = modulations.step_at_change_point(table, about.time_unit, gated=True)
+    if about.can_fit_value_per_run:
+        over["per_run"] = modulations.value_per_run(table)
     for kind, how in over.items():
-        yield from modulated(about, f"offset_{kind}", Stage.OFFSET, how, _add_to_readings(how), about.sd, reading, unit)
-        yield from modulated(
+        yield from modulated_form(
+            about, f"offset_{kind}", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
+        )
+        yield from modulated_form(
             about,
             f"gain_{kind}",
             Stage.GAIN,
             how,
-            _scaling(how, zero),
+            _reading_scaler(how, zero),
             about.sd / span,
             f"the gain of {reading}",
             "1",
             ("level",),
         )
-    if table.has_time:
-        how = modulations.wave(table, about.time_unit)
-        yield from modulated(about, "interference", Stage.OFFSET, how, _add_to_readings(how), about.sd, reading, unit)
-        yield from _settling(about)
-        yield from _lag(about)
-        yield from _delay(about)
+    if table.has_varying_time:
+        how = modulations.sinusoid_in_time(table, about.time_unit)
+        yield from modulated_form(
+            about, "interference", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
+        )
+        yield from _settling_form(about)
+        yield from _lag_form(about)
+        yield from _delay_form(about)
     for name, values in table.covariates.items():
         if name not in (reading, about.system.simulator.noise.sd) and np.nanstd(values) > 0:
-            how = modulations.column(name, table)
-            yield from modulated(
-                about, f"sensitivity:{name}", Stage.OFFSET, how, _add_to_readings(how), about.sd, reading, unit
+            how = modulations.proportional_to_column(name, table)
+            yield from modulated_form(
+                about, f"sensitivity:{name}", Stage.OFFSET, how, _reading_adder(how), about.sd, reading, unit
             )
-    yield from _hysteresis(about)
-    yield from _bend(about)
-    yield from _ceiling(about)
+    yield from _hysteresis_form(about)
+    yield from _nonlinearity_form(about)
+    yield from _saturation_form(about)
 
 
-def _add_to_readings(how: Modulation) -> Act:
-    return lambda value, theta, table: value + how.over(theta, table)
+def _reading_adder(how: Modulation) -> Act:
+    return lambda value, theta, table: value + how.at_rows(theta, table)
 
 
-def _scaling(how: Modulation, zero: float) -> Act:
-    return lambda value, theta, table: zero + (value - zero) * (1 + how.over(theta, table))
+def _reading_scaler(how: Modulation, zero: float) -> Act:
+    return lambda value, theta, table: zero + (value - zero) * (1 + how.at_rows(theta, table))
 
 
-def since_start_of_run(table: RunTable) -> FloatArray:
+def time_since_start_of_run(table: RunTable) -> FloatArray:
     """Return the time since the first row of each row's run, (n_points,)."""
     first = np.array([table.time_s[rows].min() if rows.size else 0.0 for rows in table.rows_by_scan()])
     return np.asarray(table.time_s - first[table.scan])
 
 
-def settling_times(about: About) -> LogUniform:
-    """Return the prior of a time constant of settling: from half a gap between rows to twice the longest run."""
-    longest = float(since_start_of_run(about.table).max()) or 1.0
-    return LogUniform(min(0.5 * about.gap, 0.01 * longest), 2 * longest)
+def settling_time_prior(about: ReferenceFit) -> LogUniform:
+    """Return the prior of a time constant of settling, from half a gap between rows to twice the longest run.
+
+    It begins at a hundredth of the longest run if that is less.
+    """
+    longest = float(time_since_start_of_run(about.table).max()) or 1.0
+    return LogUniform(min(0.5 * about.median_gap, 0.01 * longest), 2 * longest)
 
 
-def _settling(about: About) -> Iterator[Form]:
+def _settling_form(about: ReferenceFit) -> Iterator[Form]:
     def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * np.exp(-since_start_of_run(table) / theta[:, 1:2]))
+        return np.asarray(value + theta[:, :1] * np.exp(-time_since_start_of_run(table) / theta[:, 1:2]))
 
-    prior = settling_times(about)
+    prior = settling_time_prior(about)
     taus = np.geomspace(prior.low * 1.5, 0.5 * prior.high, _N_SIZES)
     entries = np.stack([np.full(_N_SIZES, 1.0), taus], axis=-1)[:, None, :]
-    typical = about.typical(Stage.OFFSET, act, entries, 1.0)
+    typical = about.typical_amplitude(Stage.OFFSET, act, entries, 1.0)
     if typical is None:
         return
     entries[:, :, 0] = typical
-    unit, time_unit, reading = about.unit, about.time_unit, about.system.simulator.reading
+    unit, time_unit, reading = about.reading_unit, about.time_unit, about.system.simulator.reading
     yield Form(
         "settling",
         Stage.OFFSET,
-        {"a": about.amplitude(typical), "tau_s": prior},
+        {"a": about.amplitude_prior(typical), "tau_s": prior},
         (unit, time_unit),
         ("time", "run"),
         act,
         entries,
         (0,),
         lambda mean, sd: (
-            f"{reading} is off by {with_unit(mean[0], sd[0], unit)} at the start of each run, and settles "
-            f"with a time constant of {with_unit(mean[1], sd[1], time_unit)}"
+            f"{reading} is off by {mean_with_sd(mean[0], sd[0], unit)} at the start of each run, and settles "
+            f"with a time constant of {mean_with_sd(mean[1], sd[1], time_unit)}"
         ),
     )
 
 
-def _lag(about: About) -> Iterator[Form]:
+def _lag_form(about: ReferenceFit) -> Iterator[Form]:
     def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
         out = np.array(np.broadcast_to(value, (max(len(value), len(theta)), value.shape[1])))
         tau = theta[:, 0]
@@ -149,7 +156,7 @@ def _lag(about: About) -> Iterator[Form]:
                 out[:, rows[k]] = carry[:, k - 1] * out[:, rows[k - 1]] + (1 - carry[:, k - 1]) * out[:, rows[k]]
         return out
 
-    prior = about.log_uniform(Stage.LAG, act, about.gap * np.geomspace(0.02, 200.0, 33))
+    prior = about.log_uniform_prior(Stage.LAG, act, about.median_gap * np.geomspace(0.02, 200.0, 33))
     if prior is not None:
         time_unit = about.time_unit
         yield Form(
@@ -159,17 +166,18 @@ def _lag(about: About) -> Iterator[Form]:
             (time_unit,),
             ("previous",),
             act,
-            _sizes_between(prior),
+            _log_spaced_entries(prior),
             (),
             lambda mean, sd: (
-                f"{about.system.simulator.reading} lags with a time constant of {with_unit(mean[0], sd[0], time_unit)}"
+                f"{about.system.simulator.reading} lags with a time constant of "
+                f"{mean_with_sd(mean[0], sd[0], time_unit)}"
             ),
             absent={0: 0.0},
         )
 
 
-def _delay(about: About) -> Iterator[Form]:
-    prior = about.log_uniform(Stage.LAG, delayed, about.gap * np.geomspace(1e-3, 100.0, 41))
+def _delay_form(about: ReferenceFit) -> Iterator[Form]:
+    prior = about.log_uniform_prior(Stage.LAG, delayed_values, about.median_gap * np.geomspace(1e-3, 100.0, 41))
     if prior is not None:
         time_unit = about.time_unit
         yield Form(
@@ -178,24 +186,26 @@ def _delay(about: About) -> Iterator[Form]:
             {"tau_s": prior},
             (time_unit,),
             ("previous",),
-            delayed,
-            _sizes_between(prior),
+            delayed_values,
+            _log_spaced_entries(prior),
             (),
-            lambda mean, sd: f"{about.system.simulator.reading} is delayed by {with_unit(mean[0], sd[0], time_unit)}",
+            lambda mean, sd: (
+                f"{about.system.simulator.reading} is delayed by {mean_with_sd(mean[0], sd[0], time_unit)}"
+            ),
             absent={0: 0.0},
         )
 
 
-def delayed(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-    """Delay readings or a column, (n_points,) or (n_samples, n_points), by a dead time, within runs."""
+def delayed_values(values: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    """Return readings or a column, (n_points,) or (n_samples, n_points), delayed by theta[:, 0] within each run."""
     values = np.atleast_2d(values)
     out = np.empty((max(len(values), len(theta)), values.shape[1]))
     for rows in table.rows_by_scan():
-        out[:, rows] = earlier(table.time_s[rows], values[:, rows], theta[:, 0])
+        out[:, rows] = values_at_earlier_times(table.time_s[rows], values[:, rows], theta[:, 0])
     return out
 
 
-def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
+def values_at_earlier_times(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
     """Interpolate values (1 or n_samples, n) at times (n,) linearly to times earlier by `by` (n_samples,).
 
     Before the first time, the first value holds.
@@ -211,10 +221,10 @@ def earlier(time: FloatArray, values: FloatArray, by: FloatArray) -> FloatArray:
     return np.asarray(low + share * (high - low))
 
 
-def direction_of_change(values: FloatArray, table: RunTable) -> FloatArray:
-    """Return the sign of change, (n_samples, n_points), from the previous row of the run.
+def sign_of_change(values: FloatArray, table: RunTable) -> FloatArray:
+    """Return the sign of the change from the previous row of the run, (n_samples, n_points).
 
-    Where values do not change it is the sign before; at the start of a run, the first that is not 0.
+    Where values do not change it is the sign before; before the first change of a run, the sign of that.
     """
     out = np.zeros_like(values)
     for rows in table.rows_by_scan():
@@ -231,30 +241,30 @@ def direction_of_change(values: FloatArray, table: RunTable) -> FloatArray:
     return out
 
 
-def _hysteresis(about: About) -> Iterator[Form]:
+def _hysteresis_form(about: ReferenceFit) -> Iterator[Form]:
     def act(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
-        return np.asarray(value + theta[:, :1] * direction_of_change(value, table))
+        return np.asarray(value + theta[:, :1] * sign_of_change(value, table))
 
-    if np.ptp(direction_of_change(about.predicted[None, :], about.table)) == 0:
+    if np.ptp(sign_of_change(about.predicted[None, :], about.table)) == 0:
         return
-    unit, reading = about.unit, about.system.simulator.reading
+    unit, reading = about.reading_unit, about.system.simulator.reading
     yield Form(
         "hysteresis",
         Stage.OFFSET,
-        {"a": about.amplitude(about.sd)},
+        {"a": about.amplitude_prior(about.sd)},
         (unit,),
         ("previous",),
         act,
         np.full((1, 1, 1), about.sd),
         (0,),
         lambda mean, sd: (
-            f"{reading} reads {with_unit(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} while "
-            "it rises than while it falls"
+            f"{reading} reads {mean_with_sd(2 * abs(mean[0]), 2 * sd[0], unit)} {'more' if mean[0] > 0 else 'less'} "
+            "while it rises than while it falls"
         ),
     )
 
 
-def _bend(about: About) -> Iterator[Form]:
+def _nonlinearity_form(about: ReferenceFit) -> Iterator[Form]:
     low, high = float(about.predicted.min()), float(about.predicted.max())
     if not low < high:
         return
@@ -268,15 +278,15 @@ def _bend(about: About) -> Iterator[Form]:
     entries = np.stack([np.full(len(powers), 1.0), powers], axis=-1)[:, None, :]
     guess = about.sd / (high - low)
     entries[:, :, 0] = guess
-    typical = about.typical(Stage.BEND, act, entries, guess)
+    typical = about.typical_amplitude(Stage.BEND, act, entries, guess)
     if typical is None:
         return
     entries[:, :, 0] = typical
-    unit, reading = about.unit, about.system.simulator.reading
+    unit, reading = about.reading_unit, about.system.simulator.reading
     yield Form(
         "nonlinearity",
         Stage.BEND,
-        {"a": about.amplitude(typical), "power": LogUniform(0.4, 5.0)},
+        {"a": about.amplitude_prior(typical), "power": LogUniform(0.4, 5.0)},
         ("1", "1"),
         ("level",),
         act,
@@ -284,12 +294,12 @@ def _bend(about: About) -> Iterator[Form]:
         (0,),
         lambda mean, sd: (
             f"{reading} has a bent response, y + a (hi - lo) (z^power - z) with z from 0 at {low:.4g} to 1 at "
-            f"{high:.4g} {unit}, a = {with_unit(mean[0], sd[0], '')}, power = {with_unit(mean[1], sd[1], '')}"
+            f"{high:.4g} {unit}, a = {mean_with_sd(mean[0], sd[0], '')}, power = {mean_with_sd(mean[1], sd[1], '')}"
         ),
     )
 
 
-def _ceiling(about: About) -> Iterator[Form]:
+def _saturation_form(about: ReferenceFit) -> Iterator[Form]:
     low, high = float(about.predicted.min()), float(about.predicted.max())
     if not low < high:
         return
@@ -300,7 +310,7 @@ def _ceiling(about: About) -> Iterator[Form]:
     # floor.
     middle = 0.5 * (least + most)
 
-    def cut(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    def clip(value: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
         level = theta[:, :1]
         return np.where(level > middle, np.minimum(value, level), np.maximum(value, level))
 
@@ -311,24 +321,24 @@ def _ceiling(about: About) -> Iterator[Form]:
     levels = np.concatenate([ceilings[ceilings > middle], floors[floors < middle]])
     if not levels.size:
         return
-    unit, reading = about.unit, about.system.simulator.reading
+    unit, reading = about.reading_unit, about.system.simulator.reading
     yield Form(
         "saturation",
         Stage.SATURATION,
         {"level": Uniform(bottom - 0.02 * span, top + 0.02 * span)},
         (unit,),
         ("level",),
-        cut,
+        clip,
         levels[:, None, None],
         (),
         lambda mean, sd: (
-            f"{reading} {'rises' if mean[0] > middle else 'falls'} no further than {with_unit(mean[0], sd[0], unit)}"
+            f"{reading} {'rises' if mean[0] > middle else 'falls'} no further than {mean_with_sd(mean[0], sd[0], unit)}"
         ),
         absent={0: float(top + 1e3 * span)},
     )
 
 
-def _sizes_between(prior: LogUniform) -> FloatArray:
+def _log_spaced_entries(prior: LogUniform) -> FloatArray:
     return np.asarray(np.geomspace(prior.low * 1.2, prior.high / 1.2, _N_SIZES)[:, None, None])
 
 

@@ -12,7 +12,7 @@ from probewise.effects import PROPOSAL
 from probewise.errors import ParameterError
 from probewise.sensor import Stage
 from probewise.systems.forms import driving_columns, forms_of
-from probewise.systems.forms.about import About
+from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Act, Form
 from probewise.systems.forms.proposals import proposals
 from probewise.systems.simulator import Simulator
@@ -36,8 +36,8 @@ class Recorded:
 
 
 @dataclass(frozen=True, eq=False)
-class _AsRecorded(About):
-    """A fit known by its predictions: nothing is simulated, and sizes, which only priors need, are arbitrary."""
+class _RecordedFit(ReferenceFit):
+    """A reference fit known by its recorded predictions: nothing is simulated; sizes (for priors) are arbitrary."""
 
     known: Recorded | None = None
 
@@ -52,26 +52,26 @@ class _AsRecorded(About):
         return dict(self.known.states)
 
     @property
-    def tells_runs_apart(self) -> bool:
+    def can_fit_value_per_run(self) -> bool:
         return len(self.table.scan_names) > 1
 
-    def holds(self, column: str) -> bool:
+    def is_held_between_rows(self, column: str) -> bool:
         assert self.known is not None
         return column in self.known.held
 
-    def rms(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
+    def rms_change(self, stage: Stage, act: Act, settings: FloatArray) -> FloatArray:
         return np.ones(len(settings))
 
-    def typical(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
+    def typical_amplitude(self, stage: Stage, act: Act, entries: FloatArray, guess: float) -> float | None:
         return guess
 
-    def sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
+    def range_of_sizes(self, stage: Stage, act: Act, tried: FloatArray) -> tuple[float, float] | None:
         return float(tried[0]), float(tried[-1])
 
 
-def recorded(about: About) -> Recorded:
-    """Extract from a reference fit what rebinding its forms needs."""
-    held = tuple(name for name in driving_columns(about) if about.holds(name))
+def extract_recorded(about: ReferenceFit) -> Recorded:
+    """Return what rebinding the forms of a reference fit needs of it."""
+    held = tuple(name for name in driving_columns(about) if about.is_held_between_rows(name))
     return Recorded(about.table, about.predicted, about.states, held)
 
 
@@ -98,7 +98,7 @@ def rebind_forms(
     """
     wanted = list(dict.fromkeys(names))
     system = System(simulator, known.table.scan_names)
-    about = _AsRecorded(system, known.table, np.zeros(system.n_params), 1.0, known)
+    about = _RecordedFit(system, known.table, np.zeros(system.n_params), 1.0, known)
     found = forms_of(about)
     longer = _with_more_runs(known.table, list(more_runs))
     if longer is not known.table:
@@ -106,7 +106,7 @@ def rebind_forms(
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
         states = {name: values[rows] for name, values in known.states.items()}
         beyond = Recorded(longer, known.predicted[rows], states, known.held)
-        again = forms_of(_AsRecorded(system, longer, np.zeros(system.n_params), 1.0, beyond))
+        again = forms_of(_RecordedFit(system, longer, np.zeros(system.n_params), 1.0, beyond))
         found |= {name: form for name, form in again.items() if has_value_per_run(name)}
     if any(name.startswith(PROPOSAL) for name in wanted):
         found |= {form.name: form for form in proposals(about)}

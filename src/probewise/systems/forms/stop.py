@@ -61,7 +61,7 @@ class MeterStop(NoiseEffect):
         return Product({"level": Uniform(self.level - near, self.level + near)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Return the noise as it is."""
+        """Return the noise unchanged."""
         return value
 
     def change_of_readings(self, predicted: FloatArray) -> FloatArray:
@@ -103,7 +103,7 @@ def find_meter_stop(recording: Recording, reading: str = "the reading") -> tuple
 
 
 def _longest_streak(stands: BoolArray, in_turn: BoolArray) -> int:
-    """Return the largest number of successive rows at the stop."""
+    """Return the largest number of successive rows at the stop; `in_turn` marks rows that follow the one before."""
     longest = current = int(stands[0])
     for at, follows in zip(stands[1:].tolist(), in_turn.tolist(), strict=True):
         current = (current + 1 if follows else 1) if at else 0

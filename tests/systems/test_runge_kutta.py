@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from probewise.systems.motion import Limit, Motion, Stepper
-from probewise.systems.runge_kutta import FOURTH_ORDER, StepSchedule, eighth_order
+from probewise.systems.runge_kutta import FOURTH_ORDER, StepSchedule, eighth_order_method
 from probewise.systems.simulator import Law
 
-EIGHTH_ORDER = eighth_order()
+EIGHTH_ORDER = eighth_order_method()
 SWINGS = Motion(Law({"x": 1.0, "v": 0.0}, lambda s, p, u: {"x": s["v"], "v": -s["x"] + 0 * u["t"]}))
 
 

@@ -39,12 +39,12 @@ class ChangePointEffect(NamedEffect[V]):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """All parameters but the time."""
+        """Indices of all parameters but the time."""
         return tuple(range(len(self.typical_sizes)))
 
     @cached_property
     def prior(self) -> Product:
-        """Amplitudes of either sign, and the time: uniform over the recording, or between the two chosen readings."""
+        """Prior of amplitudes, of either sign, and time, uniform over the recording or between two chosen readings."""
         sizes = {name: HeavyTailedPrior(size) for name, size in self.typical_sizes.items()}
         return Product({**sizes, "at_s": Uniform(*self.change_interval_s)})
 

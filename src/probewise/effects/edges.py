@@ -42,7 +42,7 @@ class EdgeBlur(LinearEffect[Footprint]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Set the typical width to 2 % of the length of the longest scan."""
+        """Set the typical sd to 2 % of the length of the longest scan."""
         return cls(typical_mm=0.02 * extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
@@ -55,7 +55,7 @@ class EdgeBlur(LinearEffect[Footprint]):
         return ratio is None or float(np.ptp(ratio)) == 0.0
 
     def start(self, entry: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Return the width, (1,), with its square scaled by the fitted amount."""
+        """Return the sd, (1,), with its square scaled by the fitted amount."""
         return np.asarray(entry[0] * np.sqrt(max(float(amounts[0]), 1e-4)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

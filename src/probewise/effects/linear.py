@@ -32,7 +32,7 @@ class LinearEffect(NamedEffect[V]):
 
     @property
     def amplitudes(self) -> tuple[int, ...]:
-        """All parameters."""
+        """Indices of all parameters."""
         return tuple(range(len(self.parameters)))
 
     @cached_property

@@ -122,7 +122,7 @@ class RandomWalk(NoiseEffect):
 
     @cached_property
     def prior(self) -> Product:
-        """Sd of a step in noise sds, log-uniform."""
+        """Prior of the sd of a step in noise sds, log-uniform."""
         return Product({"sd_per_row": LogUniform(self.least, self.most)})
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
@@ -168,7 +168,7 @@ class NoisePerRun(NoiseEffect):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Pure numbers."""
+        """Units of the values: pure numbers."""
         return ("1",) * len(self.runs)
 
     @property
@@ -217,7 +217,7 @@ class NoisePerRun(NoiseEffect):
         return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
 
     def apply(self, value: NoiseLevel, theta: FloatArray, plan: Plan) -> NoiseLevel:
-        """Scale the noise of each reading by its run's value; 1 for a run that is not listed."""
+        """Return the noise, its sd times the value of each reading's run; 1 for a run that is not listed."""
         known = {name: k for k, name in enumerate(self.runs)}
         at = np.array([known.get(name, len(self.runs)) for name in plan.scan_names])
         values = np.concatenate([theta, np.ones((len(theta), 1))], axis=1)

@@ -106,7 +106,7 @@ class AmbientStep(ChangePointEffect[FloatArray]):
         return np.asarray(value + theta[:, :1] * self.after_change_mask(theta, plan))
 
     def with_fewer_variants(self) -> Self:
-        """Keep all intervals: the time of the step is what identifies it."""
+        """Return the effect with all intervals: the time of the step is what identifies it."""
         return self
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

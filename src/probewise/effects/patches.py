@@ -153,7 +153,7 @@ class PatchEffect(NamedEffect[V]):
 
     @cached_property
     def prior(self) -> PatchPrior:
-        """Height, place and radius."""
+        """Prior of height, place and radius."""
         return PatchPrior(self.size, self.typical, self.line)
 
     def variants(self) -> tuple[Self, ...]:

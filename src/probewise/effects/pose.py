@@ -38,7 +38,7 @@ class Backlash(LinearEffect[Poses]):
         return cls(typical_mm=0.005 * extent.length_mm)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        """Shift the poses against the direction of the last commanded motion."""
+        """Return the poses, shifted against the direction of the last commanded motion."""
         half_mm = theta[:, :1] / 2
         return replace(
             value,

@@ -80,7 +80,7 @@ class MissingTooth(NamedEffect[Poses]):
 
     @cached_property
     def prior(self) -> Product:
-        """Jump, of either sign, its place, and its axis: 0 for X, 1 for Y."""
+        """Prior of the jump, of either sign, its place, and its axis: 0 for X, 1 for Y."""
         axis = Uniform(self.along - 0.5, self.along + 0.5)
         return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "at_mm": Uniform(*self.between_mm), "axis": axis})
 

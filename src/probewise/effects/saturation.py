@@ -55,7 +55,7 @@ class Saturation(NamedEffect[FloatArray]):
 
     @cached_property
     def prior(self) -> Product:
-        """Level, uniform over the levels at which the limit would act, and softness, log-uniform."""
+        """Prior of the level, uniform where the limit would act, and of the softness, log-uniform."""
         return Product(
             {"level": Uniform(self.lowest, self.highest), "softness": LogUniform(self.sharpest, self.softest)}
         )

@@ -169,7 +169,7 @@ class StickSlip(NamedEffect[Poses]):
 
     @cached_property
     def prior(self) -> Product:
-        """Amplitude, of either sign, period (log-uniform), and phase in turns."""
+        """Prior of the amplitude, of either sign, the period (log-uniform), and the phase in turns."""
         period = LogUniform(self.shortest_mm, self.longest_mm)
         return Product({"amp_mm": HeavyTailedPrior(self.typical_mm), "period_mm": period, "phase": Uniform(-1.0, 1.0)})
 

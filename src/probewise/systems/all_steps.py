@@ -248,7 +248,7 @@ def solve_all_steps(problem: Problem, steps: Steps, known: Sequence[KnownTraject
     search = _NewtonState(problem, steps, guess.copy())
     _iterate_with_shared_jacobians(search, known, nearest)
     # A chord that led away is no better a start than the trajectory that it began from.
-    astray = search.active & ~(search.rate < 1)
+    astray = search.active_mask & ~(search.rate < 1)
     search.states[:, astray, 1:] = guess[:, astray, 1:]
     search.change[~search.done] = np.inf
     bands = _iterate_with_own_jacobians(search)
@@ -259,7 +259,7 @@ def solve_all_steps(problem: Problem, steps: Steps, known: Sequence[KnownTraject
 def _iterate_with_shared_jacobians(search: _NewtonState, known: Sequence[KnownTrajectory], nearest: IntArray) -> None:
     """Take chord iterations, each with the Jacobian of the known trajectory nearest to a sample."""
     for _ in range(_CHORDS):
-        active = search.active & ((search.rate < _SLOW) | ~np.isfinite(search.change))
+        active = search.active_mask & ((search.rate < _SLOW) | ~np.isfinite(search.change))
         samples = np.flatnonzero(active)
         if not samples.size:
             return
@@ -283,7 +283,7 @@ def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
     for k in range(_NEWTONS):
         if k == _HOPELESS:
             search.possible &= search.change < _SLOW
-        samples = np.flatnonzero(search.active)
+        samples = np.flatnonzero(search.active_mask)
         if not samples.size:
             break
         bands = search.jacobian_bands(samples, search.states[:, samples])
@@ -313,7 +313,7 @@ class _NewtonState:
         self.states[:, :, 0] = np.stack(list(start.values()))
 
     @property
-    def active(self) -> BoolArray:
+    def active_mask(self) -> BoolArray:
         """Mask of the samples that have not converged and may yet, (n_samples,)."""
         return self.possible & ~self.done
 
@@ -341,7 +341,7 @@ class _NewtonState:
         return _bands_of_jacobian(np.stack(columns, axis=1))
 
     def correct(self, samples: IntArray, correction: FloatArray) -> None:
-        """Add a correction (n_states, n, n_steps, n_runs) to some samples' states, and see who has converged."""
+        """Add a correction (n_states, n, n_steps, n_runs) to samples' states, and mark those that have converged."""
         change = _largest_relative_change(correction, self.states[:, samples])
         self.states[:, samples, 1:] += correction
         with np.errstate(all="ignore"):
@@ -379,8 +379,8 @@ def _largest_relative_change(change: FloatArray, states: FloatArray) -> FloatArr
 def _bands_of_jacobian(slopes: FloatArray) -> list[FloatArray]:
     """Return each sample's Jacobian of the system of all steps, its diagonal and lower bands, (n_unknowns, 2 n_states).
 
-    `slopes` (n_states, n_states, n_samples, n_steps, n_runs) are those of a step's end by its begin. Unknowns are
-    ordered by run, then by step, then by state.
+    `slopes` (n_states, n_states, n_samples, n_steps, n_runs) are derivatives of a step's end by its beginning.
+    Unknowns are ordered by run, then by step, then by state.
     """
     n_states, _, n_samples, n_steps, n_runs = slopes.shape
     out = np.zeros((n_samples, n_runs, n_steps, n_states, 2 * n_states))

@@ -63,7 +63,7 @@ class Caller:
     _known: dict[bytes, FloatArray] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def probed(
+    def from_trial_calls(
         cls,
         simulate: Simulate,
         samples: Mapping[str, FloatArray],

@@ -413,16 +413,16 @@ class LawInputs:
         Its arrays have a column for each step and run, the runs of a step in turn.
         """
 
-        def flat(values: Any) -> Any:
+        def flattened(values: Any) -> Any:
             return values.reshape(len(values), -1)
 
-        def rising(values: FloatArray) -> tuple[Any, Any]:
-            return flat(values[:, gap]), flat(np.diff(values, axis=1)[:, gap])
+        def value_and_rise(values: FloatArray) -> tuple[Any, Any]:
+            return flattened(values[:, gap]), flattened(np.diff(values, axis=1)[:, gap])
 
         constant = {name: np.tile(v, (1, len(gap))) if v.shape[1] > 1 else v for name, v in self.constant.items()}
-        moving = {name: rising(v) for name, v in self.moving.items()}
-        sloping = {name: rising(v) for name, v in self.sloping.items()}
-        held = {name: flat(v[:, gap]) for name, v in self.held.items()}
+        moving = {name: value_and_rise(v) for name, v in self.moving.items()}
+        sloping = {name: value_and_rise(v) for name, v in self.sloping.items()}
+        held = {name: flattened(v[:, gap]) for name, v in self.held.items()}
         return _interpolator(constant, moving, held, sloping)
 
 
@@ -474,12 +474,12 @@ def _interpolator(
         throughout = constant, held
         return lambda share: throughout
 
-    def at(share: Any) -> Pair:
+    def inputs_at(share: Any) -> Pair:
         p = {**constant, **{name: low + share * rise for name, (low, rise) in moving.items()}}
         u = {**held, **{name: low + share * rise for name, (low, rise) in sloping.items()}}
         return p, u
 
-    return at
+    return inputs_at
 
 
 def _values_at_rows(values: NDArray[Any], rows: IntArray) -> NDArray[Any]:

@@ -26,7 +26,7 @@ from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
-from probewise.systems.table import RunRecording, RunTable, relative_sds_of
+from probewise.systems.table import RunRecording, RunTable, relative_sds_of_column
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
@@ -290,7 +290,7 @@ def _noise_level(
     if isinstance(declared, str) and fitted.known is not None:
         values = fitted.known.table.covariates[declared]
         typical = float(np.median(values[np.isfinite(values) & (values > 0)]))
-        sd = sd * relative_sds_of(table, declared, typical)
+        sd = sd * relative_sds_of_column(table, declared, typical)
     level = NoiseLevel(sd, np.zeros((1, 1)), seen=seen)
     for effect, columns in columns_of_effects(chain.effects, chain.system.n_params):
         if effect.stage is Stage.NOISE:
@@ -299,9 +299,9 @@ def _noise_level(
 
 
 def write_system_prediction(prediction: SystemPrediction, path: str | os.PathLike[str]) -> None:
-    """Write all rows of the table in order, with `mean`, `sd` and `log_density` in full precision.
+    """Write all rows of the table in order as CSV, with `mean`, `sd` and `log_density`, in full precision.
 
-    Columns of the table with one of these names are left out.
+    Columns of the table with one of these names are overwritten.
 
     Raises
     ------

@@ -52,7 +52,7 @@ N_LONGER = 3
 
 
 @cache
-def eighth_order() -> RungeKutta:
+def eighth_order_method() -> RungeKutta:
     """Return the method of eighth order.
 
     Hairer, Norsett & Wanner, Solving Ordinary Differential Equations I, 1993, section II.10.
@@ -78,5 +78,5 @@ class StepSchedule:
         """
         fewer = np.asarray(-(-n_steps // N_LONGER), dtype=np.int64)
         if N_LONGER * fewer.sum() <= _DEARER * n_steps.sum():
-            return cls(fewer, eighth_order())
+            return cls(fewer, eighth_order_method())
         return cls(n_steps, FOURTH_ORDER)

@@ -86,7 +86,7 @@ class System:
             tried = bare.theta(bare.starts[:_N_TRIED])
             columns = columns_without_reading(simulator, table)
             try:
-                caller = Caller.probed(
+                caller = Caller.from_trial_calls(
                     simulator.simulate,
                     bare.parameters(tried, table),
                     columns,

@@ -147,10 +147,10 @@ class RunRecording(Recording):
         if not self.sd_column:
             return np.ones(len(self.plan))
         table = cast(RunTable, self.plan)
-        return relative_sds_of(table, self.sd_column)
+        return relative_sds_of_column(table, self.sd_column)
 
 
-def relative_sds_of(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
+def relative_sds_of_column(table: RunTable, column: str, typical: float | None = None) -> FloatArray:
     """Return a column of sds over the typical one, by default its median, (n_points,); 1 where there is none."""
     values = table.covariates.get(column, np.full(len(table), np.nan))
     there = np.isfinite(values) & (values > 0)

@@ -52,9 +52,13 @@ class Model:
         samples = {name: theta[:, [k]] for k, name in enumerate(prior.names)}
         some = settings.take(np.unique(np.linspace(0, len(settings) - 1, _N_PROBED).astype(int))).columns
         try:
-            caller = Caller.probed(call_with_arrays, samples, some, per_run=(), broadcasts=False, name="model")
+            caller = Caller.from_trial_calls(
+                call_with_arrays, samples, some, per_run=(), broadcasts=False, name="model"
+            )
         except Exception:
-            caller = Caller.probed(call_for_one_sample, samples, some, per_run=(), broadcasts=False, name="model")
+            caller = Caller.from_trial_calls(
+                call_for_one_sample, samples, some, per_run=(), broadcasts=False, name="model"
+            )
         return cls(caller, prior, noise)
 
     @cached_property

@@ -51,7 +51,7 @@ class ReferenceFit:
 
     @cached_property
     def states(self) -> dict[str, FloatArray]:
-        """States at each row, (n_points,); none without a law."""
+        """Each state at the rows, (n_points,), by name; none without a law."""
         system = self.system
         if system.simulator.law is None:
             return {}

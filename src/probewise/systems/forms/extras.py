@@ -16,7 +16,7 @@ _UNSEEN = 1e-7  # of the noise
 
 
 def forms_of_extras(about: ReferenceFit) -> Iterator[Form]:
-    """Bind each extra effect of a file that changes the readings somewhere in its prior."""
+    """Yield a form for each extra effect of a file that changes the readings somewhere in its prior."""
     for name, extra in about.system.simulator.extra.items():
         values = np.asarray(extra.prior.from_unit((np.arange(_N_VALUES) + 0.5) / _N_VALUES))
         values = values[values != extra.null]

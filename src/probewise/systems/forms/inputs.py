@@ -46,7 +46,7 @@ def driving_columns(about: ReferenceFit) -> list[str]:
 
 
 def forms_on_inputs(about: ReferenceFit) -> Iterator[Form]:
-    """Yield the possible errors of each column that drives the simulator, and of the clock."""
+    """Yield a form for each possible error of the columns that drive the simulator, and of the clock."""
     table, time = about.table, about.table.time
     for name in driving_columns(about):
         values = table.covariates[name]
@@ -155,11 +155,11 @@ def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float
     if ends is None:
         return
 
-    def change(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
+    def clip(c: FloatArray, theta: FloatArray, table: RunTable) -> FloatArray:
         level = theta[:, :1]
         return np.asarray(np.where(level > ends.least_ceiling, np.minimum(c, level), np.maximum(c, level)))
 
-    act = _column_changer(name, change)
+    act = _column_changer(name, clip)
     if np.nanmax(about.rms_change(Stage.INPUT, act, ends.trial_levels[:, None]), initial=0.0) > 0.05:
         yield Form(
             f"input_saturation:{name}",
@@ -189,10 +189,10 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
     if len(np.unique(values)) < 3 * _ROWS_OF_A_WAVE:
         return
 
-    def change(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
+    def add_wave(c: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
 
-    act = _column_changer(name, change)
+    act = _column_changer(name, add_wave)
     waves = trial_wave_numbers(np.sort(values), [np.arange(len(values))], _most_trial_waves(about), _ROWS_OF_A_WAVE)
     guess = 1e-4 * float(np.nanstd(values))
     typical = about.typical_amplitude(Stage.INPUT, act, sine_and_cosine_entries(guess, 1 / waves), guess)

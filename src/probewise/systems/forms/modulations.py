@@ -44,7 +44,7 @@ def _single_entry(size: float) -> FloatArray:
 
 
 def linear_drift(table: RunTable, time_unit: str) -> Modulation:
-    """Linear drift in time as recorded: a t."""
+    """Return a linear drift in time as recorded: a t."""
     return Modulation(
         at_rows=lambda theta, rows: theta[:, :1] * rows.time_s,
         marginals=lambda a: {"a": a},
@@ -56,7 +56,7 @@ def linear_drift(table: RunTable, time_unit: str) -> Modulation:
 
 
 def proportional_to_column(name: str, table: RunTable) -> Modulation:
-    """Variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
+    """Return a variation in proportion to a column, about its mean over the recording: a (C - mean C)."""
     values = table.covariates[name]
     middle = float(np.nanmean(values))
 
@@ -74,7 +74,7 @@ def proportional_to_column(name: str, table: RunTable) -> Modulation:
 
 
 def step_at_change_point(table: RunTable, time_unit: str, *, gated: bool) -> Modulation:
-    """Step at a change point: a 1(t > t0), in time if recorded, else in row number."""
+    """Return a step at a change point: a 1(t > t0), in time if recorded, else in row number."""
     by_row = not table.has_varying_time
     along = np.unique(np.arange(float(len(table))) if by_row else table.time_s)
     stride = -(-(len(along) - 1) // _MOST_MOMENTS)
@@ -100,7 +100,7 @@ def step_at_change_point(table: RunTable, time_unit: str, *, gated: bool) -> Mod
 
 
 def value_per_run(table: RunTable) -> Modulation:
-    """One value per run: a_run; 0 for runs outside the recording."""
+    """Return a variation by one value per run: a_run; 0 for runs outside the recording."""
     names = table.scan_names
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
@@ -151,7 +151,7 @@ def wave_number_prior(waves: FloatArray) -> LogUniform:
 
 
 def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
-    """One sinusoid in time: a sin(2 pi hz t + phase)."""
+    """Return a sinusoid in time: a sin(2 pi hz t + phase)."""
     waves = trial_wave_numbers(table.time_s, table.rows_by_scan())
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:

@@ -1,6 +1,6 @@
 """Proposals: short formulas of columns and states, in the reading or in a rate, for effects out of vocabulary.
 
-Each is one term with one amplitude. Their evidence is computed as for any other effect; a winning proposal counts as
+Most are one term with one amplitude. Their evidence is computed as for any other effect; a winning proposal counts as
 out of vocabulary and is reported as a formula.
 """
 
@@ -129,7 +129,7 @@ def _reading_proposals(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _threshold_proposal(about: ReferenceFit, name: str) -> Iterator[Form]:
-    """Shift the reading where a column is above an unknown threshold."""
+    """Yield a shift of the reading where a column is above an unknown threshold."""
     own, values = about.system.simulator, np.unique(about.table.covariates[name])
     if len(values) <= 2:
         return
@@ -163,7 +163,7 @@ def _threshold_proposal(about: ReferenceFit, name: str) -> Iterator[Form]:
 
 
 def _one_sided_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
-    """Act on the rate of a state beyond a threshold of it, in proportion to how far beyond: a stop, a second spring."""
+    """Yield terms of a state's rate that grow with its distance beyond a threshold, either way: a stop, a spring."""
     values = about.states[state]
     low, high = float(values.min()), float(values.max())
     if not low < high:

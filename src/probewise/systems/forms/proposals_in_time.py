@@ -25,14 +25,14 @@ _N_SETTLING, _APART = 9, 2  # time constants of two settlings, and how far apart
 
 
 def proposals_in_time(about: ReferenceFit) -> Iterator[Form]:
-    """Yield what could be added to the reading along time."""
+    """Yield the proposals that add to the reading along time."""
     yield from _square_wave_proposal(about)
     yield from _swept_wave_proposal(about)
     yield from _two_settlings_proposal(about)
 
 
 def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
-    """Shift the reading during a share of every period: a wave with flat tops and edges of unknown steepness."""
+    """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
     own, table = about.system.simulator, about.table
     waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
 
@@ -74,7 +74,7 @@ def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
-    """Add a sinusoid whose frequency rises or falls steadily along the recording, by a machine that runs up, say."""
+    """Yield a sinusoid whose frequency rises or falls steadily along the recording, by a machine that runs up, say."""
     own, table = about.system.simulator, about.table
     waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
     begin, end = float(table.time_s.min()), float(table.time_s.max())
@@ -120,7 +120,7 @@ def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
 
 
 def _two_settlings_proposal(about: ReferenceFit) -> Iterator[Form]:
-    """Let the reading settle with two time constants at the start of each run."""
+    """Yield a settling of the reading with two time constants from the start of each run."""
     own = about.system.simulator
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:

@@ -19,14 +19,14 @@ _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the 
 
 
 def proposals_of_columns(about: ReferenceFit, columns: Mapping[str, FloatArray]) -> Iterator[Form]:
-    """Yield what each of these columns could add to the reading, together with the reading or with its own past."""
+    """Yield proposals of what each column could add to the reading, together with the reading or with its own past."""
     for name, values in columns.items():
         yield from _varying_influence_proposal(about, name, values)
         yield from _dose_proposals(about, name, values)
 
 
 def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
-    """Let a column add to the reading by an amount that is a quadratic function of the reading."""
+    """Yield a column's influence on the reading, its coefficient a quadratic function of the reading."""
     own, level = about.system.simulator, about.predicted
     middle, half = 0.5 * float(level.max() + level.min()), 0.5 * float(np.ptp(level))
     centre, spread = float(np.mean(values)), float(np.std(values))
@@ -63,7 +63,7 @@ def _varying_influence_proposal(about: ReferenceFit, name: str, values: FloatArr
 
 
 def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Iterator[Form]:
-    """Let the reading change with what a column has added up to since the start of the run, until it saturates."""
+    """Yield a change of the reading that saturates with the column's integral (dose) since the start of the run."""
     own, table = about.system.simulator, about.table
     centre = float(f"{np.mean(values):.6g}")
     each: dict[str, Callable[[FloatArray], FloatArray]] = {f"|{name} - {centre:.4g}|": lambda c: np.abs(c - centre)}

@@ -26,7 +26,7 @@ Of = Callable[[Any, Any], Any]
 
 
 def forms_on_rates(about: ReferenceFit) -> Iterator[Form]:
-    """Yield the terms that may be missing from the rate of each state."""
+    """Yield a form for each term that may be missing from the rate of a state, for friction and for bounds."""
     for state, values in about.states.items():
         size = float(np.nanmax(np.abs(values))) or 1.0
         own = f"{state} per {about.time_unit}"
@@ -149,7 +149,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
 
 
 def _limit_form(about: ReferenceFit, state: str, values: FloatArray) -> Iterator[Form]:
-    """Bind a bound of a state: the rate beyond it is lost, or a state downstream takes up a share (overflow)."""
+    """Yield a bound of a state: the rate beyond it is lost, or a state downstream takes up a share (overflow)."""
     ends = clipping_levels(float(np.nanmin(values)), float(np.nanmax(values)))
     if ends is None:
         return

@@ -100,7 +100,7 @@ def rebind_forms(
     system = System(simulator, known.table.scan_names)
     about = _RecordedFit(system, known.table, np.zeros(system.n_params), 1.0, known)
     found = forms_of(about)
-    longer = _with_more_runs(known.table, list(more_runs))
+    longer = _table_with_more_runs(known.table, list(more_runs))
     if longer is not known.table:
         system = System(simulator, longer.scan_names)
         rows = np.append(np.arange(len(known.table)), np.full(len(longer) - len(known.table), len(known.table) - 1))
@@ -121,7 +121,7 @@ def has_value_per_run(name: str) -> bool:
     return name.partition(":")[0] in _WITH_VALUE_PER_RUN
 
 
-def _with_more_runs(table: RunTable, more_runs: list[str]) -> RunTable:
+def _table_with_more_runs(table: RunTable, more_runs: list[str]) -> RunTable:
     """Append one row for each further run: the last row of the table, under the run's name."""
     if not more_runs or table.run is None:
         return table

@@ -56,7 +56,7 @@ class MeterStop(NoiseEffect):
 
     @cached_property
     def prior(self) -> Product:
-        """The level to within rounding."""
+        """Prior of the level: certain to within rounding."""
         near = 1e-9 * (1 + abs(self.level))
         return Product({"level": Uniform(self.level - near, self.level + near)})
 
@@ -70,7 +70,7 @@ class MeterStop(NoiseEffect):
         return -beyond(predicted - self.level, 0.0)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
-        """Say where the readings end."""
+        """Return a sentence on the level at which the readings end."""
         way = "rises" if self.is_ceiling else "falls"
         return f"{self.reading} {way} no further than {self.level:.6g} {self.unit}".rstrip() + ", where the meter stops"
 

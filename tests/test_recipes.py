@@ -103,7 +103,7 @@ def test_a_system(tmp_path):
     file = tmp_path / "spring.py"
     file.write_text(spring.text.replace("{noise}", ""), encoding="utf-8")
     predicted = read_simulator(file).simulate(drawn.shared, drawn.rows.columns)
-    np.testing.assert_allclose(predicted, drawn.readings_at_all_rows([]))
+    np.testing.assert_allclose(predicted, drawn.simulate_all_rows([]))
 
 
 def test_a_verb(capsys):

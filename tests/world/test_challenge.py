@@ -30,7 +30,7 @@ from probewise.world.challenge import (
     stratum_of,
 )
 from probewise.world.challenge.effect_samplers import CleanSetup
-from probewise.world.challenge.regions import Region, region_of
+from probewise.world.challenge.regions import Region, region_of_effect
 from probewise.world.challenge.sensors import draw_spot
 from probewise.world.challenge.sizing import EffectSizer
 
@@ -242,9 +242,9 @@ def test_every_candidate_makes_effects_of_its_name(setup):
 
 
 def test_scans_can_be_drawn_that_cross_an_edge_and_their_mounting(setup):
-    assert "edge_0" in setup.scans or "edge_0_out" in setup.scans
-    assert not any(name.startswith(("white", "black", "quadrants")) for name in setup.scans)
-    mounting = setup.scans_at_orientation_of(next(name for name in setup.scans if "90" in name))
+    assert "edge_0" in setup.edge_scan_names or "edge_0_out" in setup.edge_scan_names
+    assert not any(name.startswith(("white", "black", "quadrants")) for name in setup.edge_scan_names)
+    mounting = setup.scans_at_orientation_of(next(name for name in setup.edge_scan_names if "90" in name))
     assert all("90" in name for name in mounting)
 
 
@@ -252,7 +252,7 @@ def test_a_local_effect_is_found_where_it_is(setup):
     sizer = EffectSizer(setup, left_by_levels)
 
     def region(name, amplitude):
-        return region_of(INSIDE[name].draw(setup, np.random.default_rng(8))(amplitude), sizer)
+        return region_of_effect(INSIDE[name].draw(setup, np.random.default_rng(8))(amplitude), sizer)
 
     glint = INSIDE["glint"].draw(setup, np.random.default_rng(8))(2.0)
     found = region("glint", 2.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from probewise.recordings import Disc, HalfPlane, Image, Polygon, Quadrant, Ramp, Stripes, Uniform
-from probewise.world import Oval, paint
-from probewise.world.edges import across_edge, edge_distance
+from probewise.world import Oval, albedo_at
+from probewise.world.edges import distance_to_nearest_edge, edge_normal
 
 SURFACES = {
     "half plane": HalfPlane(0.7, 1.3),
@@ -23,23 +23,23 @@ SURFACES = {
 def test_the_distance_is_that_to_the_nearest_change_of_albedo(name):
     surface, rng = SURFACES[name], np.random.default_rng(2)
     x, y = rng.uniform(-8, 8, (2, 8))
-    distance = edge_distance(surface, x, y)
+    distance = distance_to_nearest_edge(surface, x, y)
     # Along rays in all directions, how far the albedo stays what it is at the place.
     turn, radius = np.arange(600) * (2 * math.pi / 600), np.linspace(0, 16, 801)
     for k in range(len(x)):
         ray_x = x[k] + radius[:, None] * np.cos(turn)
         ray_y = y[k] + radius[:, None] * np.sin(turn)
-        changed = paint(surface, ray_x, ray_y) != paint(surface, x[k : k + 1], y[k : k + 1])
+        changed = albedo_at(surface, ray_x, ray_y) != albedo_at(surface, x[k : k + 1], y[k : k + 1])
         nearest = radius[np.flatnonzero(changed.any(axis=1))[0]]
         assert distance[k] == pytest.approx(nearest, abs=0.04)
 
 
 @pytest.mark.parametrize("surface", [Uniform(0.3), Ramp(0.0, 0.01), Image(np.ones((2, 2)), 1.0, (0, 0), "a.npy")])
 def test_what_has_no_printed_edge_is_infinitely_far_from_one(surface):
-    np.testing.assert_array_equal(edge_distance(surface, np.zeros(2), np.ones(2)), np.inf)
+    np.testing.assert_array_equal(distance_to_nearest_edge(surface, np.zeros(2), np.ones(2)), np.inf)
 
 
 def test_across_is_the_normal_of_straight_edges_and_x_elsewhere():
-    assert across_edge(HalfPlane(0.7, 1.3)) == pytest.approx((math.cos(0.7), math.sin(0.7)))
-    assert across_edge(Stripes(0.2, 7.0, 0.4, 1.0)) == pytest.approx((math.cos(0.2), math.sin(0.2)))
-    assert across_edge(Disc((0, 0), 1.0)) == (1.0, 0.0)
+    assert edge_normal(HalfPlane(0.7, 1.3)) == pytest.approx((math.cos(0.7), math.sin(0.7)))
+    assert edge_normal(Stripes(0.2, 7.0, 0.4, 1.0)) == pytest.approx((math.cos(0.2), math.sin(0.2)))
+    assert edge_normal(Disc((0, 0), 1.0)) == (1.0, 0.0)

@@ -15,8 +15,8 @@ from probewise.world import (
     Oval,
     Spot,
     World,
+    albedo_at,
     gaussian_spot,
-    paint,
     raster_spot,
     ridge_spot,
     seen_white_fraction,
@@ -122,7 +122,7 @@ def test_a_photograph_of_a_polygon_looks_like_the_polygon():
     triangle = SURFACES["polygon"]
     centers = (np.arange(300) + 0.5) * 0.1 - 15
     x, y = np.meshgrid(centers, centers[::-1])  # first row on top
-    photo = Image(paint(triangle, x, y), 0.1, (-15.0, -15.0), "photo.npy")
+    photo = Image(albedo_at(triangle, x, y), 0.1, (-15.0, -15.0), "photo.npy")
     spot = gaussian_spot([BLOB])
     apart = seen_white_fraction(photo, spot, *poses()) - seen_white_fraction(triangle, spot, *poses())
     assert np.abs(apart).max() < 2e-3
@@ -131,22 +131,22 @@ def test_a_photograph_of_a_polygon_looks_like_the_polygon():
 def test_an_image_shows_nothing_outside_and_has_its_first_row_on_top():
     photo = Image(np.array([[0.1, 0.2], [0.3, 0.4]]), 2.0, (10.0, 20.0), "photo.npy")
     x, y = np.array([11.0, 13.0, 11.0, 13.0, 9.9, 14.1]), np.array([23.0, 23.0, 21.0, 21.0, 21.0, 21.0])
-    np.testing.assert_array_equal(paint(photo, x, y), [0.1, 0.2, 0.3, 0.4, 0, 0])
+    np.testing.assert_array_equal(albedo_at(photo, x, y), [0.1, 0.2, 0.3, 0.4, 0, 0])
 
 
 def test_a_polygon_that_crosses_itself_follows_the_even_odd_rule():
     star = Polygon(tuple((math.sin(k * 4 * math.pi / 5), math.cos(k * 4 * math.pi / 5)) for k in range(5)))
-    np.testing.assert_array_equal(paint(star, np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.7, 0.0])), [0, 1, 0])
+    np.testing.assert_array_equal(albedo_at(star, np.array([0.0, 0.0, 2.0]), np.array([0.0, 0.7, 0.0])), [0, 1, 0])
 
 
 def test_inside_and_outside_can_be_any_two_levels():
     disc = Disc((0, 0), 1.0, inside=0.2, outside=0.7)
-    np.testing.assert_array_equal(paint(disc, np.array([0.0, 2.0]), np.zeros(2)), [0.2, 0.7])
+    np.testing.assert_array_equal(albedo_at(disc, np.array([0.0, 2.0]), np.zeros(2)), [0.2, 0.7])
 
 
 def test_no_surface_is_no_surface():
     with pytest.raises(ParameterError, match="pattern of the recording format"):
-        paint("white", np.zeros(1), np.zeros(1))
+        albedo_at("white", np.zeros(1), np.zeros(1))
 
 
 def test_moments_of_a_gaussian_spot_are_those_asked_for():

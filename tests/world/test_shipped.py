@@ -6,7 +6,7 @@ import pytest
 from probewise.errors import ParameterError
 from probewise.recordings import shipped, two_way_plan
 from probewise.world import Blob, CorrelatedNoise, World, gaussian_spot
-from probewise.world.shipped import BLACK, BLOB, CANDIDATES, NOISE_SD, WHITE, main, regenerate, truth
+from probewise.world.shipped import BLACK, BLOB, CANDIDATES, NOISE_SD, WHITE, main, regenerate_recording, truth
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def test_the_files_do_not_tell_what_they_conceal():
 
 def test_a_recording_that_does_not_ship_cannot_be_made():
     with pytest.raises(ParameterError):
-        regenerate("other")
+        regenerate_recording("other")
 
 
 def test_the_paper_recording_conceals_nothing_and_the_other_one_thing():

@@ -13,7 +13,7 @@ from probewise.world.concealed import (
     Nonlinearity,
     Saturation,
 )
-from probewise.world.painting import CoveredSurface, Oval, Surface, paint
+from probewise.world.painting import CoveredSurface, Oval, Surface, albedo_at
 from probewise.world.rays import seen_white_fraction
 from probewise.world.rows import Rows
 from probewise.world.spots import Blob, Spot, gaussian_spot, raster_spot, ridge_spot, ring_spot, tailed_spot
@@ -35,8 +35,8 @@ __all__ = [
     "Surface",
     "View",
     "World",
+    "albedo_at",
     "gaussian_spot",
-    "paint",
     "raster_spot",
     "ridge_spot",
     "ring_spot",
@@ -50,6 +50,9 @@ Look = View
 
 Covered = CoveredSurface
 """The old name of `CoveredSurface`."""
+
+paint = albedo_at
+"""The old name of `albedo_at`."""
 
 seen_white = seen_white_fraction
 """The old name of `seen_white_fraction`."""

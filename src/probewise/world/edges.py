@@ -13,14 +13,14 @@ from probewise.world.painting import CoveredSurface, Oval, Surface
 _N_RIM = 720  # points on an oval's outline among which the nearest is searched
 
 
-def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def distance_to_nearest_edge(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the distance in mm to the nearest printed edge, (n_points,); infinite where there is none.
 
     Images count as having no edges, since they are not described.
     """
     match surface:
         case CoveredSurface():
-            below = [edge_distance(part, x_mm, y_mm) for part in (surface.below, *surface.cards)]
+            below = [distance_to_nearest_edge(part, x_mm, y_mm) for part in (surface.below, *surface.cards)]
             return np.asarray(np.min(below, axis=0))
         case Uniform() | Ramp() | Image():
             return np.full(x_mm.shape, np.inf)
@@ -48,7 +48,7 @@ def edge_distance(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> Float
             return _distance_to_outline(np.array(surface.vertices_mm), x_mm, y_mm)
 
 
-def across_edge(surface: Surface) -> tuple[float, float]:
+def edge_normal(surface: Surface) -> tuple[float, float]:
     """Return the unit vector across the edge of a pattern with a single straight edge; along X for others."""
     match surface:
         case HalfPlane() | Stripes() | Ramp():

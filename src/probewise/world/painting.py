@@ -45,7 +45,7 @@ class CoveredSurface:
 Surface: TypeAlias = Pattern | Oval | CoveredSurface
 
 
-def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+def albedo_at(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the albedo at points; all arrays of one shape.
 
     Raises
@@ -55,9 +55,9 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """
     match surface:
         case CoveredSurface():
-            seen = paint(surface.below, x_mm, y_mm)
+            seen = albedo_at(surface.below, x_mm, y_mm)
             for card in surface.cards:
-                seen = np.where(_is_within_polygon(card, x_mm, y_mm), card.inside, seen)
+                seen = np.where(_inside_polygon_mask(card, x_mm, y_mm), card.inside, seen)
             return seen
         case Uniform():
             return np.full(x_mm.shape, surface.albedo)
@@ -80,7 +80,7 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
             across = (dy_mm * cos - dx_mm * sin) / surface.half_axes_mm[1]
             within = along**2 + across**2 < 1
         case Polygon():
-            within = _is_within_polygon(surface, x_mm, y_mm)
+            within = _inside_polygon_mask(surface, x_mm, y_mm)
         case Stripes():
             along = x_mm * math.cos(surface.normal_rad) + y_mm * math.sin(surface.normal_rad) - surface.phase_mm
             turns = along / surface.period_mm
@@ -90,7 +90,7 @@ def paint(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     return np.where(within, surface.inside, surface.outside)
 
 
-def _is_within_polygon(polygon: Polygon, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
+def _inside_polygon_mask(polygon: Polygon, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
     """Return whether points are inside: a ray towards +x crosses an odd number of sides."""
     odd = np.zeros(x_mm.shape, dtype=np.bool_)
     corners = polygon.vertices_mm

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.recordings.patterns import Image, Ramp
-from probewise.world.edges import edge_distance
-from probewise.world.painting import Surface, paint
+from probewise.world.edges import distance_to_nearest_edge
+from probewise.world.painting import Surface, albedo_at
 from probewise.world.spots import Spot
 
 Retouch: TypeAlias = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
@@ -61,13 +61,13 @@ def seen_white_fraction(
     # A scan out and back visits each place twice.
     stands = np.stack([x_mm, y_mm, orientation_rad, np.broadcast_to(scale, n_points), *moved])
     poses, again = np.unique(stands, axis=1, return_inverse=True)
-    seen = paint(surface, poses[0] - poses[4], poses[1] - poses[5])
+    seen = albedo_at(surface, poses[0] - poses[4], poses[1] - poses[5])
     rest = np.arange(len(seen))
     if retouch is None and not isinstance(surface, Ramp | Image):
         # No edge within the footprint: the albedo at its origin applies to all of it.
         u, v = spot.edges_mm()
         reach = np.hypot(np.abs(u).max(), np.abs(v).max()) * poses[3]
-        rest = np.flatnonzero(edge_distance(surface, poses[0] - poses[4], poses[1] - poses[5]) <= reach)
+        rest = np.flatnonzero(distance_to_nearest_edge(surface, poses[0] - poses[4], poses[1] - poses[5]) <= reach)
     per_block = max(1, _BLOCK // spot.weights.size)
     for start in range(0, len(rest), per_block):
         part = rest[start : start + per_block]
@@ -85,7 +85,7 @@ def _seen_white_fraction_of_block(
     origin_x, origin_y = x_mm - pattern_x, y_mm - pattern_y
     # Corners of all pixels, (n_points, n_v + 1, n_u + 1).
     corners_x, corners_y = cos * u - sin * v[:, None], sin * u + cos * v[:, None]
-    found = paint(surface, origin_x + corners_x, origin_y + corners_y)
+    found = albedo_at(surface, origin_x + corners_x, origin_y + corners_y)
     around = (found[:, :-1, :-1], found[:, :-1, 1:], found[:, 1:, :-1], found[:, 1:, 1:])
     albedo: FloatArray = (around[0] + around[1] + around[2] + around[3]) / 4
     # The mean of the corners is exact where albedo is linear.
@@ -95,20 +95,20 @@ def _seen_white_fraction_of_block(
         per_block = max(1, _BLOCK // n_rays)
         for start in range(0, mixed_at[0].size, per_block):
             at = pose, row, column = tuple(index[start : start + per_block] for index in mixed_at)
-            first_u, first_v = _ray_shift(row, column)
+            first_u, first_v = _sequence_offset_of_pixels(row, column)
             ray_u = u[column][:, None] + spot.pixel_mm * np.mod(first_u[:, None] + np.arange(n_rays) * _STEP_U, 1.0)
             ray_v = v[row][:, None] + spot.pixel_mm * np.mod(first_v[:, None] + np.arange(n_rays) * _STEP_V, 1.0)
             c, s = cos[pose, 0], sin[pose, 0]
             landed_x = origin_x[pose, 0] + c * ray_u - s * ray_v
             landed_y = origin_y[pose, 0] + s * ray_u + c * ray_v
-            albedo[at] = paint(surface, landed_x, landed_y).mean(axis=1)
+            albedo[at] = albedo_at(surface, landed_x, landed_y).mean(axis=1)
     if retouch is not None:
         mid_u, mid_v = u[:-1] + spot.pixel_mm / 2, (v[:-1] + spot.pixel_mm / 2)[:, None]
         albedo = retouch(albedo, x_mm + cos * mid_u - sin * mid_v, y_mm + sin * mid_u + cos * mid_v)
     return np.asarray(np.einsum("kvu,vu->k", albedo, spot.weights))
 
 
-def _ray_shift(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
+def _sequence_offset_of_pixels(row: IntArray, column: IntArray) -> tuple[FloatArray, FloatArray]:
     """Return each pixel's shift of the ray sequence: fixed per pixel, spread evenly along rows and columns."""
     golden = 0.6180339887498949
     return np.mod(row * golden + column * _STEP_V, 1.0), np.mod(column * golden + row * _STEP_U, 1.0)

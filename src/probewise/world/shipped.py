@@ -58,28 +58,28 @@ def truth(name: str) -> World:
 
     Raises ParameterError if there is no recording of that name.
     """
-    choice, _, _ = _streams(name)
+    choice, _, _ = _random_streams(name)
     world = World(gaussian_spot([BLOB]), black=BLACK, white=WHITE, noise_sd=NOISE_SD)
     if name == "paper":
         return world
     return replace(world, concealed=(CANDIDATES[int(choice.integers(len(CANDIDATES)))],))
 
 
-def regenerate(name: str) -> Recording:
+def regenerate_recording(name: str) -> Recording:
     """Regenerate a shipped recording.
 
     Readings are rounded to 0.001, far below the noise, so that floating-point differences between machines vanish.
 
     Raises ParameterError if there is no recording of that name.
     """
-    _, times, noise = _streams(name)
+    _, times, noise = _random_streams(name)
     plan = paper_plan() if name == "paper" else two_way_plan()
     plan = replace(plan, instrumentation=replace(plan.instrumentation, description=_DESCRIPTIONS[name]))
     recording = truth(name).simulate(jittered(plan, rng=times), rng=noise)
     return replace(recording, readings=np.round(recording.readings, 3))
 
 
-def _streams(name: str) -> list[np.random.Generator]:
+def _random_streams(name: str) -> list[np.random.Generator]:
     """Return independent random streams for the concealed effect, the times and the noise."""
     if name not in SHIPPED:
         raise ParameterError("name", name, " or ".join(repr(known) for known in SHIPPED))
@@ -92,7 +92,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("folder", type=Path, help="an existing folder")
     folder: Path = parser.parse_args(arguments).folder
     for name in SHIPPED:
-        write_recording(regenerate(name), folder / f"{name}.csv")
+        write_recording(regenerate_recording(name), folder / f"{name}.csv")
 
 
 if __name__ == "__main__":

@@ -23,7 +23,7 @@ from probewise.world.concealed.stages import (
     Retouches,
     Stage,
 )
-from probewise.world.edges import across_edge, edge_distance
+from probewise.world.edges import distance_to_nearest_edge, edge_normal
 from probewise.world.painting import Surface
 from probewise.world.rays import seen_white_fraction
 from probewise.world.rows import Rows
@@ -130,32 +130,32 @@ class World:
             scan=np.zeros(1, dtype=np.int64),
             scan_names=("",),
             covariates={},
-            across=np.array([across_edge(surface)]),
-            edge_mm=edge_distance(surface, np.array([x_mm]), np.array([y_mm])),
+            across=np.array([edge_normal(surface)]),
+            edge_mm=distance_to_nearest_edge(surface, np.array([x_mm]), np.array([y_mm])),
         )
-        view = self._view([(surface, np.zeros(1, dtype=np.int64))], rows, height_mm)
-        return float(self._with_noise(view, rng)[0])
+        view = self._view_of_rows([(surface, np.zeros(1, dtype=np.int64))], rows, height_mm)
+        return float(self._recorded_readings(view, rng)[0])
 
     def view(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> View:
-        """Compute the seen white fraction of a plan: the part of `expected` that integrates light.
+        """Compute what the sensor sees at each reading of a plan, by integrating light: the costly part of `expected`.
 
         It does not depend on effects from the stage "response" on: a world that differs in those only may turn the same
         view into readings.
         """
-        found = self._surfaces(plan, surfaces)
+        found = self._surfaces_with_rows(plan, surfaces)
         across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
         for surface, chosen in found:
-            across[chosen] = across_edge(surface)
-            edge_mm[chosen] = edge_distance(surface, plan.x_mm[chosen], plan.y_mm[chosen])
-        return self._view(found, Rows.of(plan, across, edge_mm))
+            across[chosen] = edge_normal(surface)
+            edge_mm[chosen] = distance_to_nearest_edge(surface, plan.x_mm[chosen], plan.y_mm[chosen])
+        return self._view_of_rows(found, Rows.of(plan, across, edge_mm))
 
     def noise_free_readings(self, view: View) -> FloatArray:
         """Turn a view into noise-free readings, not rounded, shape (n_points,)."""
         rows = view.rows
-        signal = (self.white - self.black) * self._through_changes("response", view.seen, rows) * view.dimming
-        reading = self.black + self._through_changes("gain", signal, rows)
+        signal = (self.white - self.black) * self._apply_changes("response", view.seen, rows) * view.dimming
+        reading = self.black + self._apply_changes("gain", signal, rows)
         for stage in ("offset", "lag", "saturation"):
-            reading = self._through_changes(stage, reading, rows)
+            reading = self._apply_changes(stage, reading, rows)
         return reading
 
     def expected(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> FloatArray:
@@ -204,22 +204,20 @@ class World:
         ParameterError
             If the plan reads over a pattern that is not described.
         """
-        return Recording(plan, self._with_noise(self.view(plan, surfaces) if view is None else view, rng))
+        return Recording(plan, self._recorded_readings(self.view(plan, surfaces) if view is None else view, rng))
 
-    def _view(self, surfaces: _Surfaces, sent: Rows, height_mm: float | None = None) -> View:
-        place = self._through_changes("place", sent.place_mm, sent)
-        there = replace(sent, place_mm=place, orientation_rad=self._through_changes("turn", sent.orientation_rad, sent))
-        pattern = self._through_changes("pattern", np.zeros_like(place), there)
-        center = place + self._through_changes("tilt", np.zeros_like(place), there)
-        scale = (
-            self._through_changes("height", np.full(len(place), height_mm or self.height_mm), there) / self.height_mm
-        )
+    def _view_of_rows(self, surfaces: _Surfaces, sent: Rows, height_mm: float | None = None) -> View:
+        place = self._apply_changes("place", sent.place_mm, sent)
+        there = replace(sent, place_mm=place, orientation_rad=self._apply_changes("turn", sent.orientation_rad, sent))
+        pattern = self._apply_changes("pattern", np.zeros_like(place), there)
+        center = place + self._apply_changes("tilt", np.zeros_like(place), there)
+        scale = self._apply_changes("height", np.full(len(place), height_mm or self.height_mm), there) / self.height_mm
         if scale.min() <= 0:
             raise ParameterError("height_mm", float(scale.min() * self.height_mm), "greater than 0 at every reading")
-        retouch = self._through_retouches if any(isinstance(effect, Retouches) for effect in self.concealed) else None
+        retouch = self._apply_retouches if any(isinstance(effect, Retouches) for effect in self.concealed) else None
         seen, edge_mm = np.zeros(len(place)), np.empty(len(place))
         for surface, chosen in surfaces:
-            edge_mm[chosen] = edge_distance(surface, *(place - pattern)[chosen].T)
+            edge_mm[chosen] = distance_to_nearest_edge(surface, *(place - pattern)[chosen].T)
             white = partial(
                 seen_white_fraction,
                 surface,
@@ -233,25 +231,27 @@ class World:
                 seen[chosen] += part.share * white(part.spot, x_mm, y_mm)
         there = replace(there, edge_mm=edge_mm)
         # Illumination by the LED falls with the inverse square of the distance.
-        return View(self._through_changes("seen", seen, there), scale**-2.0, there)
+        return View(self._apply_changes("seen", seen, there), scale**-2.0, there)
 
-    def _with_noise(self, view: View, rng: np.random.Generator | None) -> FloatArray:
+    def _recorded_readings(self, view: View, rng: np.random.Generator | None) -> FloatArray:
+        """Turn a view into readings with noise, rounding and losses; without `rng`, with rounding only."""
         readings = self.noise_free_readings(view)
         if rng is not None:
-            noise = self._through_disturbances("noise", rng.standard_normal(len(readings)), view, rng)
+            noise = self._apply_disturbances("noise", rng.standard_normal(len(readings)), view, rng)
             readings = readings + self.noise_sd * noise
-        readings = self._through_changes("quantisation", readings, view.rows)
+        readings = self._apply_changes("quantisation", readings, view.rows)
         if self.step is not None:
             readings = np.round(readings / self.step) * self.step
-        return readings if rng is None else self._through_disturbances("loss", readings, view, rng)
+        return readings if rng is None else self._apply_disturbances("loss", readings, view, rng)
 
-    def _through_changes(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
+    def _apply_changes(self, stage: Stage, values: FloatArray, rows: Rows) -> FloatArray:
+        """Return a stage's values with the effects of that stage on them."""
         for effect in self.concealed:
             if effect.stage == stage and isinstance(effect, Changes):
                 values = effect.change(values, rows)
         return values
 
-    def _through_retouches(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    def _apply_retouches(self, albedo: FloatArray, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         for effect in self.concealed:
             if isinstance(effect, Retouches):
                 albedo = effect.retouch(albedo, x_mm, y_mm)
@@ -264,15 +264,13 @@ class World:
                 parts = effect.change_footprint(parts)
         return parts
 
-    def _through_disturbances(
-        self, stage: Stage, values: FloatArray, view: View, rng: np.random.Generator
-    ) -> FloatArray:
+    def _apply_disturbances(self, stage: Stage, values: FloatArray, view: View, rng: np.random.Generator) -> FloatArray:
         for effect in self.concealed:
             if effect.stage == stage and isinstance(effect, Disturbs):
                 values = effect.disturb(values, view.rows, view.seen, rng)
         return values
 
-    def _surfaces(self, plan: Plan, surfaces: Mapping[str, Surface] | None) -> _Surfaces:
+    def _surfaces_with_rows(self, plan: Plan, surfaces: Mapping[str, Surface] | None) -> _Surfaces:
         known: dict[str, Surface] = {**plan.patterns, **(surfaces or {})}
         rows_by_pattern = plan.rows_by_pattern()
         for name, _ in rows_by_pattern:

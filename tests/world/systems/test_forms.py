@@ -39,7 +39,7 @@ def _rows(t, run=None, **columns):
             {"a": 0.2, "hz": 0.3, "phase": 1.0},
             lambda rows, y: 0.2 * np.sin(2 * np.pi * 0.3 * rows.t + 1.0),
         ),
-        ("settling", {"a": 0.2, "tau_s": 1.5}, lambda rows, y: 0.2 * np.exp(-rows.since_start / 1.5)),
+        ("settling", {"a": 0.2, "tau_s": 1.5}, lambda rows, y: 0.2 * np.exp(-rows.time_since_start / 1.5)),
         ("hysteresis", {"a": 0.1}, lambda rows, y: -0.1 + 0 * y),
         ("saturation", {"level": 1.2}, lambda rows, y: np.minimum(y, 1.2) - y),
         ("saturation (floor)", {"level": 0.6}, lambda rows, y: np.maximum(y, 0.6) - y),
@@ -58,7 +58,7 @@ def test_a_bend_leaves_both_ends_where_they_are(solve):
 
 def test_a_lag_mixes_each_reading_with_the_one_before_within_a_run(solve):
     found, rows, bare = solve("lag", {"tau_s": 0.8})
-    for own in rows.by_run:
+    for own in rows.rows_by_run:
         expected = [bare[own[0]]]
         for before, row in pairwise(own):
             stays = np.exp(-(rows.t[row] - rows.t[before]) / 0.8)

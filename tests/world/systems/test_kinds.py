@@ -7,7 +7,7 @@ import pytest
 
 from probewise.systems import System, read_run_table, read_simulator
 from probewise.world.challenge import Stratum
-from probewise.world.systems import KINDS, SystemCase, draw_system, owners_file, write_system_case
+from probewise.world.systems import KINDS, SystemCase, draw_system, owners_file_text, write_system_case
 from probewise.world.systems.formulas import FLOW
 from probewise.world.systems.noise import noise_of_size
 
@@ -15,7 +15,7 @@ from probewise.world.systems.noise import noise_of_size
 def _case(kind, said='noise = {"sd": 0.5}', seed=5):
     rng = np.random.default_rng(seed)
     drawn = draw_system(kind, rng=rng)
-    noise_free = drawn.readings_at_all_rows([])
+    noise_free = drawn.simulate_all_rows([])
     noise = noise_of_size(
         "white", 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_rows, kind.sd, rng=rng
     )
@@ -48,7 +48,7 @@ def test_the_owners_file_predicts_what_the_world_does(kind, tmp_path):
 @pytest.mark.parametrize("said", ["", 'noise = {"sd": 0.5, "step": 0.1}'])
 def test_the_owner_says_of_the_noise_what_they_know(said, tmp_path):
     case = _case(KINDS[0], said)
-    assert owners_file(case).count("noise") == (1 if said else 0)
+    assert owners_file_text(case).count("noise") == (1 if said else 0)
     assert read_simulator(write_system_case(case, tmp_path)[0]).noise.step == (0.1 if said else None)
 
 

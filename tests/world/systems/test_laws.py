@@ -59,13 +59,13 @@ def test_a_bound_holds_and_lets_go_at_once(solve):
 def test_a_periodic_force_is_integrated_between_the_rows(solve):
     found, rows, _ = solve("periodic_forcing:x", {"a": 0.6, "hz": 0.3, "phase": 0.4}, k=0.0)
     w = 2 * np.pi * 0.3
-    begin = rows.t - rows.since_start
+    begin = rows.t - rows.time_since_start
     np.testing.assert_allclose(found, 2 + 0.6 / w * (np.cos(w * begin + 0.4) - np.cos(w * rows.t + 0.4)), rtol=1e-6)
 
 
 def test_a_parameter_that_drifts_does_so_between_the_rows_too(solve):
     found, rows, _ = solve("drifts:k", {"a": 0.02})
-    begin = rows.t - rows.since_start
+    begin = rows.t - rows.time_since_start
     np.testing.assert_allclose(found, 2 * np.exp(-0.5 * SINCE - 0.01 * (rows.t**2 - begin**2)), rtol=1e-7)
 
 
@@ -84,7 +84,7 @@ def test_a_parameter_follows_a_logged_column_on_straight_lines(solve):
     found, rows, _ = solve("depends:k:warm", {"a": 0.2})
     warm = rows.columns["warm"] - rows.columns["warm"].mean()
     area = np.zeros(len(rows))
-    for own in rows.by_run:
+    for own in rows.rows_by_run:
         area[own[1:]] = np.cumsum(np.diff(rows.t[own]) * (warm[own[1:]] + warm[own[:-1]]) / 2)
     np.testing.assert_allclose(found, 2 * np.exp(-0.5 * SINCE - 0.2 * area), rtol=1e-7)
 

@@ -7,7 +7,7 @@ from probewise.world.systems import KINDS, OTHER_NOISE, draw_system
 from probewise.world.systems.noise import noise_of_size
 
 DRAWN = draw_system(KINDS[3], rng=np.random.default_rng(4))
-CLEAN = DRAWN.without_effects.readings
+CLEAN = DRAWN.fit_without_effects.readings
 
 
 def _noise(name, wanted=12.0, seed=0):
@@ -23,11 +23,11 @@ def test_every_kind_of_noise_is_drawn_about_the_readings(name):
 
 def test_correlated_noise_gains_what_its_pairs_tell():
     noise = _noise("correlated_noise")
-    pairs = len(CLEAN) - len(DRAWN.diagnosed_rows.by_run)
+    pairs = len(CLEAN) - len(DRAWN.diagnosed_rows.rows_by_run)
     assert -pairs * np.log(1 - noise.parameters["rho"] ** 2) == pytest.approx(144.0)
     rng = np.random.default_rng(2)
     own = [noise.draw(CLEAN, DRAWN.diagnosed_rows, rng) - CLEAN for _ in range(60)]
-    rows = DRAWN.diagnosed_rows.by_run[0]
+    rows = DRAWN.diagnosed_rows.rows_by_run[0]
     found = np.mean([np.corrcoef(e[rows[:-1]], e[rows[1:]])[0, 1] for e in own])
     assert found == pytest.approx(noise.parameters["rho"], abs=0.06)
 

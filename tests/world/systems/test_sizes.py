@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import curve_fit
 
 from probewise.world.systems import KINDS, cases, draw_system, draw_system_case, system_stratum_of, truth_of
-from probewise.world.systems.cases import _of_size
-from probewise.world.systems.rivals import rivals_of
+from probewise.world.systems.cases import _draw_effect_of_size
+from probewise.world.systems.rivals import rivals_with_nats
 from probewise.world.systems.strata import SYSTEMS_WHEEL
 from probewise.world.systems.vocabulary import forms_of
 
@@ -26,8 +26,8 @@ def _form(drawn, name):
 def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
     """zero + k q^2 is linear in its parameters: a projection tells what is left."""
     drawn = _drawn("orifice flow meter")
-    effect = _of_size(_form(drawn, name), wanted, drawn, np.random.default_rng(1))
-    with_effect = drawn.diagnosed_readings([effect.placed])
+    effect = _draw_effect_of_size(_form(drawn, name), wanted, drawn, np.random.default_rng(1))
+    with_effect = drawn.simulate_diagnosed_rows([effect.form_with_parameters])
     q = drawn.diagnosed_rows.columns["flow_lpm"]
     basis = np.stack([np.ones_like(q), q**2], axis=1)
     left = with_effect - basis @ np.linalg.lstsq(basis, with_effect, rcond=None)[0]
@@ -37,8 +37,8 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
 
 def test_what_a_bent_model_leaves_is_as_large_as_asked():
     drawn = _drawn("photodiode against distance")
-    effect = _of_size(_form(drawn, "sensitivity:board_c"), 12.0, drawn, np.random.default_rng(1))
-    d, y = drawn.diagnosed_rows.columns["dist_mm"], drawn.diagnosed_readings([effect.placed])
+    effect = _draw_effect_of_size(_form(drawn, "sensitivity:board_c"), 12.0, drawn, np.random.default_rng(1))
+    d, y = drawn.diagnosed_rows.columns["dist_mm"], drawn.simulate_diagnosed_rows([effect.form_with_parameters])
 
     def law(d, dark, power, behind):
         return dark + 1e5 * power / (d + behind) ** 2
@@ -50,10 +50,10 @@ def test_what_a_bent_model_leaves_is_as_large_as_asked():
 def test_an_offset_that_depends_on_a_column_is_a_sensitivity_by_another_name():
     drawn = _drawn("orifice flow meter")
     forms = forms_of(drawn.true_system)
-    effect = _of_size(_form(drawn, "sensitivity:water_c"), 12.0, drawn, np.random.default_rng(1))
-    target = drawn.diagnosed_readings([effect.placed])
+    effect = _draw_effect_of_size(_form(drawn, "sensitivity:water_c"), 12.0, drawn, np.random.default_rng(1))
+    target = drawn.simulate_diagnosed_rows([effect.form_with_parameters])
     fitted = drawn.nominal_model.fit(target, drawn.true_coordinates)
-    rivals = rivals_of(drawn.true_system, forms, target, fitted, drawn.nominal_model, frozenset({effect.name}))
+    rivals = rivals_with_nats(drawn.true_system, forms, target, fitted, drawn.nominal_model, frozenset({effect.name}))
     assert rivals["depends:zero_kpa:water_c"] < 0.01
     assert "sensitivity:baro_hpa" not in rivals
     assert all(nats < 3 for nats in rivals.values())
@@ -85,7 +85,7 @@ def test_a_case_of_every_stratum_holds_what_it_says(number, quick):
     assert (case.noise.name != "white") is case.stratum.other_noise
     for effect in case.effects:
         assert effect.in_vocabulary is (case.stratum.kind != "outside")
-        assert case.drawn.size([effect.placed]) == pytest.approx(case.stratum.size, rel=0.01)
+        assert case.drawn.size([effect.form_with_parameters]) == pytest.approx(case.stratum.size, rel=0.01)
 
 
 @pytest.mark.slow
@@ -94,4 +94,4 @@ def test_a_case_of_every_stratum_holds_what_it_says_of_any_system(number):
     case = draw_system_case(31, number)
     for effect in case.effects:
         assert effect.size_lambda == pytest.approx(case.stratum.size, rel=0.01)
-        assert case.drawn.size([effect.placed]) == pytest.approx(case.stratum.size, rel=0.01)
+        assert case.drawn.size([effect.form_with_parameters]) == pytest.approx(case.stratum.size, rel=0.01)

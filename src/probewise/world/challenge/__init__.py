@@ -1,7 +1,8 @@
 """Challenge cases: recordings that conceal an effect of a known size, drawn from a sealed seed.
 
 A case's sensor, plan, noise and effect follow from the seed and its number alone; its held-out readings come from the
-same world. The size of an effect is what a refit of the null model leaves of it: the caller supplies that refit.
+same world. The size lambda of an effect is the norm of its residuals after a refit of the null model, in noise sds; the
+caller supplies that refit.
 """
 
 from probewise.world.challenge.cases import ALIASES, Case, draw_case, held_out_recordings

@@ -13,7 +13,7 @@ from probewise.world.challenge.effect_samplers import CleanSetup
 from probewise.world.challenge.in_vocabulary import INSIDE, PAIRABLE, SINGLES
 from probewise.world.challenge.out_of_vocabulary import OUTSIDE
 from probewise.world.challenge.plans import PLANS, draw_plan, held_out_plans
-from probewise.world.challenge.regions import region_of
+from probewise.world.challenge.regions import region_of_effect
 from probewise.world.challenge.sensors import NOISE_LEVELS, OTHER_NOISE, SSFS, draw_sensor, with_noise
 from probewise.world.challenge.sizing import EffectSizer, NormAfterRefit, amplitude_of_size
 from probewise.world.challenge.strata import Stratum, stratum_of
@@ -75,7 +75,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     Raises
     ------
     NotConvergedError
-        If no effect drawn can have the requested size, in any of the plans tried.
+        If no draw fits the stratum (the size; the cosine of a pair or an alias), in any of the plans tried.
     """
     stratum, n_earlier = stratum_of(number)
     drawing, plan_seed, noise, test, test_noise = np.random.SeedSequence(seed, spawn_key=(number,)).spawn(5)
@@ -84,12 +84,12 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
     level, model = str(rng.choice(list(NOISE_LEVELS))), str(rng.choice(OTHER_NOISE)) if stratum.other_noise else "white"
     sensor = draw_sensor(ssf, level, rng=rng)
     plan_names = ["paper"] if stratum.kind == "alias" else [str(name) for name in rng.permutation(list(PLANS))]
-    plan_name, setup, chosen = _draw_until_of_size(
+    plan_name, setup, chosen = _draw_plan_and_effects(
         stratum, n_earlier, plan_names, sensor, norm_after_refit, rng=rng, plan_rng=np.random.default_rng(plan_seed)
     )
     if any(isinstance(hidden.effect, Disturbs) for hidden in chosen.hidden):
         model = "white"  # only one noise fault at a time
-    plan = replace(setup.plan, instrumentation=_instrumentation_of(setup.plan, model))
+    plan = replace(setup.plan, instrumentation=_simulated_instrumentation(setup.plan, model))
     concealing = replace(sensor, concealed=tuple(hidden.effect for hidden in chosen.hidden))
     world = with_noise(concealing, model, duration_s=setup.duration_s)
     truth = Truth(
@@ -112,7 +112,7 @@ def draw_case(seed: int, number: int, *, norm_after_refit: NormAfterRefit) -> Ca
 
 
 def held_out_recordings(case: Case) -> dict[str, Recording]:
-    """Simulate the held-out readings, in the same world after the recording.
+    """Simulate the held-out recordings, by name of their plan, in the same world after the recording.
 
     Effects tied to a named scan are not in them; effects in time continue.
     """
@@ -129,7 +129,7 @@ class _ConcealedEffects:
     alias: Alias | None = None
 
 
-def _draw_until_of_size(
+def _draw_plan_and_effects(
     stratum: Stratum,
     n_earlier: int,
     plan_names: list[str],
@@ -139,7 +139,7 @@ def _draw_until_of_size(
     rng: np.random.Generator,
     plan_rng: np.random.Generator,
 ) -> tuple[str, CleanSetup, _ConcealedEffects]:
-    """Draw plans, and the stratum's effects a few times in each, until all have the requested size.
+    """Draw plans, and the stratum's effects a few times in each, until all fit the stratum.
 
     Return the plan's name, the plan with its world, and the effects.
     """
@@ -162,36 +162,37 @@ def _draw_effects(
 ) -> _ConcealedEffects:
     """Draw the effects of a stratum once.
 
-    Raises NotConvergedError if they cannot have the size, a pair is too similar, or an alias is none.
+    Raises NotConvergedError if they cannot have the size, a pair is too similar, or an alias is not aliased.
     """
 
-    def of_size(name: str) -> HiddenEffect:
-        return _effect_of_size(name, stratum.size, setup, sizer, rng)
+    def draw_effect(name: str) -> HiddenEffect:
+        return _draw_effect_of_size(name, stratum.size, setup, sizer, rng)
 
     match stratum.kind:
         case "single":
-            return _ConcealedEffects((of_size(SINGLES[n_earlier % len(SINGLES)]),))
+            return _ConcealedEffects((draw_effect(SINGLES[n_earlier % len(SINGLES)]),))
         case "outside":
-            return _ConcealedEffects((of_size(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),))
+            return _ConcealedEffects((draw_effect(list(OUTSIDE)[n_earlier % len(OUTSIDE)]),))
         case "pair":
-            first, second = (of_size(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
+            first, second = (draw_effect(PAIRABLE[k]) for k in sorted(rng.choice(len(PAIRABLE), 2, replace=False)))
             cosine = sizer.cosine(first.effect, second.effect)
             if abs(cosine) >= _MOST_COSINE:
                 raise NotConvergedError(f"{first.name} and {second.name} are too similar: cosine {cosine:.2f}")
             return _ConcealedEffects((first, second), cosine=cosine)
         case "alias":
-            hidden, other = (of_size(str(name)) for name in rng.permutation(ALIASES[n_earlier % len(ALIASES)]))
+            hidden, other = (draw_effect(str(name)) for name in rng.permutation(ALIASES[n_earlier % len(ALIASES)]))
             cosine = sizer.cosine(hidden.effect, other.effect)
             if stratum.size**2 * (1 - cosine**2) / 2 >= _ALIASED_NATS:
                 raise NotConvergedError(f"{hidden.name} and {other.name} are not aliased: cosine {cosine:.2f}")
             return _ConcealedEffects((hidden,), alias=Alias(other.effect, cosine))
         case _:
-            return _ConcealedEffects((of_size(stratum.kind),))
+            return _ConcealedEffects((draw_effect(stratum.kind),))
 
 
-def _effect_of_size(
+def _draw_effect_of_size(
     name: str, wanted: float, setup: CleanSetup, sizer: EffectSizer, rng: np.random.Generator
 ) -> HiddenEffect:
+    """Draw the effect `name` at the amplitude where it has the wanted size, or at a fixed one if it is not scalable."""
     sampler = INSIDE.get(name) or OUTSIDE[name]
     of_amplitude = sampler.draw(setup, rng)
     amplitude = sampler.first
@@ -200,9 +201,10 @@ def _effect_of_size(
             lambda a: sizer.size(of_amplitude(a)), wanted, first=sampler.first, limit=sampler.limit
         )
     effect = of_amplitude(amplitude)
-    return HiddenEffect(effect, sizer.size(effect), region_of(effect, sizer))
+    return HiddenEffect(effect, sizer.size(effect), region_of_effect(effect, sizer))
 
 
-def _instrumentation_of(plan: Plan, model: str) -> Instrumentation:
+def _simulated_instrumentation(plan: Plan, model: str) -> Instrumentation:
+    """Return a plan's instrumentation as that of simulated readings; "quantised" noise has a rounding step."""
     step = 1.0 if model == "quantised" else None
     return replace(plan.instrumentation, step=step, description="Simulated readings of a challenge")

@@ -37,12 +37,12 @@ class CleanSetup:
         return float(self.plan.time_s[-1] - self.plan.time_s[0])
 
     @property
-    def fastest_hz(self) -> float:
+    def nyquist_hz(self) -> float:
         """Half the median rate of the readings: the highest frequency that they determine."""
         return 0.5 / float(np.median(np.diff(self.plan.time_s)))
 
     @cached_property
-    def scans(self) -> tuple[str, ...]:
+    def edge_scan_names(self) -> tuple[str, ...]:
         """Names of the scans of 20 readings or more over a pattern with an edge."""
         return tuple(
             self.plan.scan_names[k]
@@ -68,7 +68,7 @@ class EffectSampler:
 
     Parameters
     ----------
-    shows_in
+    visible_covariates
         Covariates along which its residual is visible.
     draw
         Function that draws all parameters except the amplitude.
@@ -80,7 +80,7 @@ class EffectSampler:
         Whether its size can be chosen; otherwise the amplitude is `first`.
     """
 
-    shows_in: tuple[str, ...]
+    visible_covariates: tuple[str, ...]
     draw: Draw
     first: float
     limit: float
@@ -97,12 +97,12 @@ def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float
     return math.exp(rng.uniform(math.log(low), math.log(high)))
 
 
-def amplitude_only(make: OfAmplitude) -> Draw:
+def make_draw_of_amplitude(make: OfAmplitude) -> Draw:
     """Make the `Draw` of an effect whose amplitude is its only parameter: nothing is drawn."""
     return lambda setup, rng: make
 
 
-def sign_only(make: OfAmplitude) -> Draw:
+def make_draw_of_sign(make: OfAmplitude) -> Draw:
     """Make the `Draw` of an effect whose only drawn parameter is the sign of its amplitude."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:

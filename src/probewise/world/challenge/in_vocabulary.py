@@ -13,15 +13,15 @@ from probewise.world.challenge.effect_samplers import (
     Draw,
     EffectSampler,
     OfAmplitude,
-    amplitude_only,
     draw_log_uniform,
     draw_sign,
-    sign_only,
+    make_draw_of_amplitude,
+    make_draw_of_sign,
 )
 
 
-def _draw_of_gradient(make: Callable[[float, float], concealed.Concealed]) -> Draw:
-    """Make the `Draw` of a gradient: its direction, within 60 degrees of X, which every plan moves along."""
+def _make_draw_of_gradient(make: Callable[[float, float], concealed.Concealed]) -> Draw:
+    """Make the `Draw` of a gradient within 60 degrees of X, the direction in which every plan moves."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
         s, angle = draw_sign(rng), rng.uniform(-math.pi / 3, math.pi / 3)
@@ -41,12 +41,12 @@ def _draw_gain_drift(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude
 
 
 def _draw_flicker(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    alias_hz, phase = draw_log_uniform(rng, 0.01, setup.fastest_hz), rng.uniform(0, 2 * math.pi)
+    alias_hz, phase = draw_log_uniform(rng, 0.01, setup.nyquist_hz), rng.uniform(0, 2 * math.pi)
     return lambda a: concealed.Flicker(a, alias_hz, phase)
 
 
 def _draw_saturation(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    """Draw a ceiling below white by the amplitude, a share of the span; hard, or softened over one unit."""
+    """Draw a ceiling, hard or softened over one unit; the amplitude is its depth below white, a share of the span."""
     white, span = setup.world.white, setup.world.white - setup.world.black
     softness = float(rng.choice([0.0, 1.0]))
     return lambda a: concealed.Saturation(white - a * span, softness)
@@ -63,15 +63,15 @@ def _draw_periodic_position_error(setup: CleanSetup, rng: np.random.Generator) -
 
 
 def _draw_scan_misplacement(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    s, scan = draw_sign(rng), str(rng.choice(setup.scans))
+    s, scan = draw_sign(rng), str(rng.choice(setup.edge_scan_names))
     return lambda a: concealed.ScanMisplacement(s * a, scan)
 
 
-def _on_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
-    """Make the `Draw` of an effect on one scan, or on all scans at that scan's orientation, with its sign."""
+def _make_draw_on_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> Draw:
+    """Make the `Draw` of an effect of random sign on a random scan, or on all scans at that scan's orientation."""
 
     def draw(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-        s, scan = draw_sign(rng), str(rng.choice(setup.scans))
+        s, scan = draw_sign(rng), str(rng.choice(setup.edge_scan_names))
         scans = setup.scans_at_orientation_of(scan) if rng.random() < 0.5 else (scan,)
         return lambda a: make(s * a, scans)
 
@@ -79,7 +79,7 @@ def _on_scans(make: Callable[[float, tuple[str, ...]], concealed.Concealed]) -> 
 
 
 def _draw_patch_place(rng: np.random.Generator) -> tuple[float, float, float]:
-    """Draw the place x, y of a stain or glint, near the scans along X, and its sd."""
+    """Draw the place x, y of a stain or glint, near the scans along X, and its sd, in mm."""
     return rng.uniform(-40, 40), rng.uniform(-4, 4), draw_log_uniform(rng, 3.0, 10.0)
 
 
@@ -114,42 +114,48 @@ def _draw_outliers(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
 
 
 def _draw_dropouts(setup: CleanSetup, rng: np.random.Generator) -> OfAmplitude:
-    """Draw the value and the share of lost readings; one is obvious already, so that their size is not chosen."""
+    """Draw the value and the share of lost readings; their size is not chosen, since a single one is obvious."""
     value, factor = float(rng.choice([0.0, 100.0])), draw_log_uniform(rng, 0.5, 5.0)
     return lambda a: concealed.Dropouts(factor * a, value)
 
 
 INSIDE: Mapping[str, EffectSampler] = {
-    "ambient_gradient": EffectSampler(("place",), _draw_of_gradient(concealed.AmbientGradient), 0.01, 2.0),
+    "ambient_gradient": EffectSampler(("place",), _make_draw_of_gradient(concealed.AmbientGradient), 0.01, 2.0),
     "ambient_step": EffectSampler(("time",), _draw_ambient_step, 0.5, 30.0),
-    "offset_drift": EffectSampler(("time",), sign_only(concealed.OffsetDrift), 5.0, 500.0),
+    "offset_drift": EffectSampler(("time",), make_draw_of_sign(concealed.OffsetDrift), 5.0, 500.0),
     "gain_drift": EffectSampler(("time",), _draw_gain_drift, 0.03, 0.9),
-    "battery_sag": EffectSampler(("battery_mv",), sign_only(concealed.BatterySag), 0.5, 10.0),
+    "battery_sag": EffectSampler(("battery_mv",), make_draw_of_sign(concealed.BatterySag), 0.5, 10.0),
     "flicker": EffectSampler(("time",), _draw_flicker, 0.3, 20.0),
     "saturation": EffectSampler(("level",), _draw_saturation, 0.05, 0.9),
-    "nonlinearity": EffectSampler(("level",), sign_only(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5),
-    "quantisation": EffectSampler(("lattice",), amplitude_only(concealed.Quantisation), 1.0, 20.0),
-    "hysteresis": EffectSampler(("direction",), sign_only(concealed.Hysteresis), 0.3, 20.0),
-    "lag": EffectSampler(("slope", "direction"), amplitude_only(concealed.Lag), 0.5, 20.0),
-    "backlash": EffectSampler(("slope", "direction"), amplitude_only(concealed.Backlash), 0.5, 15.0),
+    "nonlinearity": EffectSampler(
+        ("level",), make_draw_of_sign(lambda a: concealed.Nonlinearity(math.exp(a))), 0.1, 1.5
+    ),
+    "quantisation": EffectSampler(("lattice",), make_draw_of_amplitude(concealed.Quantisation), 1.0, 20.0),
+    "hysteresis": EffectSampler(("direction",), make_draw_of_sign(concealed.Hysteresis), 0.3, 20.0),
+    "lag": EffectSampler(("slope", "direction"), make_draw_of_amplitude(concealed.Lag), 0.5, 20.0),
+    "backlash": EffectSampler(("slope", "direction"), make_draw_of_amplitude(concealed.Backlash), 0.5, 15.0),
     "position_scale": EffectSampler(("place",), _draw_position_scale, 0.02, 0.4),
     "periodic_position_error": EffectSampler(("place",), _draw_periodic_position_error, 0.3, 10.0),
-    "edge_misplacement": EffectSampler(("slope",), sign_only(concealed.EdgeMisplacement), 0.3, 8.0),
+    "edge_misplacement": EffectSampler(("slope",), make_draw_of_sign(concealed.EdgeMisplacement), 0.3, 8.0),
     "scan_misplacement": EffectSampler(("slope", "scan"), _draw_scan_misplacement, 0.3, 8.0),
-    "scan_angle_error": EffectSampler(("scan", "orientation"), _on_scans(concealed.ScanAngleError), 5.0, 45.0),
-    "orientation_error": EffectSampler(("orientation",), sign_only(concealed.OrientationError), 5.0, 45.0),
-    "sensor_tilt": EffectSampler(("orientation", "slope"), _draw_of_gradient(concealed.SensorTilt), 0.3, 8.0),
-    "height_gradient": EffectSampler(("place",), sign_only(concealed.HeightGradient), 0.01, 0.12),
-    "height_offset": EffectSampler(("scan",), _on_scans(concealed.HeightOffset), 0.3, 8.0),
-    "albedo_gradient": EffectSampler(("place",), _draw_of_gradient(concealed.AlbedoGradient), 5e-4, 0.012),
+    "scan_angle_error": EffectSampler(
+        ("scan", "orientation"), _make_draw_on_scans(concealed.ScanAngleError), 5.0, 45.0
+    ),
+    "orientation_error": EffectSampler(("orientation",), make_draw_of_sign(concealed.OrientationError), 5.0, 45.0),
+    "sensor_tilt": EffectSampler(("orientation", "slope"), _make_draw_of_gradient(concealed.SensorTilt), 0.3, 8.0),
+    "height_gradient": EffectSampler(("place",), make_draw_of_sign(concealed.HeightGradient), 0.01, 0.12),
+    "height_offset": EffectSampler(("scan",), _make_draw_on_scans(concealed.HeightOffset), 0.3, 8.0),
+    "albedo_gradient": EffectSampler(("place",), _make_draw_of_gradient(concealed.AlbedoGradient), 5e-4, 0.012),
     "albedo_patch": EffectSampler(("place",), _draw_albedo_patch, 0.05, 1.0),
-    "edge_blur": EffectSampler(("edge_distance",), amplitude_only(concealed.EdgeBlur), 1.0, 8.0),
+    "edge_blur": EffectSampler(("edge_distance",), make_draw_of_amplitude(concealed.EdgeBlur), 1.0, 8.0),
     "edge_shadow": EffectSampler(("edge_distance",), _draw_edge_shadow, 0.02, 0.6),
     "halo": EffectSampler(("edge_distance",), _draw_halo, 0.05, 0.6),
     "glint": EffectSampler(("place",), _draw_glint, 1.0, 40.0),
     "ssf_order": EffectSampler(("edge_distance",), _draw_ssf_order, 0.05, 0.5),
-    "signal_dependent_noise": EffectSampler(("level",), amplitude_only(concealed.SignalDependentNoise), 1.0, 100.0),
-    "correlated_noise": EffectSampler(("scan",), amplitude_only(concealed.CorrelatedNoise), 0.3, 0.95),
+    "signal_dependent_noise": EffectSampler(
+        ("level",), make_draw_of_amplitude(concealed.SignalDependentNoise), 1.0, 100.0
+    ),
+    "correlated_noise": EffectSampler(("scan",), make_draw_of_amplitude(concealed.CorrelatedNoise), 0.3, 0.95),
     "outliers": EffectSampler((), _draw_outliers, 5.0, 30.0),
     "dropouts": EffectSampler((), _draw_dropouts, 0.01, 0.01, scalable=False),
 }

@@ -19,8 +19,8 @@ _READING_S, _BREAK_S = 1.2, 30.0
 
 
 @dataclass(frozen=True)
-class _Scan:
-    """One scan over one pattern: places (n, 2) in mm."""
+class _HeldOutScan:
+    """One held-out scan over one pattern: places (n, 2) in mm."""
 
     name: str
     pattern: Pattern
@@ -29,14 +29,14 @@ class _Scan:
 
 
 def draw_plan(name: str, *, rng: np.random.Generator) -> Plan:
-    """Displace and turn a plan's patterns at random, as the plan then says, and give its readings an arm's times."""
+    """Return a plan by name, its patterns displaced at random (and described so), its readings at an arm's times."""
     plan = PLANS[name]()
-    patterns = {key: _displaced(pattern, rng) for key, pattern in plan.patterns.items()}
+    patterns = {key: _randomly_displaced_pattern(pattern, rng) for key, pattern in plan.patterns.items()}
     return jittered(replace(plan, patterns=patterns), rng=rng)
 
 
 def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
-    """Make three held-out plans that differ from `plan`: "angle", "pattern" and "direction", each read after it.
+    """Make the held-out plans "angle", "pattern" and "direction", which differ from `plan` and are read after it.
 
     "angle": a scan across a boundary with the sensor at an unused angle. "pattern": a scan beside the middle of a disc,
     or of a triangle if the plan has a disc already. "direction": a boundary crossed from +x to -x where the plan goes
@@ -44,7 +44,7 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     """
     one_way = not (plan.direction[:, 0] < 0).any()
     line = np.stack([np.linspace(-50, 50, 101), np.zeros(101)], axis=-1)
-    boundary = _displaced(HalfPlane(0.0, 0.0), rng)
+    boundary = _randomly_displaced_pattern(HalfPlane(0.0, 0.0), rng)
     angle = math.radians(rng.choice([0, 90, 180, 270]) + rng.uniform(25, 65))
     beside = [0.0, float(rng.uniform(4, 9))]
     if any(isinstance(pattern, Disc) for pattern in plan.patterns.values()):
@@ -53,29 +53,29 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
         )
         pattern: Pattern = Polygon(corners)
     else:
-        pattern = _displaced(Disc((0.0, 0.0), 30.0), rng)
+        pattern = _randomly_displaced_pattern(Disc((0.0, 0.0), 30.0), rng)
     slant = math.radians(rng.uniform(30, 60))
     other = (
-        _Scan("test_direction", boundary, line[::-1], 0.0)
+        _HeldOutScan("test_direction", boundary, line[::-1], 0.0)
         if one_way
-        else _Scan(
+        else _HeldOutScan(
             "test_direction", HalfPlane(slant, 0.0), line[:, :1] * [math.cos(slant), math.sin(slant)], math.pi / 2
         )
     )
     scans = {
-        "angle": _Scan("test_angle", boundary, line, angle),
-        "pattern": _Scan("test_pattern", pattern, line + beside, 0.0),
+        "angle": _HeldOutScan("test_angle", boundary, line, angle),
+        "pattern": _HeldOutScan("test_pattern", pattern, line + beside, 0.0),
         "direction": other,
     }
     start_s, plans = float(plan.time_s[-1]), {}
     for name, scan in scans.items():
-        plans[name] = _scan_after(plan, scan, start_s + _BREAK_S)
+        plans[name] = _single_scan_plan(plan, scan, start_s + _BREAK_S)
         start_s = float(plans[name].time_s[-1])
     return plans
 
 
-def _displaced(pattern: Pattern, rng: np.random.Generator) -> Pattern:
-    """Move a pattern by up to half a millimetre each way and turn a boundary by up to two degrees."""
+def _randomly_displaced_pattern(pattern: Pattern, rng: np.random.Generator) -> Pattern:
+    """Move a boundary, quadrant or disc by up to 0.5 mm; turn a boundary by up to 2 degrees, resize a disc."""
     dx, dy, turn = rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5), math.radians(rng.uniform(-2, 2))
     match pattern:
         case HalfPlane():
@@ -89,7 +89,8 @@ def _displaced(pattern: Pattern, rng: np.random.Generator) -> Pattern:
             return pattern
 
 
-def _scan_after(plan: Plan, scan: _Scan, start_s: float) -> Plan:
+def _single_scan_plan(plan: Plan, scan: _HeldOutScan, start_s: float) -> Plan:
+    """Return a plan of one scan that begins at `start_s`; covariates continue the line fitted to those of `plan`."""
     n_points = len(scan.places_mm)
     time_s = start_s + _READING_S * np.arange(n_points)
     # The battery keeps draining at the same rate.

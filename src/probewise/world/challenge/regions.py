@@ -33,7 +33,7 @@ class Region:
     scans: tuple[str, ...] = ()
 
 
-def region_of(effect: Concealed, sizer: EffectSizer) -> Region | None:
+def region_of_effect(effect: Concealed, sizer: EffectSizer) -> Region | None:
     """Return the region of a local effect, or None for a global one.
 
     Of an effect on named scans: these scans. Of a step in time: the rest of the recording. Of a saturation: the levels

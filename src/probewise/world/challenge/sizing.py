@@ -112,26 +112,26 @@ class EffectSizer:
     norm_after_refit: NormAfterRefit
 
     @cached_property
-    def _view(self) -> View:
+    def _clean_view(self) -> View:
         return self.setup.world.view(self.setup.plan)
 
     @cached_property
     def clean(self) -> Recording:
         """Recording of noise-free readings without any effect."""
-        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._view).without_declared_range()
+        return self.setup.world.simulate(self.setup.plan, rng=None, view=self._clean_view).without_declared_range()
 
     def recording(self, *concealed: Concealed) -> Recording:
         """Return a recording of the noise-free readings with these effects."""
         same_view = all(effect.stage in AFTER_VIEW for effect in concealed)
         world = replace(self.setup.world, concealed=concealed)
         return world.simulate(
-            self.setup.plan, rng=None, view=self._view if same_view else None
+            self.setup.plan, rng=None, view=self._clean_view if same_view else None
         ).without_declared_range()
 
     def size(self, *concealed: Concealed) -> float:
         """Return lambda of the effects together, in sds of the noise's Gaussian core."""
         if len(concealed) == 1 and isinstance(concealed[0], Disturbs):
-            return noise_effect_size(concealed[0], self._view, self.clean.readings, self.setup.world.noise_sd)
+            return noise_effect_size(concealed[0], self._clean_view, self.clean.readings, self.setup.world.noise_sd)
         return self.norm_after_refit(self.clean, self.recording(*concealed)) / self.setup.world.noise_sd
 
     def cosine(self, one: Concealed, other: Concealed) -> float:
@@ -144,7 +144,8 @@ def noise_effect_size(effect: Disturbs, view: View, readings: FloatArray, noise_
     """Return the size of an effect on the noise: the lambda of an equally detectable effect on the mean.
 
     lambda^2 / 2 is the expected gain in log likelihood of the truth over white Gaussian noise of the best constant
-    variance (Kullback-Leibler divergence summed over readings).
+    variance (Kullback-Leibler divergence summed over readings). Lost readings count as an effect on the mean: lambda is
+    the norm of their expected deviations in noise sds.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ class BentRail:
     amp_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        return _along_x(values, self.amp_mm * (values[:, 0] / 10) ** 2)
+        return _with_x_error(values, self.amp_mm * (values[:, 0] / 10) ** 2)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class TwistedRail:
     amp_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        return _along_x(values, self.amp_mm * (values[:, 0] / 10) ** 3)
+        return _with_x_error(values, self.amp_mm * (values[:, 0] / 10) ** 3)
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class PlaceStep:
     at_mm: float
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
-        return _along_x(values, np.where(values[:, 0] > self.at_mm, self.amp_mm, 0.0))
+        return _with_x_error(values, np.where(values[:, 0] > self.at_mm, self.amp_mm, 0.0))
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class StickSlip:
 
     def change(self, values: FloatArray, rows: Rows) -> FloatArray:
         turns = values[:, 0] / self.period_mm + self.phase
-        return _along_x(values, self.amp_mm * (2 * (turns - np.floor(turns)) - 1))
+        return _with_x_error(values, self.amp_mm * (2 * (turns - np.floor(turns)) - 1))
 
 
 @dataclass(frozen=True)
@@ -199,5 +199,5 @@ class Chirp:
         return values + self.amp * np.sin(2 * math.pi * turns + self.phase)
 
 
-def _along_x(place_mm: FloatArray, error_mm: FloatArray) -> FloatArray:
+def _with_x_error(place_mm: FloatArray, error_mm: FloatArray) -> FloatArray:
     return place_mm + np.stack([error_mm, np.zeros_like(error_mm)], axis=-1)

@@ -17,18 +17,18 @@ from probewise.world.challenge.sizing import amplitude_of_size
 from probewise.world.challenge.strata import Stratum
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.designs import design_runs
-from probewise.world.systems.fit import AddedForm, LeastSquaresFit, Model, numbers_of_setting, project_out
-from probewise.world.systems.forms.form import Form, Placed
+from probewise.world.systems.fit import AddedForm, LeastSquaresFit, Model, project_out
+from probewise.world.systems.forms.form import Form, FormWithParameters, parameter_arrays
 from probewise.world.systems.forms.out_of_vocabulary import OUT_OF_VOCABULARY, forms_out_of_vocabulary
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.formulas import FORMULAS
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
 from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
-from probewise.world.systems.rivals import rivals_of, short_name
+from probewise.world.systems.rivals import rivals_with_nats, vocabulary_name
 from probewise.world.systems.rows import SystemRows
 from probewise.world.systems.strata import system_stratum_of
-from probewise.world.systems.visible_covariates import covariates_of
+from probewise.world.systems.visible_covariates import visible_covariates_of
 from probewise.world.systems.vocabulary import FAMILIES, forms_of
 
 KINDS: tuple[SystemKind, ...] = (*FORMULAS, *LAWS)
@@ -75,18 +75,18 @@ class DrawnSystem:
     @cached_property
     def true_coordinates(self) -> FloatArray:
         """Coordinates of the true parameters."""
-        return self.nominal_model.coordinates(self.shared, self.by_run)
+        return self.nominal_model.coordinates_of(self.shared, self.by_run)
 
     @cached_property
-    def without_effects(self) -> LeastSquaresFit:
+    def fit_without_effects(self) -> LeastSquaresFit:
         """The noise-free readings without any effect, as a fit of the nominal model, with its slopes."""
-        readings, slopes = self.nominal_model.with_slopes(self.true_coordinates)
+        readings, slopes = self.nominal_model.predict_with_slopes(self.true_coordinates)
         return LeastSquaresFit(self.true_coordinates, readings, slopes, 0.0)
 
     @cached_property
     def true_system(self) -> TrueSystem:
         """The system at its true parameters, about which effects are built."""
-        parameters = self.nominal_model.parameters(self.true_coordinates[None, :])
+        parameters = self.nominal_model.parameters_at(self.true_coordinates[None, :])
         trace = simulate(self.kind, self.diagnosed_rows, parameters)
         return TrueSystem(
             self.kind,
@@ -96,42 +96,47 @@ class DrawnSystem:
             {name: v[0] for name, v in trace.states.items()},
         )
 
-    def readings_at_all_rows(self, effects: Sequence[Placed]) -> FloatArray:
+    def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
         """Return noise-free readings with these effects at all rows, (n_points,)."""
         whole = Model(self.kind, self.rows)
         with np.errstate(all="ignore"):
-            at = whole.coordinates(self.shared, self.by_run)
-            trace = simulate(self.kind, self.rows, whole.parameters(at[None, :]), effects)
+            at = whole.coordinates_of(self.shared, self.by_run)
+            trace = simulate(self.kind, self.rows, whole.parameters_at(at[None, :]), effects)
         return np.asarray(trace.readings[0])
 
-    def diagnosed_readings(self, effects: Sequence[Placed]) -> FloatArray:
+    def simulate_diagnosed_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
         """Return noise-free readings with these effects at the rows given to the diagnosis, (n_points,).
 
         Raises NotConvergedError if they are not finite.
         """
         with np.errstate(all="ignore"):
             readings: FloatArray = simulate(
-                self.kind, self.diagnosed_rows, self.nominal_model.parameters(self.true_coordinates[None, :]), effects
+                self.kind,
+                self.diagnosed_rows,
+                self.nominal_model.parameters_at(self.true_coordinates[None, :]),
+                effects,
             ).readings[0]
         if not np.isfinite(readings).all():
             raise NotConvergedError(f"the {self.kind.name} runs away")
         return readings
 
-    def size(self, effects: Sequence[Placed]) -> float:
+    def size(self, effects: Sequence[FormWithParameters]) -> float:
         """Return lambda: the norm of the effects' change after a full refit of the nominal model, in noise sds."""
-        return math.sqrt(self.nominal_model.fit(self.diagnosed_readings(effects), self.true_coordinates).chi_square)
+        return math.sqrt(
+            self.nominal_model.fit(self.simulate_diagnosed_rows(effects), self.true_coordinates).chi_square
+        )
 
     # Old names.
-    everywhere, changed = readings_at_all_rows, diagnosed_readings
+    everywhere, changed = simulate_all_rows, simulate_diagnosed_rows
     kept, seen, at, bare = (
         property(attrgetter(name))
-        for name in ("diagnosed_row_numbers", "diagnosed_rows", "true_coordinates", "without_effects")
+        for name in ("diagnosed_row_numbers", "diagnosed_rows", "true_coordinates", "fit_without_effects")
     )
 
 
 @dataclass(frozen=True, eq=False)
 class SystemEffect:
-    """An effect with its parameters, its size, and its aliases by name, with the nats that they lose."""
+    """A concealed effect: form, parameter values, size, aliases by name with their loss in nats, visible covariates."""
 
     form: Form
     values: Mapping[str, float]
@@ -142,7 +147,7 @@ class SystemEffect:
     @property
     def name(self) -> str:
         """Its name, in the vocabulary or outside."""
-        return short_name(self.form)
+        return vocabulary_name(self.form)
 
     @property
     def in_vocabulary(self) -> bool:
@@ -150,9 +155,11 @@ class SystemEffect:
         return not self.form.shape
 
     @property
-    def placed(self) -> Placed:
+    def form_with_parameters(self) -> FormWithParameters:
         """The form with its parameters."""
-        return self.form, numbers_of_setting(self.values)
+        return self.form, parameter_arrays([self.values])
+
+    placed = form_with_parameters  # its old name
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -225,8 +232,8 @@ def draw_system_case(seed: int, number: int) -> SystemCase:
         drawn = draw_system(KINDS[int(drawing.integers(len(KINDS)))], rng=drawing)
         try:
             effects, cosine = _draw_effects(stratum, n_earlier, family, drawn, drawing)
-            everywhere = drawn.readings_at_all_rows([effect.placed for effect in effects])
-            if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.without_effects.readings).max():
+            everywhere = drawn.simulate_all_rows([effect.form_with_parameters for effect in effects])
+            if not np.abs(everywhere).max() < _RUN_AWAY * np.abs(drawn.fit_without_effects.readings).max():
                 raise NotConvergedError("the held-out runs diverge")
         except NotConvergedError as error:
             failure = error
@@ -285,7 +292,7 @@ def _recorded_case(
 def _draw_effects(
     stratum: Stratum, n_earlier: int, family: str, drawn: DrawnSystem, rng: np.random.Generator
 ) -> tuple[tuple[SystemEffect, ...], float | None]:
-    """Draw the effects of a stratum once."""
+    """Draw the effects of a stratum once; return them and the cosine of a pair (None: no pair)."""
     if stratum.kind == "clean":
         return (), None
     forms = forms_of(drawn.true_system)
@@ -296,44 +303,50 @@ def _draw_effects(
             for f in forms_out_of_vocabulary(drawn.true_system, rng)
             if f.name.removeprefix("strange_").split(":")[0] == wanted
         ]
-        one = _of_size(_random_form_named(own, wanted, rng), stratum.size, drawn, rng)
-        return (_with_rivals(one, forms, drawn, ()),), None
+        one = _draw_effect_of_size(_draw_form(own, wanted, rng), stratum.size, drawn, rng)
+        return (_effect_with_rivals(one, forms, drawn, ()),), None
     if stratum.kind == "single":
-        own = [f for f in forms if short_name(f).split(":")[0] == family]
-        one = _of_size(_random_form_named(own, family, rng), stratum.size, drawn, rng)
-        return (_with_rivals(one, forms, drawn, ()),), None
+        own = [f for f in forms if vocabulary_name(f).split(":")[0] == family]
+        one = _draw_effect_of_size(_draw_form(own, family, rng), stratum.size, drawn, rng)
+        return (_effect_with_rivals(one, forms, drawn, ()),), None
     names = rng.choice(FAMILIES, 2, replace=False)
     both = [
-        _random_form_named([f for f in forms if short_name(f).split(":")[0] == name], str(name), rng) for name in names
+        _draw_form([f for f in forms if vocabulary_name(f).split(":")[0] == name], str(name), rng) for name in names
     ]
-    first, second = (_of_size(form, stratum.size, drawn, rng) for form in both)
+    first, second = (_draw_effect_of_size(form, stratum.size, drawn, rng) for form in both)
     cosine = _cosine(drawn, first, second)
     if abs(cosine) >= _APART:
         raise NotConvergedError(f"{first.name} and {second.name} are alike: cosine {cosine:.2f}")
-    return (_with_rivals(first, forms, drawn, (second,)), _with_rivals(second, forms, drawn, (first,))), cosine
+    return (
+        _effect_with_rivals(first, forms, drawn, (second,)),
+        _effect_with_rivals(second, forms, drawn, (first,)),
+    ), cosine
 
 
-def _random_form_named(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
+def _draw_form(forms: Sequence[Form], name: str, rng: np.random.Generator) -> Form:
+    """Draw one of these forms; raise NotConvergedError, with their common name, if there is none."""
     if not forms:
         raise NotConvergedError(f"this system has no target for {name}")
     return forms[int(rng.integers(len(forms)))]
 
 
-def _of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.random.Generator) -> SystemEffect:
-    """Choose the amplitude at which a form has the requested size."""
+def _draw_effect_of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.random.Generator) -> SystemEffect:
+    """Draw an effect of this form with the requested size; its aliases are not filled in yet."""
     more = form.draw(rng)
     sign = -1.0 if form.signed and rng.random() < 0.5 else 1.0
 
-    def placed(amplitude: float) -> list[Placed]:
-        return [(form, numbers_of_setting(form.of_amplitude(sign * amplitude, more)))]
+    def at_amplitude(amplitude: float) -> list[FormWithParameters]:
+        return [(form, parameter_arrays([form.of_amplitude(sign * amplitude, more)]))]
 
-    change = (drawn.diagnosed_readings(placed(form.first)) - drawn.without_effects.readings) / drawn.kind.sd
-    seen = float(np.linalg.norm(project_out(change, drawn.without_effects.slopes)))
+    change = (
+        drawn.simulate_diagnosed_rows(at_amplitude(form.first)) - drawn.fit_without_effects.readings
+    ) / drawn.kind.sd
+    seen = float(np.linalg.norm(project_out(change, drawn.fit_without_effects.slopes)))
     if not seen > 1e-6:
         raise NotConvergedError(f"{form.name} does not show in the {drawn.kind.name}")
     first = min(form.first * min(max(wanted / seen, 1e-4), 1e4), form.limit)
     amplitude = amplitude_of_size(
-        lambda a: drawn.size(placed(a)),
+        lambda a: drawn.size(at_amplitude(a)),
         wanted,
         first=first,
         limit=form.limit,
@@ -341,39 +354,42 @@ def _of_size(form: Form, wanted: float, drawn: DrawnSystem, rng: np.random.Gener
         acceptable=0.01,
         max_calls=14,
     )
-    return SystemEffect(form, form.of_amplitude(sign * amplitude, more), drawn.size(placed(amplitude)), {}, ())
+    return SystemEffect(form, form.of_amplitude(sign * amplitude, more), drawn.size(at_amplitude(amplitude)), {}, ())
 
 
-def _with_true_time(form: Form, values: Mapping[str, float]) -> Form:
-    """Set a step form's time to the effect's, since other times between the same rows are equivalent."""
+def _with_true_time_in_bank(form: Form, values: Mapping[str, float]) -> Form:
+    """Add the effect's own time of a step to the bank of a form with a step; return other forms unchanged."""
     at = next((name for name in ("at_s", "at_row") if name in values and name in form.bank[0][0]), None)
     return form if at is None else replace(form, bank=[*form.bank, [{**form.bank[0][0], at: values[at]}]])
 
 
 def _cosine(drawn: DrawnSystem, one: SystemEffect, other: SystemEffect) -> float:
     a, b = (
-        project_out(drawn.diagnosed_readings([e.placed]) - drawn.without_effects.readings, drawn.without_effects.slopes)
+        project_out(
+            drawn.simulate_diagnosed_rows([e.form_with_parameters]) - drawn.fit_without_effects.readings,
+            drawn.fit_without_effects.slopes,
+        )
         for e in (one, other)
     )
     return float(a @ b / np.sqrt((a @ a) * (b @ b)))
 
 
-def _with_rivals(
+def _effect_with_rivals(
     effect: SystemEffect, forms: Sequence[Form], drawn: DrawnSystem, others: Sequence[SystemEffect]
 ) -> SystemEffect:
-    """Find the aliases of an effect, given the other effects."""
-    target = drawn.diagnosed_readings([e.placed for e in (effect, *others)])
+    """Return an effect with its aliases and visible covariates, found in the presence of the other effects."""
+    target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
     beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
     model = Model(drawn.kind, drawn.diagnosed_rows, beside)
-    start = model.coordinates(drawn.shared, drawn.by_run)
+    start = model.coordinates_of(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
-    rivals = rivals_of(
+    rivals = rivals_with_nats(
         drawn.true_system,
-        [_with_true_time(form, effect.values) for form in forms],
+        [_with_true_time_in_bank(form, effect.values) for form in forms],
         target,
         fitted,
         model,
         frozenset({effect.name, *(e.name for e in others)}),
     )
     left = (target - fitted.readings) / drawn.kind.sd
-    return replace(effect, rivals=rivals, covariates=covariates_of(effect.form, left, drawn.true_system))
+    return replace(effect, rivals=rivals, covariates=visible_covariates_of(effect.form, left, drawn.true_system))

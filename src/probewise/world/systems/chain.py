@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.forms.form import Instants, Placed
+from probewise.world.systems.forms.form import FormWithParameters, Instants
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.motion import solve_law
 from probewise.world.systems.rows import SystemRows
@@ -23,7 +23,7 @@ class NoiseFreeResult:
 
 
 def simulate(
-    kind: SystemKind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[Placed] = ()
+    kind: SystemKind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[FormWithParameters] = ()
 ) -> NoiseFreeResult:
     """Simulate a system without noise: its readings and states.
 
@@ -60,10 +60,10 @@ def simulate(
             p[form.target] = p[form.target] + form.act(now, numbers)
         readings = np.asarray(kind.formula(p, columns))
     readings = np.array(np.broadcast_to(readings, (n_samples, len(rows))))
-    return NoiseFreeResult(with_reading_effects(readings, rows, placed), states)
+    return NoiseFreeResult(apply_reading_effects(readings, rows, placed), states)
 
 
-def with_reading_effects(readings: FloatArray, rows: SystemRows, effects: Sequence[Placed]) -> FloatArray:
+def apply_reading_effects(readings: FloatArray, rows: SystemRows, effects: Sequence[FormWithParameters]) -> FloatArray:
     """Apply the effects on the readings, in order."""
     for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
         readings = form.act(readings, rows, numbers)

@@ -12,7 +12,7 @@ _PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
 
 def irregular_times(rng: np.random.Generator, n: int, gap: float) -> FloatArray:
-    """Draw times from 0 whose gaps lie between 0.6 and 1.4 of `median_gap`, (n,)."""
+    """Draw times from 0 whose gaps lie between 0.6 and 1.4 of `gap`, (n,)."""
     return np.concatenate([[0.0], np.cumsum(gap * rng.uniform(0.6, 1.4, n - 1))])
 
 

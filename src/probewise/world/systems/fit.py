@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.chain import simulate
-from probewise.world.systems.forms.form import Form, Numbers, Placed
+from probewise.world.systems.forms.form import Form, FormWithParameters
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
@@ -22,13 +22,13 @@ _FAR = 1e9  # residual in sds where a law diverges
 
 
 def fitted_parameters(form: Form) -> tuple[str, ...]:
-    """Return the parameters to fit: not the time of a step, nor values of absent runs."""
+    """Return the names of a form's fitted parameters: not the time of a step, nor values of runs without rows."""
     return tuple(name for name, step in form.steps.items() if step > 0)
 
 
 @dataclass(frozen=True, eq=False)
 class AddedForm:
-    """A form in a model: starting values, and names of the fitted parameters."""
+    """A form in a model, with starting values of its parameters and the names of the fitted ones."""
 
     form: Form
     start: Mapping[str, float]
@@ -59,24 +59,24 @@ class Model:
 
     @cached_property
     def _runs(self) -> list[int]:
-        return [int(self.rows.run[own[0]]) for own in self.rows.by_run]
+        return [int(self.rows.run[own[0]]) for own in self.rows.rows_by_run]
 
     @property
     def n_nominal_coordinates(self) -> int:
         """Number of coordinates of the nominal model."""
-        return len(self.kind.shared) + len(self.kind.per_run) * len(self._runs)
+        return len(self.kind.shared_names) + len(self.kind.per_run) * len(self._runs)
 
-    def coordinates(self, shared: Mapping[str, float], by_run: Mapping[str, FloatArray]) -> FloatArray:
-        """Return coordinates of true parameters (n_runs of the case,), with forms at their starting values."""
-        own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared]
+    def coordinates_of(self, shared: Mapping[str, float], by_run: Mapping[str, FloatArray]) -> FloatArray:
+        """Return the coordinates of parameters (`by_run` for all runs of the case) and of the forms' start values."""
+        own = [self.kind.priors[name].coordinate(np.array(shared[name])) for name in self.kind.shared_names]
         each = [self.kind.priors[name].coordinate(by_run[name][self._runs]) for name in self.kind.per_run]
         numbers = [b.start[name] / (b.form.steps[name] * _FORM_STEP) for b in self.added for name in b.free]
         return np.concatenate([np.ravel(own), *each, numbers])
 
-    def parameters(self, x: FloatArray) -> dict[str, FloatArray]:
+    def parameters_at(self, x: FloatArray) -> dict[str, FloatArray]:
         """Return parameters at coordinates (n_samples, n_coordinates): (n_samples, 1), or (n_samples, n_points)."""
-        out, n = {}, len(self.kind.shared)
-        for k, name in enumerate(self.kind.shared):
+        out, n = {}, len(self.kind.shared_names)
+        for k, name in enumerate(self.kind.shared_names):
             out[name] = self.kind.priors[name].value(x[:, k : k + 1])
         at = np.searchsorted(self._runs, self.rows.run)
         for name in self.kind.per_run:
@@ -84,9 +84,9 @@ class Model:
             n += len(self._runs)
         return out
 
-    def effects(self, x: FloatArray) -> list[Placed]:
+    def effects_at(self, x: FloatArray) -> list[FormWithParameters]:
         """Return forms with their parameters at coordinates."""
-        out: list[Placed] = []
+        out: list[FormWithParameters] = []
         n = self.n_nominal_coordinates
         for b in self.added:
             numbers: dict[str, FloatArray] = {name: np.full((len(x), 1), value) for name, value in b.start.items()}
@@ -98,14 +98,14 @@ class Model:
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return noise-free readings at coordinates (n_samples, n_coordinates): (n_samples, n_points)."""
-        return simulate(self.kind, self.rows, self.parameters(x), self.effects(x)).readings
+        return simulate(self.kind, self.rows, self.parameters_at(x), self.effects_at(x)).readings
 
-    def with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def predict_with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (n_points,) and their slopes (n_points, n_coordinates).
 
         Parameters per run are varied in all runs at once.
         """
-        n_shared, n_runs = len(self.kind.shared), len(self._runs)
+        n_shared, n_runs = len(self.kind.shared_names), len(self._runs)
         moves = [np.eye(len(x))[k] for k in range(n_shared)]
         for j in range(len(self.kind.per_run)):
             moves.append(np.isin(np.arange(len(x)), n_shared + j * n_runs + np.arange(n_runs)).astype(float))
@@ -126,10 +126,10 @@ class Model:
                     out[here, column] = slope[here]
         return found[0], out
 
-    def _with_slopes_or_huge(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _predict_with_slopes_or_huge(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings with their slopes; if a law diverges, values so large that the fit steps back."""
         try:
-            readings, slopes = self.with_slopes(x)
+            readings, slopes = self.predict_with_slopes(x)
         except NotConvergedError:
             readings = np.full(len(self.rows), np.nan)
         if not np.isfinite(readings).all():
@@ -151,13 +151,13 @@ class Model:
             key = x.tobytes()
             if key not in last:
                 last.clear()
-                last[key] = self._with_slopes_or_huge(x)
+                last[key] = self._predict_with_slopes_or_huge(x)
             return last[key]
 
         def standardised_residuals(x: FloatArray) -> FloatArray:
             return np.asarray((readings_and_slopes(x)[0] - readings) / sd)
 
-        def slopes_of(x: FloatArray) -> FloatArray:
+        def standardised_slopes(x: FloatArray) -> FloatArray:
             return np.asarray(readings_and_slopes(x)[1] / sd)
 
         try:
@@ -165,7 +165,7 @@ class Model:
                 found = least_squares(
                     standardised_residuals,
                     start,
-                    jac=slopes_of,
+                    jac=standardised_slopes,
                     x_scale="jac",
                     xtol=1e-6,
                     ftol=1e-7,
@@ -184,8 +184,3 @@ def project_out(change: FloatArray, slopes: FloatArray) -> FloatArray:
     basis, values, _ = np.linalg.svd(slopes / np.where(scale > 0, scale, 1.0), full_matrices=False)
     basis = basis[:, values > 1e-8 * values.max(initial=1e-300)]
     return np.asarray(change - basis @ (basis.T @ change))
-
-
-def numbers_of_setting(values: Mapping[str, float]) -> Numbers:
-    """Convert one setting to parameter arrays."""
-    return {name: np.array([[value]]) for name, value in values.items()}

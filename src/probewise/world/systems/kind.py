@@ -52,17 +52,21 @@ class Prior:
     b: float
 
     @property
-    def width(self) -> float:
-        """Unit of its coordinate: the range or the sd, or 1 for a logarithm."""
+    def coordinate_unit(self) -> float:
+        """Unit of the coordinate: the range or the sd, or 1 where the coordinate is a logarithm."""
         return {"uniform": self.b - self.a, "normal": self.b}.get(self.shape, 1.0)
 
     def coordinate(self, value: FloatArray) -> FloatArray:
-        """Return the coordinate of a value."""
-        return np.log(value) if self.shape == "log" else np.asarray(value / self.width)
+        """Return the coordinate of a value: its logarithm, or the value in units of `coordinate_unit`."""
+        return np.log(value) if self.shape == "log" else np.asarray(value / self.coordinate_unit)
 
     def value(self, coordinate: FloatArray) -> FloatArray:
         """Return the value at a coordinate."""
-        return np.exp(np.clip(coordinate, -60.0, 60.0)) if self.shape == "log" else np.asarray(coordinate * self.width)
+        return (
+            np.exp(np.clip(coordinate, -60.0, 60.0))
+            if self.shape == "log"
+            else np.asarray(coordinate * self.coordinate_unit)
+        )
 
     def stratified_draws(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw n values, one from each of n parts of equal mass, in random order."""
@@ -115,7 +119,7 @@ class SystemKind:
     drives
         Columns that the law uses.
     sd
-        Sd of a reading.
+        Sd of a reading's noise.
     formula, law
         The nominal model, one of the two.
     time, time_unit, run
@@ -156,6 +160,6 @@ class SystemKind:
     defines_states: bool = True
 
     @property
-    def shared(self) -> tuple[str, ...]:
+    def shared_names(self) -> tuple[str, ...]:
         """Parameters that all runs share."""
         return tuple(name for name in self.priors if name not in self.per_run)

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
-from probewise.world.systems.forms.form import Form, Instants, Placed
+from probewise.world.systems.forms.form import Form, FormWithParameters, Instants
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.rows import SystemRows
 
@@ -34,7 +34,7 @@ def solve_law(
     rows: SystemRows,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, FloatArray],
-    effects: Sequence[Placed],
+    effects: Sequence[FormWithParameters],
 ) -> dict[str, FloatArray]:
     """Solve a law: every state at every row, (n_samples, n_points).
 
@@ -62,13 +62,13 @@ class _Integration:
     rows: SystemRows
     parameters: Mapping[str, FloatArray]
     columns: Mapping[str, FloatArray]
-    effects: Sequence[Placed]
+    effects: Sequence[FormWithParameters]
 
     @cached_property
-    def places(self) -> IntArray:
+    def row_by_position(self) -> IntArray:
         """Row at each position of each run, (n_places, n_runs); short runs repeat their last row."""
-        longest = max(len(own) for own in self.rows.by_run)
-        filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.rows.by_run]
+        longest = max(len(own) for own in self.rows.rows_by_run)
+        filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.rows.rows_by_run]
         return np.stack(filled, axis=1)
 
     @cached_property
@@ -78,8 +78,8 @@ class _Integration:
         return max(len(v) for v in arrays)
 
     @cached_property
-    def _rows_of_run(self) -> dict[int, IntArray]:
-        return {int(self.rows.run[own[0]]): own for own in self.rows.by_run}
+    def _rows_by_run_number(self) -> dict[int, IntArray]:
+        return {int(self.rows.run[own[0]]): own for own in self.rows.rows_by_run}
 
     @cached_property
     def delays(self) -> dict[str, FloatArray]:
@@ -101,16 +101,16 @@ class _Integration:
             at = (
                 self._at_first_rows(self.parameters[given]) if isinstance(given, str) else np.full((1, 1), float(given))
             )
-            out.append(np.broadcast_to(at, (self.n_samples, self.places.shape[1])))
+            out.append(np.broadcast_to(at, (self.n_samples, self.row_by_position.shape[1])))
         return np.array(out)
 
     def _at_first_rows(self, values: FloatArray) -> FloatArray:
-        return values if values.shape[1] == 1 else values[:, self.places[0]]
+        return values if values.shape[1] == 1 else values[:, self.row_by_position[0]]
 
-    def within_gap(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Instants]]:
+    def rate_inputs_in_gap(self, k: int, runs: Any = slice(None)) -> Callable[[float], tuple[dict[str, Any], Instants]]:
         """Return a function of the share of the gap from position k to the next, giving parameters and columns."""
-        here, there = self.places[k, runs], self.places[k + 1, runs]
-        first = self.places[0, runs]
+        here, there = self.row_by_position[k, runs], self.row_by_position[k + 1, runs]
+        first = self.row_by_position[0, runs]
         law, time = self.kind.law, self.rows.time
         assert law is not None
         assert time is not None
@@ -131,7 +131,7 @@ class _Integration:
             u[time] = t[:, here] + share * (t[:, there] - t[:, here])
             now_t = (printed[here] + share * (printed[there] - printed[here]))[None, :]
             for name, tau in self.delays.items():
-                u[name] = self._delayed(name, now_t - tau, run)
+                u[name] = self._delayed_column(name, now_t - tau, run)
             now = Instants(now_t, now_t - printed[first], u, run, np.zeros(1))
             p: dict[str, Any] = dict(base)
             for form, numbers in varying:
@@ -140,13 +140,13 @@ class _Integration:
 
         return at
 
-    def _delayed(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
+    def _delayed_column(self, name: str, t: FloatArray, run: IntArray) -> FloatArray:
         """Interpolate a column at earlier times, (n_samples, n_runs): held or linear; constant before the start."""
         law = self.kind.law
         assert law is not None
         out = np.empty(t.shape)
         for j, number in enumerate(run):
-            own = self._rows_of_run[int(number)]
+            own = self._rows_by_run_number[int(number)]
             times, values = self.rows.t[own], self.columns[name][0, own]
             if law.linear:
                 out[:, j] = np.interp(t[:, j], times, values)
@@ -155,6 +155,7 @@ class _Integration:
         return out
 
     def rates(self, s: dict[str, Any], p: Mapping[str, Any], now: Instants) -> dict[str, Any]:
+        """Return the rate of each state with the effects on rates, except dry friction and bounds."""
         law = self.kind.law
         assert law is not None
         out = law.rates(s, p, now.u)
@@ -165,7 +166,7 @@ class _Integration:
 
     def discontinuity_shares(self, k: int) -> list[float]:
         """Return the shares of the gap from position k to the next with discontinuities, with 0 and 1."""
-        here, there = self.places[k], self.places[k + 1]
+        here, there = self.row_by_position[k], self.row_by_position[k + 1]
         begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
         moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
         if self.delays:
@@ -182,23 +183,27 @@ class _Integration:
         """Return every state at every row, (n_samples, n_points)."""
         law = self.kind.law
         assert law is not None
-        names, places = list(law.start), self.places
+        names, n_positions = list(law.start), len(self.row_by_position)
         s = self.clipped_to_bounds(self.initial_states().copy(), names)
-        kept = np.empty((*s.shape, len(places)))
+        kept = np.empty((*s.shape, n_positions))
         kept[..., 0] = s
-        for k in range(len(places) - 1):
-            s = self._through_gap(s, k, names)
+        for k in range(n_positions - 1):
+            s = self._integrate_gap(s, k, names)
             kept[..., k + 1] = s
-        return self._at_rows(names, kept)
+        return self._states_at_rows(names, kept)
 
-    def _through_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
+    def _integrate_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
         """Integrate from position k of all runs to the next, (n_states, n_samples, n_runs), with the initial modes."""
         time = self.rows.time
         assert time is not None
         t = self.columns[time]
-        gap, at, hard = t[:, self.places[k + 1]] - t[:, self.places[k]], self.within_gap(k), self.frictions_and_bounds
+        gap, at, hard = (
+            t[:, self.row_by_position[k + 1]] - t[:, self.row_by_position[k]],
+            self.rate_inputs_in_gap(k),
+            self.frictions_and_bounds,
+        )
 
-        def free(share: float, y: FloatArray) -> dict[str, Any]:
+        def free_rates(share: float, y: FloatArray) -> dict[str, Any]:
             p, now = at(share)
             return self.rates(dict(zip(names, y, strict=True)), p, now)
 
@@ -208,7 +213,7 @@ class _Integration:
             # Slightly inside: a discontinuity at an end belongs to the other side.
             hair = 1e-8 if len(edges) > 2 else 0.0
             begin, end = low + hair, high - hair
-            at_begin = free(begin, s) if hard else {}
+            at_begin = free_rates(begin, s) if hard else {}
             modes = [_mode_of_motion(f, size, s[names.index(f.target)], at_begin[f.target]) for f, size in hard]
 
             n_calls = 0
@@ -220,7 +225,7 @@ class _Integration:
                     raise NotConvergedError(
                         f"the law of the {self.kind.name} runs away, or is too stiff, between two rows"
                     )
-                found = free(share, flat.reshape(shape))
+                found = free_rates(share, flat.reshape(shape))
                 for (form, size), mode in zip(hard, modes, strict=True):
                     found[form.target] = np.where(
                         mode == 0, 0.0, found[form.target] - (size * mode if form.sticks else 0.0)
@@ -241,39 +246,39 @@ class _Integration:
                 raise NotConvergedError(f"the law of the {self.kind.name} cannot be solved: {solved.message}")
             for x, y in zip(solved.t, solved.y.T, strict=True) if hard else ():
                 own = y.reshape(s.shape)
-                rates = free(x, own)
+                rates = free_rates(x, own)
                 for (form, size), mode in zip(hard, modes, strict=True):
-                    again |= _has_mode_ended(form, size, mode, own[names.index(form.target)], rates[form.target])
+                    again |= _mode_ended_mask(form, size, mode, own[names.index(form.target)], rates[form.target])
             s = solved.y[:, -1].reshape(s.shape)
         for i, j in np.argwhere(again):
-            s[:, i, j] = self._integration_of_sample(int(i)).through_gap_with_events(begun[:, i, j], k, int(j), names)
+            s[:, i, j] = self._integration_of_sample(int(i)).integrate_gap_with_events(begun[:, i, j], k, int(j), names)
         return s
 
     @property
     def frictions_and_bounds(self) -> list[tuple[Any, FloatArray]]:
-        """Dry friction and bounds with their sizes (n_samples, 1)."""
+        """The forms of dry friction and of bounds, each with its sizes or levels, (n_samples or 1, 1)."""
         return [(f, np.atleast_2d(n["a" if f.sticks else "level"])) for f, n in self.effects if f.sticks or f.stops]
 
-    def _at_rows(self, names: list[str], kept: FloatArray) -> dict[str, FloatArray]:
+    def _states_at_rows(self, names: list[str], kept: FloatArray) -> dict[str, FloatArray]:
         out = {}
         for name, values in zip(names, kept, strict=True):
             found = np.empty((self.n_samples, len(self.rows)))
-            for j, own in enumerate(self.rows.by_run):
+            for j, own in enumerate(self.rows.rows_by_run):
                 found[:, own] = values[:, j, : len(own)]
             out[name] = found
         return out
 
     def _integration_of_sample(self, i: int) -> _Integration:
-        def one(v: Any) -> Any:
+        def of_sample(v: Any) -> Any:
             v = np.atleast_2d(v)
             return v[i : i + 1] if len(v) > 1 else v
 
         return _Integration(
             self.kind,
             self.rows,
-            {name: one(v) for name, v in self.parameters.items()},
-            {name: one(v) for name, v in self.columns.items()},
-            [(form, {name: one(v) for name, v in numbers.items()}) for form, numbers in self.effects],
+            {name: of_sample(v) for name, v in self.parameters.items()},
+            {name: of_sample(v) for name, v in self.columns.items()},
+            [(form, {name: of_sample(v) for name, v in numbers.items()}) for form, numbers in self.effects],
         )
 
     def clipped_to_bounds(self, s: FloatArray, names: list[str]) -> FloatArray:
@@ -284,16 +289,16 @@ class _Integration:
                 s[k] = np.minimum(s[k], size)
         return s
 
-    def through_gap_with_events(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
+    def integrate_gap_with_events(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
         """Integrate from position k of run j to the next for one sample, with events of friction and bounds."""
         time = self.rows.time
         assert time is not None
         t = self.columns[time]
-        gap = float(t[0, self.places[k + 1, j]] - t[0, self.places[k, j]])
-        at = self.within_gap(k, slice(j, j + 1))
+        gap = float(t[0, self.row_by_position[k + 1, j]] - t[0, self.row_by_position[k, j]])
+        at = self.rate_inputs_in_gap(k, slice(j, j + 1))
         hard = [(form, float(size[0, 0])) for form, size in self.frictions_and_bounds]
 
-        def free(share: float, y: FloatArray) -> dict[str, float]:
+        def free_rates(share: float, y: FloatArray) -> dict[str, float]:
             p, now = at(share)
             found = self.rates(dict(zip(names, y, strict=True)), p, now)
             return {name: float(np.ravel(v)[0]) for name, v in found.items()}
@@ -302,14 +307,14 @@ class _Integration:
         for low, high in _intervals_between(edges):
             share, forced = low, dict[int, int]()
             for _ in range(_MOST_EVENTS):
-                rates = free(share, s)
+                rates = free_rates(share, s)
                 modes = [
                     forced.get(m, int(_mode_of_motion(f, size, s[names.index(f.target)], rates[f.target])))
                     for m, (f, size) in enumerate(hard)
                 ]
 
                 def slope(x: float, y: FloatArray, modes: Any = modes) -> FloatArray:
-                    found = free(x, y)
+                    found = free_rates(x, y)
                     for (form, size), mode in zip(hard, modes, strict=True):
                         found[form.target] = (
                             0.0 if mode == 0 else found[form.target] - (size * mode if form.sticks else 0.0)
@@ -325,34 +330,34 @@ class _Integration:
                     atol=_ATOL,
                     first_step=high - share,
                     events=[
-                        _event_of_mode_end(f, size, mode, names, free)
+                        _event_of_mode_end(f, size, mode, names, free_rates)
                         for (f, size), mode in zip(hard, modes, strict=True)
                     ],
                 )
                 s, share = solved.y[:, -1].copy(), float(solved.t[-1])
                 if solved.status != 1 or share >= high:
                     break
-                forced = _after_events(hard, modes, solved.t_events or [], s, names, partial(free, share))
+                forced = _modes_after_events(hard, modes, solved.t_events or [], s, names, partial(free_rates, share))
             else:
                 raise NotConvergedError(f"the law of the {self.kind.name} sticks and slips without end")
         return s
 
 
-def _after_events(
+def _modes_after_events(
     hard: Sequence[tuple[Form, float]],
     modes: Sequence[int],
     events: Sequence[FloatArray],
     s: FloatArray,
     names: list[str],
-    free: Callable[[FloatArray], dict[str, float]],
+    free_rates: Callable[[FloatArray], dict[str, float]],
 ) -> dict[int, int]:
-    """Place states that came to rest or to their bound; return the modes of those that broke loose, by their number."""
+    """Put states that came to rest or a bound exactly there; return the modes of those that broke loose, by number."""
     forced: dict[int, int] = {}
     for m, ((f, size), found, mode) in enumerate(zip(hard, events, modes, strict=True)):
         if found.size and mode != 0:  # at rest, or at the bound
             s[names.index(f.target)] = 0.0 if f.sticks else size
         elif found.size:  # breaks loose
-            forced[m] = int(np.sign(free(s)[f.target])) if f.sticks else 1
+            forced[m] = int(np.sign(free_rates(s)[f.target])) if f.sticks else 1
     return forced
 
 
@@ -368,23 +373,23 @@ def _mode_of_motion(form: Form, size: Any, value: Any, rate: Any) -> Any:
     return np.where((value >= size) & (rate > 0), 0, 1)
 
 
-def _has_mode_ended(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
-    """Return whether a mode has ended."""
+def _mode_ended_mask(form: Form, size: Any, mode: Any, value: Any, rate: Any) -> Any:
+    """Return where a mode has ended: motion reversed, or a force or value beyond its limit."""
     if form.sticks:
         return np.where(mode == 0, np.abs(rate) > size, value * mode < 0)
     return np.where(mode == 0, rate < 0, value > size)
 
 
-def _event_of_mode_end(form: Form, size: float, mode: int, names: list[str], free: Any) -> Any:
+def _event_of_mode_end(form: Form, size: float, mode: int, names: list[str], free_rates: Any) -> Any:
     """Return the event function for the end of a mode: coming to rest, breaking loose, reaching or leaving a bound."""
     i = names.index(form.target)
     if form.sticks:
         if mode == 0:
-            found, direction = (lambda x, y: abs(free(x, y)[form.target]) - size), 1.0
+            found, direction = (lambda x, y: abs(free_rates(x, y)[form.target]) - size), 1.0
         else:
             found, direction = (lambda x, y: y[i] + mode * _REST), -float(mode)  # it may start from 0
     elif mode == 0:
-        found, direction = (lambda x, y: free(x, y)[form.target]), -1.0
+        found, direction = (lambda x, y: free_rates(x, y)[form.target]), -1.0
     else:
         found, direction = (lambda x, y: y[i] - size), 1.0
     found.terminal, found.direction = True, direction  # type: ignore[attr-defined]

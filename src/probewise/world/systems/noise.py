@@ -35,11 +35,11 @@ class SystemNoise:
     name
         "white" or one of OTHER_NOISE.
     draw
-        (noise-free readings, rows) to readings, (n_points,).
+        Function of noise-free readings, rows and a generator; returns readings, (n_points,).
     parameters
         As in the vocabulary.
     size_lambda
-        Square root of twice the expected gain in log likelihood over white noise; 0 if not requested.
+        Square root of twice the expected gain in log likelihood over white noise; 0 if its strength is fixed.
     step
         Rounding step, if this noise is rounding.
     """
@@ -54,17 +54,20 @@ class SystemNoise:
 def noise_of_size(
     name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
-    """Choose the strength of a noise so that it is as detectable as an effect of size `wanted`."""
+    """Return a noise, as detectable as an effect of size `wanted` if its strength can be chosen.
+
+    The strengths of "white", "outliers", "dropouts", "t4" and "quantised" are fixed.
+    """
     whole = rows.n_runs
     match name:
         case "white":
             return SystemNoise(name, lambda y, rows, rng: y + sd * rng.standard_normal(len(y)))
         case "correlated_noise":
-            pairs = len(rows) - len(rows.by_run)
+            pairs = len(rows) - len(rows.rows_by_run)
             rho = math.sqrt(1 - math.exp(-(wanted**2) / pairs))
-            return SystemNoise(name, lambda y, rows, rng: y + sd * _ar1(rows, rho, rng), {"rho": rho}, wanted)
+            return SystemNoise(name, lambda y, rows, rng: y + sd * _ar1_noise(rows, rho, rng), {"rho": rho}, wanted)
         case "random_walk":
-            spectrum = _spectrum_of_walk(len(rows))
+            spectrum = _walk_covariance_eigenvalues(len(rows))
             q = _strength_with_size(lambda a: _lambda_of_variances(1 + a**2 * spectrum), wanted, 1e-4, 1.0)
             return SystemNoise(
                 name,
@@ -100,7 +103,9 @@ def noise_of_size(
             )
         case "outliers":
             return SystemNoise(
-                name, lambda y, rows, rng: y + sd * _outlier_draws(len(y), 0.03, 7.0, rng), {"share": 0.03, "size": 7.0}
+                name,
+                lambda y, rows, rng: y + sd * _noise_with_outliers(len(y), 0.03, 7.0, rng),
+                {"share": 0.03, "size": 7.0},
             )
         case "dropouts":
             return SystemNoise(
@@ -111,25 +116,27 @@ def noise_of_size(
         case "t4":  # its scale is the sd of the normal that matches its centre
             return SystemNoise(name, lambda y, rows, rng: y + sd * rng.standard_t(4.0, len(y)), {"freedom": 4.0})
         case _:
-            step = _round_number(2.0 * sd)
+            step = _nearest_preferred_number(2.0 * sd)
             return SystemNoise(
                 "quantised", lambda y, rows, rng: y + sd * rng.standard_normal(len(y)), {"step": step}, step=step
             )
 
 
-def _ar1(rows: SystemRows, rho: float, rng: np.random.Generator) -> FloatArray:
+def _ar1_noise(rows: SystemRows, rho: float, rng: np.random.Generator) -> FloatArray:
+    """Draw AR(1) noise of sd 1 within each run, (n_points,)."""
     own = rng.standard_normal(len(rows))
-    for run in rows.by_run:
+    for run in rows.rows_by_run:
         for before, row in pairwise(run):
             own[row] = rho * own[before] + math.sqrt(1 - rho**2) * own[row]
     return own
 
 
-def _outlier_draws(n: int, share: float, size: float, rng: np.random.Generator) -> FloatArray:
+def _noise_with_outliers(n: int, share: float, size: float, rng: np.random.Generator) -> FloatArray:
+    """Draw noise of sd 1, with additional noise of sd `size` in a share of the readings, (n,)."""
     return rng.standard_normal(n) + np.where(rng.random(n) < share, size * rng.standard_normal(n), 0.0)
 
 
-def _spectrum_of_walk(n: int) -> FloatArray:
+def _walk_covariance_eigenvalues(n: int) -> FloatArray:
     """Return the eigenvalues of a unit-step random walk's covariance, without the constant, (n - 1,)."""
     count = np.arange(1.0, n + 1)
     walk = np.minimum(count[:, None], count)
@@ -150,7 +157,7 @@ def _strength_with_size(size: Callable[[float], float], wanted: float, low: floa
     return float(np.exp(brentq(lambda a: size(math.exp(a)) - wanted, math.log(low), math.log(high), xtol=1e-4)))
 
 
-def _round_number(value: float) -> float:
-    """Return the nearest of 1, 2, 5 times a power of ten."""
+def _nearest_preferred_number(value: float) -> float:
+    """Return the nearest of 1, 2 and 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(value))
     return float(min((m * power for m in (1.0, 2.0, 5.0, 10.0)), key=lambda m: abs(math.log(m / value))))

@@ -29,7 +29,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     drawn, kind = case.drawn, case.drawn.kind
     beside = [AddedForm(e.form, e.values, fitted_parameters(e.form)) for e in case.effects]
     model = Model(kind, drawn.diagnosed_rows, beside)
-    fitted = model.fit(case.readings[drawn.diagnosed_row_numbers], model.coordinates(drawn.shared, drawn.by_run))
+    fitted = model.fit(case.readings[drawn.diagnosed_row_numbers], model.coordinates_of(drawn.shared, drawn.by_run))
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
     x = fitted.coordinates + (rng.standard_normal((n_samples, len(s))) * wide) @ vt
@@ -38,8 +38,8 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
             x[:, model.n_nominal_coordinates + k] = _rounded_to_quantiles(x[:, model.n_nominal_coordinates + k])
     later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
     ahead = Model(kind, later, beside)
-    n_shared = len(kind.shared)
-    n_runs = len(later.by_run)
+    n_shared = len(kind.shared_names)
+    n_runs = len(later.rows_by_run)
     own = [
         np.stack(
             [
@@ -53,15 +53,15 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     parts = [x[:, :n_shared], *own, x[:, model.n_nominal_coordinates :]]
     there = np.concatenate(parts, axis=1)
     effects = [
-        (form, _numbers_of_unseen_run(numbers, b.free))
-        for (form, numbers), b in zip(ahead.effects(there), beside, strict=True)
+        (form, _with_unseen_runs_at_mean(numbers, b.free))
+        for (form, numbers), b in zip(ahead.effects_at(there), beside, strict=True)
     ]
     with np.errstate(all="ignore"):
-        return simulate(kind, later, ahead.parameters(there), effects).readings
+        return simulate(kind, later, ahead.parameters_at(there), effects).readings
 
 
-def _numbers_of_unseen_run(numbers: Numbers, free: Sequence[str]) -> Numbers:
-    """Give a held-out run the mean of the fitted runs' values: a parameter takes up what they have in common."""
+def _with_unseen_runs_at_mean(numbers: Numbers, free: Sequence[str]) -> Numbers:
+    """Set values of held-out runs to the mean of the fitted ones, which the runs have in common."""
     fitted = [numbers[name] for name in free if name.startswith("values[")]
     if not fitted:
         return numbers

@@ -12,9 +12,9 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
-from probewise.world.systems.chain import simulate, with_reading_effects
+from probewise.world.systems.chain import apply_reading_effects, simulate
 from probewise.world.systems.fit import AddedForm, LeastSquaresFit, Model, fitted_parameters, project_out
-from probewise.world.systems.forms.form import Form, Placed, numbers_of_settings
+from probewise.world.systems.forms.form import Form, FormWithParameters, parameter_arrays
 from probewise.world.systems.forms.true_system import TrueSystem
 
 TELLING_NATS = 3.0
@@ -27,12 +27,12 @@ _CHUNK = 160  # settings simulated together
 _NEUTRAL = {"level": np.inf, "period": 1.0}
 
 
-def short_name(form: Form) -> str:
+def vocabulary_name(form: Form) -> str:
     """Return the vocabulary's name of a form: a saturation from below is `saturation` too."""
     return form.name.removesuffix(" (floor)")
 
 
-def _needs_own_integration(form: Form) -> bool:
+def _has_costly_fit(form: Form) -> bool:
     return form.sticks or form.stops or bool(form.late)
 
 
@@ -43,7 +43,7 @@ class _StartOfFit:
     nats: float
 
 
-def rivals_of(
+def rivals_with_nats(
     true: TrueSystem,
     forms: Sequence[Form],
     target: FloatArray,
@@ -51,7 +51,7 @@ def rivals_of(
     model: Model,
     without: frozenset[str],
 ) -> dict[str, float]:
-    """Find the forms that explain noise-free readings as well.
+    """Find the forms that explain an effect's noise-free readings almost as well as the effect itself.
 
     Parameters
     ----------
@@ -70,12 +70,12 @@ def rivals_of(
     -------
     Loss of log likelihood in nats by name, for those below TELLING_NATS, the best first.
     """
-    left = project_out((target - fitted.readings) / true.sd, fitted.slopes)
-    near = _best_by_linearisation(true, [f for f in forms if short_name(f) not in without], left, fitted, model)
+    left = project_out((target - fitted.readings) / true.noise_sd, fitted.slopes)
+    near = _best_by_linearisation(true, [f for f in forms if vocabulary_name(f) not in without], left, fitted, model)
     found: dict[str, float] = {}
-    hard = any(_needs_own_integration(b.form) for b in model.added)
+    hard = any(_has_costly_fit(b.form) for b in model.added)
     for candidate in near:
-        name = short_name(candidate.form)
+        name = vocabulary_name(candidate.form)
         if hard:  # fits with dry friction or a bound take minutes: the linearised result is used
             found[name] = min(candidate.nats, found.get(name, np.inf))
             continue
@@ -91,7 +91,7 @@ def rivals_of(
                 * wider.fit(
                     target,
                     np.concatenate([fitted.coordinates, own]),
-                    max_calls=5 if _needs_own_integration(candidate.form) else 7,
+                    max_calls=5 if _has_costly_fit(candidate.form) else 7,
                 ).chi_square
             )
         except NotConvergedError:
@@ -112,7 +112,7 @@ def _best_by_linearisation(
         groups = [list(group) for group in form.bank]
         at = 0
         for group in groups:
-            columns = project_out(changes[at : at + len(group)].T / true.sd, fitted.slopes)
+            columns = project_out(changes[at : at + len(group)].T / true.noise_sd, fitted.slopes)
             at += len(group)
             good = np.isfinite(columns).all(axis=0) & (np.sqrt(np.sum(columns**2, axis=0)) > 1e-6)
             if not good.any():
@@ -122,7 +122,7 @@ def _best_by_linearisation(
             rest = left - columns @ amounts
             nats = 0.5 * float(rest @ rest)
             if nats < _NEAR or 1 - 2 * nats / size > _COSINE**2:
-                own.append(_StartOfFit(form, form.join(group, np.asarray(amounts, dtype=np.float64)), nats))
+                own.append(_StartOfFit(form, form.start_values(group, np.asarray(amounts, dtype=np.float64)), nats))
         out += sorted(own, key=lambda c: c.nats)[:2]
     return sorted(out, key=lambda c: c.nats)[:_MOST_FITS]
 
@@ -130,10 +130,10 @@ def _best_by_linearisation(
 def templates_of(
     true: TrueSystem, forms: Sequence[Form], fitted: LeastSquaresFit, model: Model
 ) -> dict[Form, FloatArray]:
-    """Return the change of the readings by every setting of every form's bank about a fit, (n_settings, n_points)."""
+    """Return, by form, the changes of the readings about a fit by every setting of its bank, (n_settings, n_points)."""
     settings = {form: [each for group in form.bank for each in group] for form in forms}
     x = fitted.coordinates[None, :]
-    parameters, beside = model.parameters(x), model.effects(x)
+    parameters, beside = model.parameters_at(x), model.effects_at(x)
     inner = [e for e in beside if e[0].side != "reading"]
     outer = [e for e in beside if e[0].side == "reading"]
     bare = simulate(true.kind, true.rows, parameters, inner).readings
@@ -142,17 +142,17 @@ def templates_of(
         for form in (f for f in forms if f.side == "reading"):
             unread = np.repeat(bare, len(settings[form]), axis=0)
             out[form] = (
-                with_reading_effects(unread, true.rows, [*outer, (form, numbers_of_settings(settings[form]))])
+                apply_reading_effects(unread, true.rows, [*outer, (form, parameter_arrays(settings[form]))])
                 - fitted.readings
             )
         alone, together = _split_by_way_of_simulation(true, [f for f in forms if f.side != "reading"])
         for form in alone:
             found = _simulated_or_nan(
-                true, parameters, [*beside, (form, numbers_of_settings(settings[form]))], len(settings[form])
+                true, parameters, [*beside, (form, parameter_arrays(settings[form]))], len(settings[form])
             )
             out[form] = found - fitted.readings
         for chunk in _chunks_of_forms(together, settings):
-            out |= _simulated_together(true, chunk, settings, fitted, model)
+            out |= _changes_of_chunk(true, chunk, settings, fitted, model)
     return out
 
 
@@ -174,19 +174,19 @@ def _chunks_of_forms(forms: Sequence[Form], settings: dict[Form, list[dict[str, 
     return out
 
 
-def _simulated_together(
+def _changes_of_chunk(
     true: TrueSystem,
     forms: Sequence[Form],
     settings: dict[Form, list[dict[str, float]]],
     fitted: LeastSquaresFit,
     model: Model,
 ) -> dict[Form, FloatArray]:
-    """Simulate many forms at once, each with its null setting except in its own samples."""
+    """Return the changes of the readings by many forms, simulated at once: each is neutral but in its own samples."""
     ends = np.cumsum([len(settings[form]) for form in forms])
     total, x = int(ends[-1]), fitted.coordinates[None, :]
     placed = []
     for form, end in zip(forms, ends, strict=True):
-        own = numbers_of_settings(settings[form])
+        own = parameter_arrays(settings[form])
         numbers = {}
         for name, values in own.items():
             whole = np.full((total, 1), _NEUTRAL.get(name, 0.0))
@@ -194,18 +194,18 @@ def _simulated_together(
             numbers[name] = whole
         # For screening, a delayed column may be interpolated; a full fit treats its jumps exactly.
         placed.append((replace(form, late=""), numbers))
-    found = _simulated_or_nan(true, model.parameters(x), [*model.effects(x), *placed], total) - fitted.readings
+    found = _simulated_or_nan(true, model.parameters_at(x), [*model.effects_at(x), *placed], total) - fitted.readings
     if len(forms) > 1 and not np.isfinite(found).all():  # one of them diverges, which stops the integration of all
         return {
             form: each
             for own in forms
-            for form, each in _simulated_together(true, [own], settings, fitted, model).items()
+            for form, each in _changes_of_chunk(true, [own], settings, fitted, model).items()
         }
     return {form: found[end - len(settings[form]) : end] for form, end in zip(forms, ends, strict=True)}
 
 
 def _simulated_or_nan(
-    true: TrueSystem, parameters: Mapping[str, FloatArray], effects: Sequence[Placed], n: int
+    true: TrueSystem, parameters: Mapping[str, FloatArray], effects: Sequence[FormWithParameters], n: int
 ) -> FloatArray:
     """Simulate; NaN if a law diverges."""
     try:

@@ -41,23 +41,23 @@ class SystemRows:
         return np.arange(float(len(self))) if self.time is None else self.columns[self.time]
 
     @cached_property
-    def by_run(self) -> Sequence[IntArray]:
+    def rows_by_run(self) -> Sequence[IntArray]:
         """Row numbers of each run that has rows here."""
         found = (np.flatnonzero(self.run == k) for k in range(self.n_runs))
         return [rows for rows in found if rows.size]
 
     @cached_property
-    def since_start(self) -> FloatArray:
+    def time_since_start(self) -> FloatArray:
         """Time since the first row of the run."""
         out = np.empty(len(self))
-        for rows in self.by_run:
+        for rows in self.rows_by_run:
             out[rows] = self.t[rows] - self.t[rows[0]]
         return out
 
     @cached_property
     def median_gap(self) -> float:
         """Median time from a row to the next of its run."""
-        return float(np.median(np.concatenate([np.diff(self.t[rows]) for rows in self.by_run])))
+        return float(np.median(np.concatenate([np.diff(self.t[rows]) for rows in self.rows_by_run])))
 
     @property
     def duration(self) -> float:

@@ -13,7 +13,7 @@ _AS_PLAIN = 0.9  # share of the best covariate's explained variance that counts 
 _PLAIN = 0.25  # least explained share of the sum of squares
 
 
-def covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
+def visible_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[str, ...]:
     """Return the covariates that a right answer may rank first: the form's own, and equivalent ones.
 
     Parameters
@@ -27,21 +27,21 @@ def covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -> tuple[
     """
     rows = true.rows
     pooled = {name: values for name, values in rows.columns.items() if name != rows.time}
-    pooled |= {"level": true.readings, "previous": _change_of_reading(true)}
+    pooled |= {"level": true.readings, "previous": _change_from_previous_row(true)}
     pooled |= {f"state:{name}": values for name, values in true.states.items()}
     if rows.time is not None:
         pooled["time"] = rows.t
     shares = {name: _explained_share(residuals, _bin_numbers(values)) for name, values in pooled.items()}
-    if len(rows.by_run) > 1:
+    if len(rows.rows_by_run) > 1:
         shares["run"] = _explained_share(residuals, rows.run)
     best = max(shares.values())
     plain = [name for name, share in shares.items() if share >= _AS_PLAIN * best and share > _PLAIN]
     return tuple(dict.fromkeys((*form.covariates, *sorted(plain, key=lambda name: -shares[name]))))
 
 
-def _change_of_reading(true: TrueSystem) -> FloatArray:
+def _change_from_previous_row(true: TrueSystem) -> FloatArray:
     out = np.zeros(len(true.rows))
-    for own in true.rows.by_run:
+    for own in true.rows.rows_by_run:
         out[own[1:]] = np.diff(true.readings[own])
     return out
 

@@ -37,7 +37,7 @@ class Instants:
     @classmethod
     def at_rows(cls, rows: SystemRows) -> Self:
         """Return the instants of all rows."""
-        return cls(rows.t[None, :], rows.since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
+        return cls(rows.t[None, :], rows.time_since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +59,7 @@ class Form:
         Draws all parameters except the amplitude and its sign.
     bank
         Its template bank.
-    join
+    start_values
         Converts a group of the bank and the amounts of its members to starting values of a fit.
     steps
         Step of each parameter for derivatives.
@@ -93,7 +93,7 @@ class Form:
     of_amplitude: Callable[[float, dict[str, float]], dict[str, float]]
     draw: Callable[[np.random.Generator], dict[str, float]]
     bank: Bank
-    join: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
+    start_values: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
     steps: Mapping[str, float]
     first: float
     limit: float
@@ -110,10 +110,10 @@ class Form:
     also_in_truth: Mapping[str, Any] = field(default_factory=dict)
 
 
-Placed: TypeAlias = tuple[Form, Numbers]
+FormWithParameters: TypeAlias = tuple[Form, Numbers]
 """A form with its parameters."""
 
 
-def numbers_of_settings(settings: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
+def parameter_arrays(settings: Sequence[Mapping[str, float]]) -> dict[str, FloatArray]:
     """Stack settings to parameter arrays, (n_settings, 1) each."""
     return {name: np.array([[each[name]] for each in settings]) for name in settings[0]}

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
-from probewise.world.systems.forms.modulations import join_sine_and_cosine, scale_single_member, wave_bank
+from probewise.world.systems.forms.modulations import amplitude_and_phase, scale_only_member, wave_bank
 from probewise.world.systems.forms.readings import delayed
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.rows import SystemRows
@@ -27,9 +27,10 @@ def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
         yield _linear_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
 
 
-def _changing_column(
+def _act_on_column(
     column: str, change: Change
 ) -> Callable[[Mapping[str, FloatArray], SystemRows, Numbers], dict[str, Any]]:
+    """Return the `Form.act` that changes one column."""
     return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
 
 
@@ -39,11 +40,11 @@ def _linear_form(
     return Form(
         name,
         "input",
-        _changing_column(column, change),
+        _act_on_column(column, change),
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": first}]],
-        scale_single_member,
+        scale_only_member,
         {"a": first},
         first,
         limit,
@@ -58,7 +59,7 @@ def _nonlinear_form(
     return Form(
         name,
         "input",
-        _changing_column(column, change),
+        _act_on_column(column, change),
         lambda a, drawn: {number: a},
         lambda rng: {},
         [[{number: float(size)}] for size in tried],
@@ -84,7 +85,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
     yield Form(
         f"input_saturation:{column}",
         "input",
-        _changing_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
+        _act_on_column(column, lambda c, rows, v: np.minimum(c, v["level"])),
         lambda a, drawn: {"level": high - a},
         lambda rng: {},
         [[{"level": float(level)}] for level in levels],
@@ -105,13 +106,13 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
             sizes,
             own,
         )
-    moves = np.concatenate([np.diff(values[rows]) for rows in true.rows.by_run])
+    moves = np.concatenate([np.diff(values[rows]) for rows in true.rows.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
         yield _nonlinear_form(f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column))
     if len(np.unique(values)) > 20:
         waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
 
-        def wavy(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        def add_wave(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
             return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
 
         first = 0.01 * spread
@@ -121,14 +122,14 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         yield Form(
             f"periodic_error:{column}",
             "input",
-            _changing_column(column, wavy),
+            _act_on_column(column, add_wave),
             lambda a, drawn: {"a": a, **drawn},
             lambda rng: {
                 "period": span / draw_log_uniform(rng, 1.5, min(len(np.unique(values)) / 6, 25)),
                 "phase": float(rng.uniform(0, 2 * np.pi)),
             },
             bank,
-            join_sine_and_cosine,
+            amplitude_and_phase,
             {"a": first, "period": 0.002 * span, "phase": 0.05},
             first,
             0.2 * span,
@@ -155,7 +156,7 @@ def behind_gear_play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
     """
     half = 0.5 * np.maximum(v["width"][:, 0], 0.0)
     out = np.empty((max(len(c), len(half)), c.shape[1]))
-    for own in rows.by_run:
+    for own in rows.rows_by_run:
         moves = np.diff(c[0, own])
         ways = moves[moves != 0]
         at = c[:, own[0]] - half * (np.sign(ways[0]) if ways.size else 0.0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form
-from probewise.world.systems.forms.modulations import Modulation, scale_single_member
+from probewise.world.systems.forms.modulations import Modulation, scale_only_member
 from probewise.world.systems.forms.true_system import TrueSystem
 
 _N_WAVES = 20
@@ -22,7 +22,7 @@ def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
         over["drifts"] = modulations.along_time(true)
     for name in true.kind.priors:
         own = dict(over)
-        if name not in true.kind.per_run and true.kind.run is not None and len(true.rows.by_run) > 1:
+        if name not in true.kind.per_run and true.kind.run is not None and len(true.rows.rows_by_run) > 1:
             own["differs"] = modulations.by_run(true)
         if name in true.kind.per_run and true.kind.law is not None:
             own = {}  # initial values do not vary within a run
@@ -34,7 +34,7 @@ def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
 
 
 def varying_parameter(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
-    """Bind a modulation to a parameter."""
+    """Return the form `name` by which the parameter `target` varies as a modulation."""
     first = 0.003 * float(np.abs(true.parameters[target]).mean()) / how.reach
     return Form(
         name,
@@ -43,7 +43,7 @@ def varying_parameter(true: TrueSystem, name: str, target: str, how: Modulation)
         how.of_amplitude,
         how.draw,
         how.bank(0.1 * first),
-        how.join,
+        how.start_values,
         how.steps(first),
         first,
         200 * first,
@@ -65,7 +65,7 @@ def term_in_rate(
     shape: str = "",
     signed: bool = True,
 ) -> Form:
-    """Bind a term a push(states, now, parameters) to the rate of a state; `size` is the scale of the push."""
+    """Return the form of a term a push(states, now, parameters) in the rate of a state; `size` is the push's scale."""
     first = 0.01 * true.rms_rate(state) / size
     return Form(
         name,
@@ -74,7 +74,7 @@ def term_in_rate(
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": 0.1 * first}]],
-        scale_single_member,
+        scale_only_member,
         {"a": first},
         first,
         300 * first,
@@ -115,11 +115,11 @@ def forms_of_rates(true: TrueSystem) -> Iterator[Form]:
                     true, f"coupling:{state}:{other}", state, _term_in_state(other, lambda r: -r), most, seen
                 )
         yield _periodic_term(true, state)
-        yield from _friction_and_bound(true, state)
+        yield from _friction_and_bound_forms(true, state)
 
 
 def _term_in_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any, Any], Any]:
-    """Return a push from a term in one state."""
+    """Return the push that is a function of one state alone."""
     return lambda s, now, v: term(s[state])
 
 
@@ -133,7 +133,7 @@ def _periodic_term(true: TrueSystem, state: str) -> Form:
         how.of_amplitude,
         how.draw,
         how.bank(0.1 * first),
-        how.join,
+        how.start_values,
         how.steps(first),
         first,
         100 * first,
@@ -143,7 +143,7 @@ def _periodic_term(true: TrueSystem, state: str) -> Form:
     )
 
 
-def _friction_and_bound(true: TrueSystem, state: str) -> Iterator[Form]:
+def _friction_and_bound_forms(true: TrueSystem, state: str) -> Iterator[Form]:
     speed, values = true.rms_rate(state), true.states[state]
     sizes = speed * np.geomspace(1e-3, 0.3, 4)
     yield Form(

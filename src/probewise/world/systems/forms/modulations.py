@@ -1,4 +1,4 @@
-"""Variations: drift, step, per run, with a column, wave, settling."""
+"""Modulations of a reading, a parameter or a rate: drift, step, per run, with a column, wave, settling."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from probewise.world.systems.forms.true_system import TrueSystem, draw_log_unifo
 
 @dataclass(frozen=True, eq=False)
 class Modulation:
-    """A variation in proportion to an amplitude; attributes as in `Form`."""
+    """A variation in proportion to an amplitude; attributes as in `Form`, some of them functions of the amplitude.
+
+    `over` is its value as a function of instants and parameters, `reach` the scale of that value at amplitude 1.
+    """
 
     over: Callable[[Instants, Numbers], Any]
     of_amplitude: Callable[[float, dict[str, float]], dict[str, float]]
     draw: Callable[[np.random.Generator], dict[str, float]]
     bank: Callable[[float], Bank]
-    join: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
+    start_values: Callable[[Sequence[dict[str, float]], FloatArray], dict[str, float]]
     steps: Callable[[float], Mapping[str, float]]
     covariates: tuple[str, ...]
     reach: float
@@ -30,12 +33,8 @@ class Modulation:
     signed: bool = True
 
 
-def _no_values(rng: np.random.Generator) -> dict[str, float]:
-    return {}
-
-
-def scale_single_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Scale the amplitude of a group's only member."""
+def scale_only_member(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+    """Return the only member of a group with its amplitude scaled by the only amount."""
     return {**group[0], "a": group[0]["a"] * float(amounts[0])}
 
 
@@ -45,9 +44,9 @@ def _of_amplitude_alone(
     return Modulation(
         over,
         lambda a, drawn: {"a": a},
-        _no_values,
+        lambda rng: {},
         lambda a: [[{"a": a}]],
-        scale_single_member,
+        scale_only_member,
         lambda a: {"a": a},
         covariates,
         reach,
@@ -82,7 +81,7 @@ def step(true: TrueSystem) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {at: true.random_time(rng)},
         lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
-        scale_single_member,
+        scale_only_member,
         lambda a: {"a": a, at: 0.0},
         ("time", str(true.rows.time)) if timed else ("row",),
         1.0,
@@ -94,13 +93,13 @@ def by_run(true: TrueSystem) -> Modulation:
     """Return a random value per run, including held-out runs, scaled by the amplitude."""
     n = true.rows.n_runs
     names = [f"values[{k}]" for k in range(n)]
-    present = [int(true.rows.run[own[0]]) for own in true.rows.by_run]
+    present = [int(true.rows.run[own[0]]) for own in true.rows.rows_by_run]
 
     def over(now: Instants, v: Numbers) -> Any:
         values = np.concatenate(np.broadcast_arrays(*(np.atleast_2d(v[name]) for name in names)), axis=1)
         return values[:, now.run]
 
-    def join(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+    def start_values(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
         return {name: float(sum(m * each[name] for m, each in zip(amounts, group, strict=True))) for name in names}
 
     return Modulation(
@@ -108,7 +107,7 @@ def by_run(true: TrueSystem) -> Modulation:
         lambda a, drawn: {name: a * drawn[name] for name in names},
         lambda rng: dict(zip(names, rng.standard_normal(n).tolist(), strict=True)),
         lambda a: [[{name: a * (name == names[k]) for name in names} for k in present]],
-        join,
+        start_values,
         lambda a: {name: (a if k in present else 0.0) for k, name in enumerate(names)},
         ("run",),
         1.0,
@@ -120,8 +119,8 @@ def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
     return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
 
 
-def join_sine_and_cosine(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
-    """Convert the amounts of sine and cosine to amplitude and phase."""
+def amplitude_and_phase(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+    """Return the setting of the wave that the amounts of sine and cosine add up to."""
     sine, cosine = amounts * group[0]["a"]
     return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
 
@@ -135,7 +134,7 @@ def waves(true: TrueSystem, n: int) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
         lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
-        join_sine_and_cosine,
+        amplitude_and_phase,
         lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
         ("time", str(rows.time)),
         1.0,
@@ -145,14 +144,14 @@ def waves(true: TrueSystem, n: int) -> Modulation:
 
 def settling(true: TrueSystem) -> Modulation:
     """Return an exponential settling after the start of each run."""
-    longest = float(true.rows.since_start.max())
+    longest = float(true.rows.time_since_start.max())
     taus = np.geomspace(true.rows.median_gap, longest, 12)
     return Modulation(
         lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.rows.median_gap, 0.4 * longest)},
         lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
-        scale_single_member,
+        scale_only_member,
         lambda a: {"a": a, "tau_s": 0.05 * longest},
         ("time", "run", str(true.rows.time)),
         1.0,

@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Instants, Numbers
 from probewise.world.systems.forms.inside import term_in_rate
-from probewise.world.systems.forms.modulations import scale_single_member
+from probewise.world.systems.forms.modulations import scale_only_member
 from probewise.world.systems.forms.readings import OFFSET
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.rows import SystemRows
@@ -30,20 +30,20 @@ OUT_OF_VOCABULARY = (
 
 
 def forms_out_of_vocabulary(true: TrueSystem, rng: np.random.Generator) -> Iterator[Form]:
-    """Bind every effect outside the vocabulary to randomly drawn columns and states."""
+    """Yield the effects outside the vocabulary that this system can have, on randomly drawn columns and states."""
     columns = [str(name) for name in rng.permutation(true.varying_columns)]
     first, second = columns[0], columns[1]
     yield _product(true, first, second)
     yield _switch(true, first, float(rng.uniform(0.55, 0.8)))
-    yield _memory(true, first)
-    yield _fading(true, first)
+    yield _soft_limited_sum(true, first)
+    yield _bend_with_column(true, first)
     if true.rows.time is not None:
-        yield _square(true, rng)
+        yield _square_wave(true, rng)
         yield _chirp(true)
         yield _two_settlings(true)
     if true.kind.law is not None and true.states:
         state = str(rng.choice(list(true.states)))
-        yield _spring(true, state)
+        yield _one_sided_spring(true, state)
         yield _leak(true, state)
         yield _column_times_state(true, state, first)
 
@@ -59,7 +59,7 @@ def _added_to_reading(
     def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         return np.asarray(y + v["a"] * over(y, rows, v))  # type: ignore[operator]
 
-    sd = true.sd
+    sd = true.noise_sd
     return Form(
         f"strange_{name}",
         "reading",
@@ -67,7 +67,7 @@ def _added_to_reading(
         lambda a, more: {"a": a, **more},
         lambda rng: dict(drawn or {}),
         [[{"a": sd}]],
-        scale_single_member,
+        scale_only_member,
         {"a": sd},
         sd,
         1e4 * sd,
@@ -100,13 +100,13 @@ def _switch(true: TrueSystem, column: str, share: float) -> Form:
     )
 
 
-def _memory(true: TrueSystem, column: str) -> Form:
-    """Add the sum of a column since the start of the run, soft-limited."""
+def _soft_limited_sum(true: TrueSystem, column: str) -> Form:
+    """Return the form that adds the sum of a column's absolute deviations since the start of the run, soft-limited."""
     middle, spread = true.mean_of(column), true.sd_of(column)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         out = np.empty(len(rows))
-        for own in rows.by_run:
+        for own in rows.rows_by_run:
             out[own] = np.tanh(np.cumsum(np.abs(rows.columns[column][own] - middle)) / spread / 12)
         return out
 
@@ -119,7 +119,7 @@ def _memory(true: TrueSystem, column: str) -> Form:
     )
 
 
-def _fading(true: TrueSystem, column: str) -> Form:
+def _bend_with_column(true: TrueSystem, column: str) -> Form:
     middle, spread, low, high = (
         true.mean_of(column),
         true.sd_of(column),
@@ -136,7 +136,7 @@ def _fading(true: TrueSystem, column: str) -> Form:
     )
 
 
-def _square(true: TrueSystem, rng: np.random.Generator) -> Form:
+def _square_wave(true: TrueSystem, rng: np.random.Generator) -> Form:
     hz = draw_log_uniform(rng, 4 / true.rows.duration, 0.06 / true.rows.median_gap)
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
@@ -160,7 +160,7 @@ def _chirp(true: TrueSystem) -> Form:
 
 
 def _two_settlings(true: TrueSystem) -> Form:
-    longest = float(true.rows.since_start.max())
+    longest = float(true.rows.time_since_start.max())
 
     def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         since = Instants.at_rows(rows).since[0]
@@ -175,7 +175,7 @@ def _two_settlings(true: TrueSystem) -> Form:
     )
 
 
-def _spring(true: TrueSystem, state: str) -> Form:
+def _one_sided_spring(true: TrueSystem, state: str) -> Form:
     at = float(np.quantile(true.states[state], 0.6))
     size = float(np.ptp(true.states[state]))
     return term_in_rate(

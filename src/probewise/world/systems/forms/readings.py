@@ -22,18 +22,18 @@ def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
     """Yield every form of the reading."""
     yield from _modulated_forms(true)
     yield from _nonlinear_forms(true)
-    yield from _lag_and_delay(true)
+    yield from _lag_and_delay_forms(true)
 
 
-def added_to_readings(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
-    """Bind a modulation to the reading, as an offset or a gain about 0."""
+def modulated_reading(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
+    """Return the form by which an offset, or with `gain` a factor 1 + modulation, varies the reading."""
 
     def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
         change = how.over(Instants.at_rows(rows), v)
         return np.asarray(y * (1 + change) if gain else y + change)
 
     typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
-    first = true.sd / typical / how.reach
+    first = true.noise_sd / typical / how.reach
     return Form(
         name,
         "reading",
@@ -41,7 +41,7 @@ def added_to_readings(true: TrueSystem, name: str, how: Modulation, *, gain: boo
         how.of_amplitude,
         how.draw,
         how.bank(first),
-        how.join,
+        how.start_values,
         how.steps(first),
         first,
         1e4 * first,
@@ -56,22 +56,22 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
     both = {"step": modulations.step(true)}
     if timed:
         both["drift"] = modulations.along_time(true)
-    if true.kind.run is not None and len(true.rows.by_run) > 1:
+    if true.kind.run is not None and len(true.rows.rows_by_run) > 1:
         both["per_run"] = modulations.by_run(true)
     for kind, how in both.items():
-        yield added_to_readings(true, f"offset_{kind}", how)
-        yield added_to_readings(true, f"gain_{kind}", how, gain=True)
+        yield modulated_reading(true, f"offset_{kind}", how)
+        yield modulated_reading(true, f"gain_{kind}", how, gain=True)
     for column in true.varying_columns:
-        yield added_to_readings(true, f"sensitivity:{column}", modulations.with_column(true, column))
+        yield modulated_reading(true, f"sensitivity:{column}", modulations.with_column(true, column))
     if timed:
-        yield added_to_readings(true, "interference", modulations.waves(true, _N_WAVES))
-        yield added_to_readings(true, "settling", modulations.settling(true))
+        yield modulated_reading(true, "interference", modulations.waves(true, _N_WAVES))
+        yield modulated_reading(true, "settling", modulations.settling(true))
 
 
 def direction_of_change(y: FloatArray, rows: SystemRows) -> FloatArray:
     """Return the sign of change of readings (n_samples, n_points); rests keep the last sign, the first row the next."""
     out = np.zeros_like(y)
-    for own in rows.by_run:
+    for own in rows.rows_by_run:
         for i in range(len(y)):
             signs = np.sign(np.diff(y[i, own]))
             moving = np.flatnonzero(signs)
@@ -83,7 +83,7 @@ def direction_of_change(y: FloatArray, rows: SystemRows) -> FloatArray:
 
 
 def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
-    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.sd
+    low, high, sd = float(true.readings.min()), float(true.readings.max()), true.noise_sd
     yield Form(
         "hysteresis",
         "reading",
@@ -91,7 +91,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         lambda a, drawn: {"a": a},
         lambda rng: {},
         [[{"a": sd}]],
-        modulations.scale_single_member,
+        modulations.scale_only_member,
         {"a": sd},
         sd,
         1e3 * sd,
@@ -113,7 +113,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"power": float(rng.choice([0.6, 1.6, 2.0, 3.0]))},
         [[{"a": first, "power": p}] for p in (0.5, 0.7, 1.4, 2.0, 3.0, 4.5)],
-        modulations.scale_single_member,
+        modulations.scale_only_member,
         {"a": first, "power": 0.05},
         first,
         0.5,
@@ -127,8 +127,8 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         yield Form(
             "saturation" if upper else "saturation (floor)",
             "reading",
-            _clipped(upper),
-            _clipping_level(end, sign),
+            _make_clip(upper),
+            _make_clip_level(end, sign),
             lambda rng: {},
             [[{"level": float(level)}] for level in levels],
             lambda group, amounts: dict(group[0]),
@@ -141,23 +141,23 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         )
 
 
-def _clipped(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatArray]:
-    """Return a function that clips at a level."""
+def _make_clip(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatArray]:
+    """Return the `Form.act` that clips readings at the parameter "level", from above or below."""
     bound = np.minimum if upper else np.maximum
     return lambda y, rows, v: np.asarray(bound(y, v["level"]))
 
 
-def _clipping_level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
-    """Return the level that clips by an amplitude."""
+def _make_clip_level(end: float, sign: float) -> Callable[[float, dict[str, float]], dict[str, float]]:
+    """Return the `Form.of_amplitude` that clips by an amplitude inwards from `end`."""
     return lambda a, drawn: {"level": end + sign * a}
 
 
 def delayed(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray:
-    """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs; before the first value it holds."""
+    """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs: interpolated, constant before the first."""
     n = max(len(values), len(tau))
     values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
     out = np.empty(values.shape)
-    for own in rows.by_run:
+    for own in rows.rows_by_run:
         t = rows.t[own]
         for i in range(n):
             out[i, own] = np.interp(t - tau[i, 0], t, values[i, own])
@@ -167,14 +167,14 @@ def delayed(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray
 def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
     tau = np.maximum(np.broadcast_to(v["tau_s"], (max(len(y), len(v["tau_s"])), 1)), 1e-12)
     out = np.array(np.broadcast_to(y, (len(tau), y.shape[1])))
-    for own in rows.by_run:
+    for own in rows.rows_by_run:
         for before, row in pairwise(own):
             stays = np.exp(-(rows.t[row] - rows.t[before]) / tau[:, 0])
             out[:, row] = stays * out[:, before] + (1 - stays) * out[:, row]
     return out
 
 
-def _lag_and_delay(true: TrueSystem) -> Iterator[Form]:
+def _lag_and_delay_forms(true: TrueSystem) -> Iterator[Form]:
     if true.rows.time is None:
         return
     gap = true.rows.median_gap

@@ -35,8 +35,8 @@ class TrueSystem:
     states: Mapping[str, FloatArray]
 
     @property
-    def sd(self) -> float:
-        """Sd of a reading."""
+    def noise_sd(self) -> float:
+        """Sd of a reading's noise."""
         return self.kind.sd
 
     @property
@@ -55,7 +55,7 @@ class TrueSystem:
     def rms_rate(self, state: str) -> float:
         """Return the root-mean-square rate of a state, from its values at the rows."""
         found = []
-        for own in self.rows.by_run:
+        for own in self.rows.rows_by_run:
             gaps = np.diff(self.rows.t[own])
             found.append(np.diff(self.states[state][own])[gaps > 0] / gaps[gaps > 0])
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.challenge import NullRefit, score
-from probewise.challenge.aliasing import cosines_with_vocabulary, residual_with_one_named
+from probewise.challenge.aliasing import cosines_with_vocabulary, residual_norms_with_one_named
 from probewise.effects import VOCABULARY
 from probewise.recordings.plan import Recording
 from probewise.recordings.plans import paper_plan
@@ -90,7 +90,7 @@ def test_of_two_effects_what_is_left_beside_one_is_the_other(refit, world, plan,
     hidden = AmbientStep(0.8, float(np.quantile(plan.time_s, 0.4))), Hysteresis(0.5)
     both = replace(world, concealed=hidden).simulate(plan, rng=None)
     alone = replace(world, concealed=hidden[1:]).simulate(plan, rng=None)
-    left = residual_with_one_named(refit, clean, both, ["ambient_step"])
+    left = residual_norms_with_one_named(refit, clean, both, ["ambient_step"])
     assert left["ambient_step"] == pytest.approx(refit(clean, alone), rel=0.1)
 
 
@@ -98,7 +98,7 @@ def test_a_ceiling_hides_what_is_above_it(refit, world, plan, clean):
     patch = AlbedoPatch(0.05, 10.0, 0.0, 4.0)
     alone = replace(world, concealed=(patch,)).simulate(plan, rng=None)
     both = replace(world, concealed=(patch, Saturation(45.0))).simulate(plan, rng=None)
-    assert residual_with_one_named(refit, clean, both, ["saturation"])["saturation"] < 0.3 * refit(clean, alone)
+    assert residual_norms_with_one_named(refit, clean, both, ["saturation"])["saturation"] < 0.3 * refit(clean, alone)
 
 
 def test_an_alarm_is_due_on_physics_alone(make):

@@ -67,7 +67,7 @@ def cosines_with_vocabulary(
     return out
 
 
-def residual_with_one_named(
+def residual_norms_with_one_named(
     refit: NullRefit, clean: Recording, both: Recording, names: Iterable[str]
 ) -> dict[str, float]:
     """Return the norm of two effects' residuals after a fit of the null and one of them, in reading units.

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from probewise.challenge.aliasing import cosines_with_vocabulary, residual_with_one_named
-from probewise.challenge.coverage import place_overlap, sensor_truths_and_intervals, truths_and_intervals
+from probewise.challenge.aliasing import cosines_with_vocabulary, residual_norms_with_one_named
+from probewise.challenge.coverage import effect_truths_and_intervals, place_overlap, sensor_truths_and_intervals
 from probewise.challenge.held_out import log_densities_of_scans
 from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
@@ -99,18 +99,18 @@ def _truth_result(case: Case, refit: NullRefit) -> dict[str, Any]:
         "noise_model": truth.noise_model,
         "readings": len(case.recording),
         "truth": list(truth.combination),
-        "hidden": _concealed_effects(truth.hidden, sizer, refit),
+        "hidden": _effect_results(truth.hidden, sizer, refit),
         "alias": None if truth.alias is None else truth.alias.effect.name,
         "cosine": truth.alias.cosine if truth.alias is not None else truth.cosine,
     }
 
 
-def _concealed_effects(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
+def _effect_results(hidden: Sequence[HiddenEffect], sizer: EffectSizer, refit: NullRefit) -> list[dict[str, Any]]:
     """Describe the effects; for a pair also "size_beside", the size of each effect when the other is in the model."""
     each = [_effect_result(one, sizer, refit) for one in hidden]
     if len(hidden) == 2:
         both = sizer.recording(*(one.effect for one in hidden))
-        left = residual_with_one_named(refit, sizer.clean, both, [one.name for one in hidden])
+        left = residual_norms_with_one_named(refit, sizer.clean, both, [one.name for one in hidden])
         for own, other in zip(each, reversed(each), strict=True):
             own["size_beside"] = left[other["name"]] / sizer.setup.world.noise_sd
     return each
@@ -126,7 +126,7 @@ def _effect_result(hidden: HiddenEffect, sizer: EffectSizer, refit: NullRefit) -
         "size_lambda": hidden.size_lambda,
         "on_noise": on_noise,
         "in_vocabulary": hidden.in_vocabulary,
-        "shows_in": list(hidden.shows_in),
+        "shows_in": list(hidden.visible_covariates),
         "cosines": {name: rho for name, rho in like.items() if rho > _LEAST_COSINE},
     }
 
@@ -140,13 +140,13 @@ def _diagnosis_result(case: Case, task: Task) -> dict[str, Any]:
     named = [h for h in case.truth.hidden if h.name in diagnosis.combination and h.name in found]
     region = case.truth.hidden[0].region if len(case.truth.hidden) == 1 else None
     return {
-        **scored_statements(diagnosis),
+        **statements_to_score(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
         "overlap": None if region is None else place_overlap(region, diagnosis.where),
-        "parameters": {h.name: truths_and_intervals(h.parameters, found[h.name]) for h in named},
+        "parameters": {h.name: effect_truths_and_intervals(h.parameters, found[h.name]) for h in named},
         "sensor": sensor_truths_and_intervals(case.world, diagnosis.repaired),
         "held_out": log_densities_of_scans(case, diagnosis, rng=files),
-        "settled": _diagnosed_after_advice(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
+        "settled": _result_after_advice(case, diagnosis, later) if case.truth.stratum.kind == "alias" else None,
         "cpu_s": cpu_s,
     }
 
@@ -159,13 +159,13 @@ def _investigation_result(case: Case, task: Task, *, rounds: int) -> dict[str, A
 
     begun_s = time.process_time()
     told = [
-        {**scored_statements(each.diagnosis), "readings": len(each.recording), "settled": each.settled}
+        {**statements_to_score(each.diagnosis), "readings": len(each.recording), "settled": each.settled}
         for each in investigate(record, case.recording.plan, rounds=rounds, rng=thinking)
     ]
     return {**told[-1], "readings": len(case.recording), "rounds": told, "cpu_s": time.process_time() - begun_s}
 
 
-def scored_statements(diagnosis: Diagnosis) -> dict[str, Any]:
+def statements_to_score(diagnosis: Diagnosis) -> dict[str, Any]:
     """Return the parts of a diagnosis that are scored, as a JSON object."""
     return {
         "verdict": diagnosis.verdict,
@@ -178,10 +178,10 @@ def scored_statements(diagnosis: Diagnosis) -> dict[str, Any]:
     }
 
 
-def _diagnosed_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
+def _result_after_advice(case: Case, diagnosis: Diagnosis, rng: np.random.Generator) -> Mapping[str, Any] | None:
     """Take the readings that the diagnosis advises and diagnose all readings together."""
     asked = diagnosis.next_measurement
     if asked is None:
         return None
     more = case.world.simulate(asked.plan, rng=rng)
-    return {"readings": len(more), **scored_statements(diagnose([case.recording, more], rng=rng))}
+    return {"readings": len(more), **statements_to_score(diagnose([case.recording, more], rng=rng))}

@@ -17,7 +17,7 @@ from probewise.world.world import World
 _NOT_STATED = frozenset({"softness"})  # parameters that the vocabulary does not estimate
 
 
-def truths_and_intervals(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
+def effect_truths_and_intervals(parameters: Mapping[str, Any], found: EffectFound) -> dict[str, list[float]]:
     """Pair each parameter's truth with its 95 % interval: name -> [truth, low, high].
 
     Angles are compared modulo a turn. Parameters with one value per run, which share a prior, are left out.
@@ -35,9 +35,9 @@ def truths_and_intervals(parameters: Mapping[str, Any], found: EffectFound) -> d
 
 
 def sensor_truths_and_intervals(world: World, samples: ModelSamples) -> dict[str, list[float]]:
-    """Pair the true second moments of the footprint and the levels with their 95 % intervals.
+    """Pair the true moments of the footprint, and the levels, with their 95 % intervals: name -> [truth, low, high].
 
-    Moments do not depend on the number of Gaussians: mean (mm), variances and covariance (mm^2).
+    The moments, mean (mm) and variances and covariance (mm^2), do not depend on the number of Gaussians.
     """
     mean, covariance = world.spot.moments()
     n_ssf = 6 * samples.n_gaussians

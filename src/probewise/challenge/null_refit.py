@@ -53,11 +53,11 @@ class NullRefit:
     def null(self, clean: Recording) -> Fit:
         """Fit the null to the clean readings; the result is cached."""
         if self._clean is not clean:
-            self._clean, self._null = clean, _best_order(clean)
+            self._clean, self._null = clean, _fit_of_best_order(clean)
         return self._null
 
 
-def _best_order(clean: Recording) -> Fit:
+def _fit_of_best_order(clean: Recording) -> Fit:
     extent, noise = Extent.of(clean), NoiseModel((), clean, least_sd=_NOISE_SD)
     sensor = default_sensor(extent, 1)
     found = min(

@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.challenge.estimates import Estimate, bootstrapped, share
-from probewise.challenge.scoring import leading_probability
+from probewise.challenge.scoring import leading_probability_and_correctness
 
 _EDGES = np.linspace(0, 1, 11)
 
@@ -25,7 +25,7 @@ class Bin:
 
 def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
     """Bin cases by the probability of their leading hypothesis into ten bins; empty bins are left out."""
-    said = [leading_probability(result) for result in results]
+    said = [leading_probability_and_correctness(result) for result in results]
     of_case = _bin_numbers(np.array([p for p, _ in said]))
     return tuple(
         Bin(
@@ -39,7 +39,7 @@ def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
 def calibration_error(results: Sequence[Mapping[str, Any]]) -> Estimate:
     """Estimate the expected calibration error: abs(stated - right) of each bin, averaged over the cases."""
     found = bootstrapped(
-        np.array([leading_probability(result) for result in results], dtype=np.float64).reshape(-1, 2),
+        np.array([leading_probability_and_correctness(result) for result in results], dtype=np.float64).reshape(-1, 2),
         _calibration_error_of_rows,
     )
     return replace(found, low=max(found.low, 0.0), high=max(found.high, 0.0)) if found.n else found

@@ -8,7 +8,13 @@ from typing import Any
 import numpy as np
 
 from probewise.challenge.estimates import Estimate, mean, share
-from probewise.challenge.scoring import Result, acts_on_mean, credible_set_covers, has_false_extra, leading_name_right
+from probewise.challenge.scoring import (
+    Result,
+    acts_on_mean,
+    credible_set_covers,
+    has_false_extra,
+    is_leading_name_right,
+)
 from probewise.challenge.table import Row, cases_with_one_effect, names_effect_on_mean, rejection_rate
 
 _BOOTSTRAPS = 2000
@@ -58,7 +64,7 @@ def _rows_before_and_after(
 
 
 def _share_named(results: list[Result], size: float) -> Estimate:
-    return share([leading_name_right(r) for r in cases_with_one_effect(results, size)])
+    return share([is_leading_name_right(r) for r in cases_with_one_effect(results, size)])
 
 
 def _mean_set_size(results: list[Result], size: float) -> Estimate:
@@ -78,7 +84,7 @@ def _pair_results(results: list[Result]) -> list[Result]:
 
 
 def _share_of_pairs_named(results: list[Result]) -> Estimate:
-    return share([leading_name_right(r) for r in _pair_results(results)])
+    return share([is_leading_name_right(r) for r in _pair_results(results)])
 
 
 def _share_of_pairs_with_false_extra(results: list[Result]) -> Estimate:

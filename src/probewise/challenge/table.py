@@ -24,15 +24,15 @@ from probewise.challenge.scoring import (
     Result,
     acts_on_mean,
     credible_set_covers,
-    effects_to_name,
     has_false_extra,
     is_distinguishable_from_ssf,
+    is_leading_name_right,
     is_out_of_vocabulary,
     leading_hypothesis,
-    leading_name_right,
-    leading_probability,
+    leading_probability_and_correctness,
     names_in_label,
     names_match,
+    right_name_sets,
 )
 
 Decision: TypeAlias = Literal["met", "missed", "open"]
@@ -63,7 +63,7 @@ class Row:
 
     @property
     def decision(self) -> Decision | None:
-        """Whether the target is met: decided only if the whole interval is on one side; None without a target."""
+        """Whether the target is "met" or "missed" by the whole interval, or "open" otherwise; None without a target."""
         if math.isinf(self.least) and math.isinf(self.most):
             return None
         if self.found.low >= self.least and self.found.high <= self.most:
@@ -95,7 +95,7 @@ def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -
     singles = cases_with_one_effect([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
-    return {name: (rejection_rate(rs, 0.01), share([leading_name_right(r) for r in rs])) for name, rs in own.items()}
+    return {name: (rejection_rate(rs, 0.01), share([is_leading_name_right(r) for r in rs])) for name, rs in own.items()}
 
 
 def _clean_rows(done: list[Result]) -> list[Row]:
@@ -133,7 +133,7 @@ def _detection_rows(done: list[Result]) -> list[Row]:
 
 def _naming_rows(done: list[Result]) -> list[Row]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
-    found = {size: share([leading_name_right(r) for r in cases_with_one_effect(done, size)]) for size in targets}
+    found = {size: share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]) for size in targets}
     falls = [_difference_of_shares(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
     worst = max(falls, key=lambda fall: fall.value, default=share([]))
     rows = []
@@ -183,7 +183,7 @@ def _probability_rows(done: list[Result]) -> list[Row]:
 def set_size_with_aliases_merged(result: Result) -> float:
     """Count the hypotheses of a credible set; the right one and its aliases count as one."""
     right = sum(
-        names_match(names_in_label(label), effects_to_name(result, merged=True)) for label in result["credible_set"]
+        names_match(names_in_label(label), right_name_sets(result, merged=True)) for label in result["credible_set"]
     )
     return float(len(result["credible_set"]) - max(right - 1, 0))
 
@@ -206,7 +206,7 @@ def _interval_rows(done: list[Result]) -> list[Row]:
     right = [
         r
         for r in done
-        if names_match(r["combination"], effects_to_name(r, merged=False)) and not is_out_of_vocabulary(r)
+        if names_match(r["combination"], right_name_sets(r, merged=False)) and not is_out_of_vocabulary(r)
     ]
     stated_of = [interval for r in right for own in r["parameters"].values() for interval in own.values()]
     gaussian = [r for r in right if r["ssf"] in _GAUSSIAN and r["kind"] != "ssf_order"]
@@ -224,15 +224,17 @@ def share_of_intervals_with_truth(intervals: list[list[float]]) -> Estimate:
 
 def _held_out_rows(done: list[Result]) -> list[Row]:
     inside = [r for r in done if r["kind"] in ("single", "pair") and acts_on_mean(r)]
-    gains = _gains_of([r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right")
+    gains = _gains_by_scan([r for r in inside if all("right" in scan for scan in r["held_out"].values())], "right")
     white = [r for r in inside if r["noise_model"] == "white"]
     outside = [r for r in done if r["kind"] == "outside" and r["noise_model"] == "white"]
-    worse = [_gains_over_null(r, _SCANS, "true")[0] < -1.0 for r in done]
+    worse = [_summed_gains_over_null(r, _SCANS, "true")[0] < -1.0 for r in done]
     return [
         Row("held-out gain, share of the right model's", bootstrapped(gains, _ratio_of_gains), 0.98),
         *(Row(f"  a new {scan}", bootstrapped(gains[:, k], _ratio_of_gains)) for k, scan in enumerate(_SCANS)),
-        Row("  share of what the truth itself would gain", bootstrapped(_gains_of(white, "true"), _ratio_of_gains)),
-        Row("  the same, outside the vocabulary", bootstrapped(_gains_of(outside, "true"), _ratio_of_gains)),
+        Row(
+            "  share of what the truth itself would gain", bootstrapped(_gains_by_scan(white, "true"), _ratio_of_gains)
+        ),
+        Row("  the same, outside the vocabulary", bootstrapped(_gains_by_scan(outside, "true"), _ratio_of_gains)),
         Row("held-out worse than the null by over 1 nat", share(worse), most=0.01),
         # The scatter that noise alone causes in the best gain possible with these readings.
         Row(
@@ -241,13 +243,13 @@ def _held_out_rows(done: list[Result]) -> list[Row]:
     ]
 
 
-def _gains_of(results: Sequence[Result], best: str) -> FloatArray:
-    """Return the gains of the repaired and the best model over the null, (n_cases, n_scans, 2)."""
-    gains = [[_gains_over_null(r, [scan], best) for scan in _SCANS] for r in results]
+def _gains_by_scan(results: Sequence[Result], best: str) -> FloatArray:
+    """Return the gains over the null of the repaired model and of model `best`, (n_cases, n_scans, 2)."""
+    gains = [[_summed_gains_over_null(r, [scan], best) for scan in _SCANS] for r in results]
     return np.array(gains, dtype=np.float64).reshape(-1, len(_SCANS), 2)
 
 
-def _gains_over_null(result: Result, scans: Sequence[str], best: str) -> tuple[float, float]:
+def _summed_gains_over_null(result: Result, scans: Sequence[str], best: str) -> tuple[float, float]:
     own = [result["held_out"][scan] for scan in scans]
     return sum(s["repaired"] - s["null"] for s in own), sum(s[best] - s["null"] for s in own)
 
@@ -259,7 +261,7 @@ def _ratio_of_gains(gains: FloatArray) -> float:
 
 def _pair_rows(done: list[Result]) -> list[Row]:
     pairs = [r for r in done if r["kind"] == "pair"]
-    both = [leading_name_right(r) for r in pairs]
+    both = [is_leading_name_right(r) for r in pairs]
     shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_size_beside_other(r)]
     return [
         Row("two effects: both named", share(both), 0.95),
@@ -296,7 +298,11 @@ def _alias_rows(done: list[Result]) -> list[Row]:
     return [
         Row("aliased pair: cannot tell", share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
         Row("aliased pair: sure of the wrong name", share([is_confidently_wrong(r) for r in aliased]), most=0.01),
-        Row("right name after the advised readings", share([leading_probability(r)[1] for r in settled]), 0.95),
+        Row(
+            "right name after the advised readings",
+            share([leading_probability_and_correctness(r)[1] for r in settled]),
+            0.95,
+        ),
         Row(
             "  readings advised, of those that repeating the plan needs",
             mean([r["settled"]["readings"] / readings_to_separate_alias(r) for r in aliased if r["settled"]]),
@@ -344,6 +350,6 @@ def names_effect_on_mean(result: Result) -> bool:
 
 def is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong effect is stated above .9; `clean` and `unknown` do not count."""
-    probability, right = leading_probability(result)
+    probability, right = leading_probability_and_correctness(result)
     names = leading_hypothesis(result, clean=True)[0]
     return probability > 0.9 and not right and names not in ((), ("unknown",))

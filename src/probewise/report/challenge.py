@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from probewise.challenge import Estimate, Row, confusion_counts, detected_and_named_by_effect, reliability_bins
-from probewise.challenge.scoring import effects_to_name, leading_hypothesis, leading_name_right, names_match
+from probewise.challenge.scoring import is_leading_name_right, leading_hypothesis, names_match, right_name_sets
 from probewise.challenge.systems import name_without_target
 from probewise.challenge.systems.table import gains_on_held_out_runs
 from probewise.recordings.table import csv_text_of_rows
@@ -131,7 +131,9 @@ def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
     if "failed" in result:
         return (*begun, f"failed: {result['failed']}", "", "no", "")
     names, probability = leading_hypothesis(result, clean=True)
-    right = leading_name_right(result) if result["hidden"] else names_match(names, effects_to_name(result, merged=True))
+    right = (
+        is_leading_name_right(result) if result["hidden"] else names_match(names, right_name_sets(result, merged=True))
+    )
     gains = gains_on_held_out_runs(result, "right")
     said = " and ".join(names) or "clean"
     return (

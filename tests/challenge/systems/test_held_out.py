@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, t
 
-from probewise.challenge.systems.held_out import predicted_runs
+from probewise.challenge.systems.held_out import predict_runs
 from probewise.diagnosis import ModelSamples
 from probewise.priors import Normal, Uniform
 from probewise.systems import RunTable, Simulator, System
@@ -32,13 +32,13 @@ def _later():
 
 
 def test_shared_parameters_are_the_posteriors():
-    predicted, sd = predicted_runs(*_samples(()), _later(), rng=np.random.default_rng(0))
+    predicted, sd = predict_runs(*_samples(()), _later(), rng=np.random.default_rng(0))
     np.testing.assert_allclose(predicted, np.tile(1.0 + 2.0 * X, (len(predicted), 1)))
     np.testing.assert_allclose(sd, 0.1)
 
 
 def test_what_is_a_runs_own_is_drawn_from_its_prior():
-    predicted, _ = predicted_runs(*_samples(("start",)), _later(), rng=np.random.default_rng(0))
+    predicted, _ = predict_runs(*_samples(("start",)), _later(), rng=np.random.default_rng(0))
     start = predicted[:, 0]
     np.testing.assert_allclose(predicted - start[:, None], np.tile(2.0 * X, (len(start), 1)), atol=1e-12)
     assert start.mean() == pytest.approx(5.0, abs=0.01)
@@ -47,7 +47,7 @@ def test_what_is_a_runs_own_is_drawn_from_its_prior():
 
 def test_the_value_that_an_effect_gives_to_a_run_is_drawn_for_a_run_not_seen():
     """As `predict_system` draws it: offsets 0.5 and -0.5 in two runs, so 3 degrees of freedom, width sqrt(.5 * 1.5)."""
-    predicted, _ = predicted_runs(*_samples((), "offset_per_run"), _later(), rng=np.random.default_rng(0))
+    predicted, _ = predict_runs(*_samples((), "offset_per_run"), _later(), rng=np.random.default_rng(0))
     offset = predicted[:, 0] - 1.0
     np.testing.assert_allclose(predicted - offset[:, None], np.tile(1.0 + 2.0 * X, (len(offset), 1)), atol=1e-12)
     np.testing.assert_allclose(np.quantile(offset, [0.1, 0.5, 0.9]), t.ppf([0.1, 0.5, 0.9], 3) * 0.75**0.5, atol=0.1)

@@ -9,8 +9,8 @@ import warnings
 from dataclasses import asdict
 from typing import Any
 
-from probewise.challenge.case import Task, scored_statements
-from probewise.challenge.coverage import truths_and_intervals
+from probewise.challenge.case import Task, statements_to_score
+from probewise.challenge.coverage import effect_truths_and_intervals
 from probewise.challenge.systems.held_out import log_densities_of_runs
 from probewise.diagnosis import Diagnosis
 from probewise.diagnosis.system.diagnose import diagnose_system
@@ -95,9 +95,9 @@ def _diagnosis_result(case: SystemCase, task: Task) -> dict[str, Any]:
     found = {effect.name: effect for effect in diagnosis.effects}
     named = [e for e in case.effects if e.name in diagnosis.combination and e.name in found]
     return {
-        **scored_statements(diagnosis),
+        **statements_to_score(diagnosis),
         "where": [place.covariate for place in diagnosis.where],
-        "parameters": {e.name: truths_and_intervals(e.parameters, found[e.name]) for e in named},
+        "parameters": {e.name: effect_truths_and_intervals(e.parameters, found[e.name]) for e in named},
         "formula": _has_formula(diagnosis),
         "held_out": log_densities_of_runs(case, diagnosis, kept_back, rng=later),
         "cpu_s": cpu_s,

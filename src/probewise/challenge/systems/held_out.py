@@ -43,19 +43,19 @@ def log_densities_of_runs(
     rows = np.flatnonzero(case.drawn.rows.run >= case.drawn.rows.n_runs - 2)
     about = cast(SimulatorApparatus, diagnosis.apparatus).about
     scores = {
-        "null": _log_density(*predicted_runs(diagnosis.null, about, later, rng=drawing[0]), readings),
-        "true": _log_density(case.noise_free[None, rows], np.array([sd]), readings),
+        "null": _log_mean_density(*predict_runs(diagnosis.null, about, later, rng=drawing[0]), readings),
+        "true": _log_mean_density(case.noise_free[None, rows], np.array([sd]), readings),
     }
     same = diagnosis.repaired is diagnosis.null
     scores["repaired"] = (
         scores["null"]
         if same
-        else _log_density(*predicted_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings)
+        else _log_mean_density(*predict_runs(diagnosis.repaired, about, later, rng=drawing[1]), readings)
     )
     if case.effects:
         try:
             right = right_predictions(case, _N_OF_A_RUN if case.drawn.kind.per_run else _N_SAMPLES, rng=fitting)
-            scores["right"] = _log_density(right, np.full(len(right), sd), readings)
+            scores["right"] = _log_mean_density(right, np.full(len(right), sd), readings)
         except NotConvergedError:
             pass  # no fit was possible, so the case does not count for the share
     run = case.drawn.rows.run[rows]
@@ -66,7 +66,7 @@ def log_densities_of_runs(
     }
 
 
-def predicted_runs(
+def predict_runs(
     samples: ModelSamples, about: ReferenceFit, table: RunTable, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Predict new runs: noise-free readings (n_samples, n_points), and the sd of a reading (n_samples,).
@@ -107,7 +107,7 @@ def predicted_runs(
     return predicted, samples.noise_sd[chosen]
 
 
-def _log_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
+def _log_mean_density(predicted: FloatArray, sd: FloatArray, readings: FloatArray) -> FloatArray:
     """Return the log of the mean density over samples, (n_points,)."""
     each = log_gaussian_density(readings, predicted, sd[:, None])
     return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))

@@ -13,11 +13,11 @@ from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     Result,
     credible_set_covers,
-    effects_to_name,
+    is_leading_name_right,
     is_out_of_vocabulary,
     leading_hypothesis,
-    leading_name_right,
     names_match,
+    right_name_sets,
 )
 from probewise.challenge.table import (
     Row,
@@ -80,7 +80,7 @@ def _naming_rows(done: list[Result]) -> list[Row]:
         *(
             Row(
                 f"right name and target first, lambda {size:g}",
-                share([leading_name_right(r) for r in cases_with_one_effect(done, size)]),
+                share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]),
                 least,
             )
             for size, least in targets.items()
@@ -90,7 +90,7 @@ def _naming_rows(done: list[Result]) -> list[Row]:
             share([bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]),
             0.95,
         ),
-        Row("two effects, lambda 12 each: both named", share([leading_name_right(r) for r in pairs]), 0.85),
+        Row("two effects, lambda 12 each: both named", share([is_leading_name_right(r) for r in pairs]), 0.85),
     ]
 
 
@@ -113,7 +113,7 @@ def _probability_rows(done: list[Result]) -> list[Row]:
 def _is_confidently_wrong(result: Result) -> bool:
     """Return whether a wrong name, not an alias of the truth, is stated above .9."""
     return is_confidently_wrong(result) and not names_match(
-        leading_hypothesis(result, clean=True)[0], effects_to_name(result, merged=True)
+        leading_hypothesis(result, clean=True)[0], right_name_sets(result, merged=True)
     )
 
 
@@ -123,7 +123,10 @@ def _interval_rows(done: list[Result]) -> list[Row]:
 
 
 def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | None:
-    """Return the gains of the repaired and the best model on the held-out runs, each at most 100 nats."""
+    """Return the gains over the null of the repaired model and of model `best` on the held-out runs, at most 100 nats.
+
+    None if a run lacks a finite density under one of the three models.
+    """
     own = [result["held_out"][run] for run in _RUNS]
     if any(model not in scores for scores in own for model in ("null", "repaired", best)):
         return None
@@ -131,7 +134,7 @@ def gains_on_held_out_runs(result: Result, best: str) -> tuple[float, float] | N
     return min(repaired, _MOST_NATS), min(most, _MOST_NATS)
 
 
-def _gain_shares(results: Sequence[Result]) -> FloatArray:
+def _shares_of_right_gain(results: Sequence[Result]) -> FloatArray:
     gains = [g for g in (gains_on_held_out_runs(r, "right") for r in results) if g is not None and g[1] >= _LEAST_NATS]
     return np.array([[repaired / right] for repaired, right in gains]).reshape(-1, 1)
 
@@ -139,16 +142,13 @@ def _gain_shares(results: Sequence[Result]) -> FloatArray:
 def _held_out_rows(done: list[Result]) -> list[Row]:
     named = [r for r in done if r["kind"] in ("single", "pair")]
     clean = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done if r["kind"] == "clean") if g is not None]
+    shares = bootstrapped(_shares_of_right_gain(named), lambda rows: float(np.median(rows)))
     every = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done) if g is not None]
     return [
-        Row("held-out runs: median share of the right model's gain", bootstrapped(_gain_shares(named), _median), 0.95),
+        Row("held-out runs: median share of the right model's gain", shares, 0.95),
         Row("held-out worse than the null by over 3 nats", share([bool(g < -3.0) for g in every])),
         Row("  of clean ones", share([bool(g < -3.0) for g in clean])),
     ]
-
-
-def _median(rows: FloatArray) -> float:
-    return float(np.median(rows))
 
 
 def _unlisted_law_rows(done: list[Result]) -> list[Row]:
@@ -167,7 +167,7 @@ def _unlisted_law_rows(done: list[Result]) -> list[Row]:
 def _gains_as_much_as_true_law(result: Result) -> bool:
     """Return whether a name or formula gains most of what the true law does; aliases count too."""
     if (
-        names_match(leading_hypothesis(result, clean=True)[0], effects_to_name(result, merged=True))
+        names_match(leading_hypothesis(result, clean=True)[0], right_name_sets(result, merged=True))
         and result["verdict"] != "unknown"
     ):
         return True

@@ -26,7 +26,7 @@ from probewise.sensor import mixture_names
 from probewise.study.circles import FIELD, POPULATIONS
 from probewise.study.concealed import ConcealedTrial, _arm_in_concealed_world
 from probewise.study.rows import REFERENCE
-from probewise.study.trial import BRIGHT, DARK, accuracy_of, experiment_of, has_reached_target
+from probewise.study.trial import BRIGHT, DARK, accuracy_measures, experiment_of, has_reached_target
 
 EFFECTS = ("backlash", "saturation", "nonlinearity", "albedo_gradient", "ambient_gradient", "edge_blur", "halo")
 CLEAR = 1
@@ -65,7 +65,7 @@ def run(sensor: FittedSensor, trial: ConcealedTrial) -> tuple[FittedSensor, dict
     figures = {
         "known": has_reached_target(last, experiment),
         "readings": last.number,
-        **accuracy_of(last, experiment, trial.truth),
+        **accuracy_measures(last, experiment, trial.truth),
         "credible": list(found.credible_set),
     }
     return repaired_sensor(sensor, last, rng=np.random.default_rng(trial.seed)), figures

@@ -78,6 +78,8 @@ def run_campaign(
         If the file belongs to another campaign, is damaged before its last line, or is being written to.
     NotConvergedError
         If a worker dies; finished results are kept.
+    ParameterError
+        If a result is not a JSON object of finite numbers.
     """
     path = Path(path)
     wanted = json.loads(json.dumps(dict(settings)))
@@ -163,7 +165,7 @@ class _ResultLog:
 def _results_as_tasks_end(
     work: Callable[[T], Result], tasks: Mapping[str, T], executor: Executor | None
 ) -> Iterator[Iterator[tuple[str, Result]]]:
-    """Yield (key, result) as tasks end; on leaving, cancel the tasks that have not begun."""
+    """Give an iterator over (key, result) as tasks end; on leaving, cancel the tasks that have not begun."""
     if executor is None:
         yield ((key, work(task)) for key, task in tasks.items())
         return

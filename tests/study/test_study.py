@@ -8,7 +8,7 @@ import pytest
 from probewise.campaign import run_campaign
 from probewise.errors import FileError, ParameterError
 from probewise.study import REFERENCE, Row, Trial, paper_rows, read_study, run_study, run_trial
-from probewise.study.trial import experiment_for_trial
+from probewise.study.trial import experiment_of_trial
 
 ROWS = [REFERENCE, Row(model="naive")]
 BRIEF = {"n_circles": 2, "max_readings": 3}
@@ -58,7 +58,7 @@ def test_the_papers_method_stands_beside_ours_on_the_same_circle():
     for row in (paper, naive):
         found = run_trial(Trial(row, 0, max_readings=1))
         assert (found["readings"], found["reached"]) == (1, False)
-    one, again, other = (experiment_for_trial(Trial(naive, k)).likelihood for k in (0, 0, 1))
+    one, again, other = (experiment_of_trial(Trial(naive, k)).likelihood for k in (0, 0, 1))
     assert one == again != other
     assert abs(one.mu_black - 10) < 5 / 20**0.5
     assert abs(one.mu_white - 60) < 5 / 20**0.5

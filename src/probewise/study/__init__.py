@@ -4,7 +4,7 @@ A study is a campaign of autonomous runs: every row of its table has the same ci
 from a reference row in one factor.
 """
 
-from probewise.study.circles import POPULATIONS, Population, noise_of_run
+from probewise.study.circles import POPULATIONS, Population, standard_noise_of_run
 from probewise.study.concealed import (
     CONCEALED,
     ConcealedRow,
@@ -36,7 +36,6 @@ __all__ = [
     "concealed_rows",
     "concealed_table",
     "experiment_of",
-    "noise_of_run",
     "paper_rows",
     "read_study",
     "run_concealed",
@@ -44,12 +43,13 @@ __all__ = [
     "run_study",
     "run_trial",
     "share_with_interval",
+    "standard_noise_of_run",
     "standard_rows",
     "summarise",
 ]
 
-noise_of = noise_of_run
-"""The old name of `noise_of_run`."""
+noise_of = standard_noise_of_run
+"""The old name of `standard_noise_of_run`."""
 
 share_within = share_with_interval
 """The old name of `share_with_interval`."""

@@ -30,7 +30,7 @@ from probewise.study.trial import (
     BRIGHT,
     DARK,
     SEED,
-    accuracy_of,
+    accuracy_measures,
     experiment_of,
     footprint_pixels,
     has_reached_target,
@@ -144,8 +144,8 @@ class ConcealedTrial:
         return self.circle_mm if frame is None else frame(CONCEALED[self.effect][1][self.size], self.circle_mm)
 
     @property
-    def name(self) -> str:
-        """The right answer of the run."""
+    def right_answer(self) -> str:
+        """The name that a run should give: of the concealed effect, of an equivalent one, or clean."""
         return NAMES.get(self.effect, self.effect)
 
     @property
@@ -180,8 +180,8 @@ def run_concealed_trial(trial: ConcealedTrial) -> dict[str, Any]:
     return {
         "known": has_reached_target(last, experiment),
         "readings": last.number,
-        **accuracy_of(last, experiment, trial.truth),
-        "p_truth": round(left_out.probability.get(trial.name, 0.0), 4),
+        **accuracy_measures(last, experiment, trial.truth),
+        "p_truth": round(left_out.probability.get(trial.right_answer, 0.0), 4),
         "credible": list(left_out.credible_set),
         "noticed": bool(last.p_value < experiment.doubt_p or left_out.leading != CLEAN),
         "cpu_s": [round(float(np.quantile(cpu, q)), 3) for q in (0.5, 0.95)],
@@ -226,7 +226,7 @@ def run_concealed(
     executor: Executor | None = None,
     progress: Progress = silent,
 ) -> dict[ConcealedTrial, dict[str, Any]]:
-    """Run every row over the first circles, with and without doubt, or resume an interrupted study.
+    """Run every row over the first circles, with and without doubt in the sensor, or resume an interrupted study.
 
     Parameters
     ----------
@@ -296,7 +296,7 @@ def concealed_rows(results: Mapping[ConcealedTrial, Mapping[str, Any]]) -> list[
     """Summarise each row: effect, size and trust."""
     rows: dict[tuple[str, int, float], list[tuple[str, Mapping[str, Any]]]] = {}
     for trial, result in results.items():
-        rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.name, result))
+        rows.setdefault((trial.effect, trial.size, trial.trust), []).append((trial.right_answer, result))
     return [_summary_row(key, runs) for key, runs in rows.items()]
 
 

@@ -32,7 +32,7 @@ from probewise.priors import Normal, Product
 from probewise.recordings import Disc
 from probewise.scene import HypothesisScene
 from probewise.sensor import FAST_NODES, Chain, FixedLevels, FixedMixture, FreeLevels, NaiveSensor
-from probewise.study.circles import FIELD, POPULATIONS, noise_of_run
+from probewise.study.circles import FIELD, POPULATIONS, standard_noise_of_run
 from probewise.study.rows import Row
 from probewise.study.table import WRONG_MM
 from probewise.world import Blob, Spot, World, gaussian_spot
@@ -95,7 +95,7 @@ def experiment_of(row: Row) -> Experiment:
     return Experiment(shape, free, GaussianKnown(row.noise_sd), **common, sensor_prior=_prior_of_sensor_changes())
 
 
-def experiment_for_trial(trial: Trial) -> Experiment:
+def experiment_of_trial(trial: Trial) -> Experiment:
     """Build the experiment of a row over one circle; the paper's naive robot first reads black and white sheets."""
     posed = experiment_of(trial.row)
     if (trial.row.method, trial.row.model) != ("paper", "naive"):
@@ -117,7 +117,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     covers the truth (`held`), p-value of the fit (`p_value`), widest posterior sd after each reading (`widest_mm`).
     Cost: arm time in seconds (`arm_s`), median processor time per decision in seconds (`cpu_s`).
     """
-    experiment = experiment_for_trial(trial)
+    experiment = experiment_of_trial(trial)
     widest, cpu, first_white, bits_at_white = [], [], None, None
     for step, cpu_s in timed_steps(arm_of(trial), experiment, circle=trial.circle, max_readings=trial.max_readings):
         last = step
@@ -131,7 +131,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         "first_white": first_white,
         "bits": round(last.bits, 3),
         "bits_at_white": bits_at_white,
-        **accuracy_of(last, experiment, trial.truth),
+        **accuracy_measures(last, experiment, trial.truth),
         "arm_s": round(last.reading.time_s, 2),
         "cpu_s": round(float(np.median(cpu)), 4),
         "widest_mm": widest,
@@ -160,8 +160,8 @@ def has_reached_target(last: Step, experiment: Experiment) -> bool:
     return bool(last.p_value >= experiment.doubt_p and known)
 
 
-def accuracy_of(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
-    """Compare the last posterior of the shape with the truth, (3,)."""
+def accuracy_measures(last: Step, experiment: Experiment, truth: FloatArray) -> dict[str, Any]:
+    """Compare the last posterior with the true shape, (3,): `error_mm`, `chance_wrong` and `held` of `run_trial`."""
     columns = experiment.shape_columns
     theta, weight = last.posterior.theta[:, columns], last.posterior.weight
     held = []
@@ -180,7 +180,7 @@ def arm_of(trial: Trial) -> SimulatedArm:
     world = World(footprint_pixels(), black=DARK, white=BRIGHT, noise_sd=0.0)
     x_mm, y_mm, radius_mm = trial.truth.tolist()
     disc = Disc((x_mm, y_mm), radius_mm)
-    noise, number = noise_of_run(trial.circle, trial.max_readings), itertools.count()
+    noise, number = standard_noise_of_run(trial.circle, trial.max_readings), itertools.count()
 
     def light(pose: Pose, time_s: float, height_mm: float) -> float:
         clean = world.read(disc, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=None)

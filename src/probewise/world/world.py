@@ -116,7 +116,7 @@ class World:
         rng
             Generator of the noise; None: a reading without noise.
         direction
-            Unit vector of the motion that led there, for backlash.
+            Unit vector of the motion that led there, for backlash and hysteresis.
         height_mm
             Height of the sensor; None: `self.height_mm`.
         """

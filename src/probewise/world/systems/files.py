@@ -53,7 +53,7 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
 
 
 def truth_of(case: SystemCase) -> dict[str, Any]:
-    """Return the truth of a case."""
+    """Return the truth of a case as a JSON object, the content of truth.json."""
     seen = case.drawn.diagnosed_row_numbers
     later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
     pair = len(case.effects) == 2

@@ -165,7 +165,7 @@ class _Integration:
         return out
 
     def discontinuity_shares(self, k: int) -> list[float]:
-        """Return the shares of the gap from position k to the next with discontinuities, with 0 and 1."""
+        """Return shares of the gap from position k to the next: 0, the discontinuities of any sample or run, and 1."""
         here, there = self.row_by_position[k], self.row_by_position[k + 1]
         begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
         moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
@@ -193,7 +193,10 @@ class _Integration:
         return self._states_at_rows(names, kept)
 
     def _integrate_gap(self, s: FloatArray, k: int, names: list[str]) -> FloatArray:
-        """Integrate from position k of all runs to the next, (n_states, n_samples, n_runs), with the initial modes."""
+        """Integrate from position k of all runs to the next, (n_states, n_samples, n_runs).
+
+        A gap of a sample and run in which friction or a bound changes its mode is integrated again with events.
+        """
         time = self.rows.time
         assert time is not None
         t = self.columns[time]

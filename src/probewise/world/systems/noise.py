@@ -1,4 +1,4 @@
-"""Other kinds of noise, with a requested detectability."""
+"""Kinds of noise, most of them other than white, some with a requested detectability."""
 
 from __future__ import annotations
 

@@ -46,8 +46,8 @@ class Summary:
     reached
         Share of runs that reached the target precision within the limit of readings, with its 95 % interval.
     mean, median
-        Readings needed, a miss counted as the limit; mean with standard error, median with 95 % interval (NaN for fewer
-        than `LEAST_FOR_MEDIAN` runs).
+        Readings needed, a miss counted as the limit; mean with standard error, median with 95 % interval (NaN bounds
+        for fewer than `LEAST_FOR_MEDIAN` runs).
     to_white
         Readings up to the first one on white, a run without one counted as the limit.
     after_white
@@ -65,7 +65,7 @@ class Summary:
     arm_s
         Arm time per run in seconds, with the standard error.
     cpu_s
-        Processor time per decision, median over runs of each run's median; None if not recorded.
+        Processor time per decision, median over runs of each run's median, in seconds.
     """
 
     n_runs: int

@@ -1,7 +1,7 @@
-"""Likelihoods, and the inference problem: a prior, a sensor model, a likelihood and a recording.
+"""Likelihoods of readings, and the inference problem: a prior, a sensor model, a likelihood and a recording.
 
-The paper's naive likelihood and its Student-t likelihood (sigma of each data set integrated
-out), and Gaussian likelihoods; any sensor model works with any of them.
+The likelihoods are the paper's naive one, its Student-t (the noise sd of each data set integrated out), Gaussian ones,
+and one of rounded readings; any sensor model works with any of them.
 """
 
 from probewise.inference.gaussian import GaussianInferred, GaussianKnown

@@ -1,4 +1,4 @@
-"""Gaussian likelihoods: the sd of the noise is known, or a parameter."""
+"""Gaussian likelihoods, with the sd of the noise known or as a parameter."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class GaussianKnown:
 
 @dataclass(frozen=True, eq=False)
 class GaussianInferred:
-    """An inference problem whose last parameter is the sd of the Gaussian noise; otherwise as `SensorProblem`.
+    """An inference problem with Gaussian noise, whose sd is the last parameter; otherwise as `SensorProblem`.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class GaussianInferred:
     sd_prior
         Prior of the sd, in units of the reading, for instance `LogUniform(floor, ceiling)`.
     sd_name
-        Name of its column.
+        Name of the sd among the parameters.
     """
 
     sensor_prior: Prior
@@ -78,11 +78,11 @@ class GaussianInferred:
 
     @cached_property
     def prior(self) -> Prior:
-        """The sensor's prior, then the sd's."""
+        """Joint prior of the sensor's parameters, then the sd."""
         return Joint((self.sensor_prior, Product({self.sd_name: self.sd_prior})))
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Return the log likelihood of the usable readings, (n_samples, n_params) -> (n_samples,)."""
+        """Return the log likelihood of the usable readings, (n_samples, n_params), sd last -> (n_samples,)."""
         usable = self.recording.usable
         predicted = self.model.predict(theta[:, :-1], self.recording.plan)[:, usable]
         readings = self.recording.readings[usable]
@@ -90,7 +90,10 @@ class GaussianInferred:
 
 
 def log_prob_gaussian(readings: FloatArray, predicted: FloatArray, sd: FloatArray) -> FloatArray:
-    """Return the log likelihood for one sd each, (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)."""
+    """Return the Gaussian log likelihood of readings, with one noise sd per hypothesis.
+
+    (n_points,), (n_samples, n_points), (n_samples,) -> (n_samples,)
+    """
     residual = residuals(readings, predicted)
     square = np.einsum("ij,ij->i", residual, residual)
     return np.asarray(-0.5 * square / sd**2 - readings.size * (np.log(sd) + 0.5 * _LOG_2PI))

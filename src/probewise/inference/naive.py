@@ -1,4 +1,4 @@
-"""The naive likelihood: one level over black, another over white (paper, eq. naive).
+"""The naive likelihood: the sensor reads one level over black, another over white (paper, eq. naive).
 
 The paper prints (2 pi sigma)^(-1/2) and a positive exponent; a normal density has
 (2 pi sigma^2)^(-1/2) and a negative one.
@@ -45,10 +45,10 @@ class Naive:
 
     @classmethod
     def estimated(cls, black: ArrayLike, white: ArrayLike, *, sd_floor: float) -> Naive:
-        """Estimate means and sds from readings over known black and known white, two or more of each.
+        """Build from readings over known black and known white, two or more of each: their means and sds.
 
-        `sd_floor`, for instance `step / sqrt(12)`, bounds the sd where all readings are equal. Raises ParameterError if
-        readings are too few or not finite.
+        `sd_floor`, for instance `step / sqrt(12)`, is the least sd, for readings that are all equal. Raises
+        ParameterError if readings are too few or not finite.
         """
         values: list[float] = []
         for name, readings in (("black", black), ("white", white)):

@@ -1,4 +1,4 @@
-"""Bounds of a recording's noise sd, which make its prior proper."""
+"""Bounds of a recording's noise sd, between which its prior is proper."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from probewise.recordings.plan import Recording
 
 
 def reading_span(recording: Recording) -> float:
-    """Return the range of the usable readings; if they are all equal, the declared range, or else 1."""
+    """Return the range of the usable readings, max - min; if that is 0, the declared range, or else 1."""
     readings = recording.readings[recording.usable]
     span = float(np.ptp(readings)) if readings.size else 0.0
     if span > 0:
@@ -25,10 +25,10 @@ def reading_span(recording: Recording) -> float:
 
 
 def sd_floor(recording: Recording) -> float:
-    """Return the lower bound of the noise sd: the sd of rounding to the declared step, at least a share of the range.
+    """Return the lower bound of the noise sd: that of rounding to the declared step, or a share of the range if larger.
 
-    Where no step is declared, that of the lattice on which all readings lie is used. Otherwise readings at levels on
-    that lattice would have residual zero, which a heavy-tailed noise model would take for the noise.
+    Where no step is declared, that of the lattice on which all readings lie, if any, is used: residuals of readings at
+    levels of that lattice would be 0 otherwise, which a heavy-tailed noise model would take for the noise sd.
     """
     step = recording.plan.instrumentation.step or lattice_step(recording.readings[recording.usable])
     return max(step / math.sqrt(12.0), recording.least_share_of_span * reading_span(recording))
@@ -40,14 +40,14 @@ def sd_ceiling(recording: Recording) -> float:
 
 
 def student_t_of(recording: Recording, groups: IntArray | None = None) -> StudentT:
-    """Build the Student-t likelihood of a recording's usable readings, with the bounds of this module.
+    """Build the Student-t likelihood of a recording's usable readings, with `sd_floor` and `sd_ceiling` of it.
 
     Parameters
     ----------
     recording
         The recording.
     groups
-        Data set of each row of the plan, (n_points,); by default its scan.
+        Data set of each row of the plan, (n_points,), each with its own noise sd; by default its scan.
     """
     rows = recording.plan.scan if groups is None else np.asarray(groups)
     return StudentT(rows[recording.usable], sd_floor(recording), sd_ceiling(recording))

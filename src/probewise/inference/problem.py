@@ -1,4 +1,4 @@
-"""An inference problem: a prior, a model that predicts readings, and a likelihood."""
+"""Inference problems: a prior, a model that predicts readings, a likelihood, and the readings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MOST_NUMBERS = 1_000_000  # predicted at a time, to bound memory
 
 
 class Likelihood(Protocol):
-    """A likelihood of readings given predictions."""
+    """The interface of a likelihood of readings given predictions."""
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return the log likelihood, constants included, (n_points,), (n_samples, n_points) -> (n_samples,)."""
@@ -26,26 +26,26 @@ class Likelihood(Protocol):
 
 
 class Problem(Protocol):
-    """A prior and a likelihood, as nested sampling needs them."""
+    """The interface of an inference problem: a prior, and the log likelihood of parameters."""
 
     @property
     def prior(self) -> Prior:
-        """The prior; its names are the problem's parameters."""
+        """The prior; its names are those of the parameters."""
         ...
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Return the log likelihood of a batch of hypotheses, (n_samples, n_params) -> (n_samples,)."""
+        """Return the log likelihood of each hypothesis, (n_samples, n_params) -> (n_samples,)."""
         ...
 
 
 def require_model(model: object) -> None:
-    """Raise ParameterError unless `model` is a sensor model."""
+    """Raise ParameterError unless `model` is like a sensor model: with `names` and `predict`."""
     allowed = "a sensor model such as Chain(ssf, levels, scene), with names and predict(theta, plan)"
     require_like("model", model, ("names", "predict"), allowed)
 
 
 def checked_log_prob(likelihood: Likelihood, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-    """Return the log likelihood of each prediction, (n_points,), (n_samples, n_points) -> (n_samples,).
+    """Return a likelihood's log likelihood of each prediction, (n_points,), (n_samples, n_points) -> (n_samples,).
 
     Raises ShapeError if the likelihood, which may be a user's own, does not return one number per hypothesis.
     """
@@ -66,7 +66,10 @@ def require_likelihood(likelihood: object) -> None:
 
 @dataclass(frozen=True, eq=False)
 class SensorProblem:
-    """The problem of inferring sensor, scene or both from a recording's usable readings."""
+    """The problem of inferring sensor, scene or both (the model's parameters) from a recording's usable readings.
+
+    Raises ParameterError if the names of `prior` and `model` differ.
+    """
 
     prior: Prior
     model: SensorModel

@@ -61,25 +61,25 @@ class Rounded:
         return np.asarray(self._log_cell_probability(away).sum(axis=1))
 
     def _log_cell_probability(self, away: FloatArray) -> FloatArray:
-        """Look up the log probability of a cell, by its distance from the prediction in sds."""
+        """Interpolate the log probability of readings' cells from a table, by distance from the prediction in sds."""
         position = np.minimum(away, _FAR - 1.0) * _PER_SD
         entry = position.astype(np.int64)
-        below = self._table[entry]
-        out = below + (position - entry) * (self._table[entry + 1] - below)
+        below = self._log_probability_table[entry]
+        out = below + (position - entry) * (self._log_probability_table[entry + 1] - below)
         far = away > _FAR - 1.0
         if far.any():
-            out[far] = self._log_cell_exactly(away[far])
+            out[far] = self._exact_log_cell_probability(away[far])
         return np.asarray(out)
 
     def _log_end_probability(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the log probability of a clipped reading: everything beyond that end of the scale."""
+        """Return the log probability of readings at an end of the scale: of everything beyond it."""
         inward = np.where(readings >= self.high, predicted - readings, readings - predicted)
         return np.asarray(log_ndtr((inward + 0.5 * self.step) / self.sd))
 
     @cached_property
-    def _table(self) -> FloatArray:
-        return self._log_cell_exactly(np.arange(0.0, _FAR + 1.0 / _PER_SD, 1.0 / _PER_SD))
+    def _log_probability_table(self) -> FloatArray:
+        return self._exact_log_cell_probability(np.arange(0.0, _FAR + 1.0 / _PER_SD, 1.0 / _PER_SD))
 
-    def _log_cell_exactly(self, away: FloatArray) -> FloatArray:
+    def _exact_log_cell_probability(self, away: FloatArray) -> FloatArray:
         half = 0.5 * self.step / self.sd
         return log_mass_between(-half - away, half - away)

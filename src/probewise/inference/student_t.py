@@ -1,6 +1,6 @@
 """The paper's Student-t likelihood of readings with unknown noise sd, made proper.
 
-The paper integrates a Gaussian over its unknown sigma and keeps [sum of squares]^(-(N-1)/2). With
+The paper integrates a Gaussian over its unknown sd, sigma, and keeps [sum of squares]^(-(N-1)/2). With
 an unbounded prior of sigma this diverges where a hypothesis fits the few readings of a small data set
 exactly, and is flat after one reading. So here sigma's prior is 1/sigma between a floor and a
 ceiling, and all constants are kept.
@@ -58,12 +58,12 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
     if fits.any():
         b = a[fits]
         out[fits] = _log_difference(
-            _log_lower_scaled(b, t_low[fits]) - 2.0 * b * math.log(low),
-            _log_lower_scaled(b, t_high[fits]) - 2.0 * b * math.log(high),
+            _log_lower_gamma_scaled(b, t_low[fits]) - 2.0 * b * math.log(low),
+            _log_lower_gamma_scaled(b, t_high[fits]) - 2.0 * b * math.log(high),
         )
     if huge.any():
         b = a[huge]
-        difference = _log_difference(_log_upper(b, t_high[huge]), _log_upper(b, t_low[huge]))
+        difference = _log_difference(_log_upper_gamma(b, t_high[huge]), _log_upper_gamma(b, t_low[huge]))
         out[huge] = difference + b * (math.log(2.0) - np.log(s[huge]))
     usual = ~(fits | huge)
     if usual.any():
@@ -72,7 +72,7 @@ def log_sigma_integral(square: ArrayLike, n: ArrayLike, low: float, high: float)
 
 
 def _log_twice_integral_over_peak(s: FloatArray, a: FloatArray, t_low: FloatArray, t_high: FloatArray) -> FloatArray:
-    """Return the log of twice the integral, for t_low above a and t_high below."""
+    """Return the log of twice the integral, for t_low above a and t_high below: the integrand's peak is within."""
     share = gammainc(a, t_low) - gammainc(a, t_high)
     return np.asarray(gammaln(a) + np.log(share) + a * (math.log(2.0) - np.log(s)))
 
@@ -81,8 +81,8 @@ def _log_difference(large: FloatArray, small: FloatArray) -> FloatArray:
     return np.asarray(large + np.log(-np.expm1(np.minimum(small - large, -1e-300))))
 
 
-def _log_lower_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the log of gamma(a, t) / t^a, finite at t = 0; for t below about a."""
+def _log_lower_gamma_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
+    """Return the log of gamma(a, t) / t^a, gamma the lower incomplete one; finite at t = 0, for t up to about a."""
     share = gammainc(a, t)
     safe = np.where(share > _TINY, t, 1.0)
     out = np.log(np.maximum(share, _TINY)) + gammaln(a) - a * np.log(safe)
@@ -97,8 +97,8 @@ def _log_lower_scaled(a: FloatArray, t: FloatArray) -> FloatArray:
     return np.asarray(out)
 
 
-def _log_upper(a: FloatArray, t: FloatArray) -> FloatArray:
-    """Return the log of Gamma(a, t), for t above about a; -inf at t = inf."""
+def _log_upper_gamma(a: FloatArray, t: FloatArray) -> FloatArray:
+    """Return the log of Gamma(a, t), the upper incomplete gamma function, for t from about a; -inf at t = inf."""
     share = gammaincc(a, t)
     out = np.log(np.maximum(share, _TINY)) + gammaln(a)
     rare = share <= _TINY
@@ -142,21 +142,21 @@ class StudentT:
 
     @cached_property
     def _membership(self) -> FloatArray:
-        """One where reading i belongs to data set j, (n_points, n_groups)."""
+        """Indicator matrix, (n_points, n_groups): 1 where reading i belongs to data set j."""
         return np.asarray(self.groups[:, None] == np.unique(self.groups)[None, :], dtype=np.float64)
 
     @cached_property
-    def _starts(self) -> IntArray | None:
-        """Index of each data set's first reading, if they are many, in one piece each and in order; otherwise None."""
+    def _group_starts(self) -> IntArray | None:
+        """Index of each data set's first reading, if there are over 16, each contiguous and in order; else None."""
         starts = np.flatnonzero(np.diff(self.groups, prepend=self.groups[:1] - 1))
         in_one_piece = starts.size == self.sizes.size and bool((np.diff(self.groups[starts]) > 0).all())
         return starts if in_one_piece and starts.size > _MANY_GROUPS else None
 
     def sums_by_group(self, square: FloatArray) -> FloatArray:
-        """Sum over the readings of each data set, (n_samples, n_points) -> (n_samples, n_groups)."""
-        if self._starts is None:
+        """Return sums over the readings of each data set, (n_samples, n_points) -> (n_samples, n_groups)."""
+        if self._group_starts is None:
             return square @ self._membership
-        return np.asarray(np.add.reduceat(square, self._starts, axis=1))
+        return np.asarray(np.add.reduceat(square, self._group_starts, axis=1))
 
     @cached_property
     def sizes(self) -> FloatArray:
@@ -178,7 +178,9 @@ class StudentT:
         return np.asarray(integral.sum(axis=1) - constant)
 
     def weights(self, residual: FloatArray) -> FloatArray:
-        """Return one over each reading's noise variance, from its data set's residuals; both (n_samples, n_points).
+        """Return one over the noise variance of each reading's data set, as its residuals estimate it.
+
+        (n_samples, n_points) -> the same shape.
 
         The gradient of `log_prob` by the predictions is the residual times this, except near the bounds of the sd.
         """
@@ -187,14 +189,17 @@ class StudentT:
         return np.asarray(per_set[:, np.unique(self.groups, return_inverse=True)[1]])
 
     def pooled(self, readings: FloatArray, predicted: FloatArray) -> PooledSigma:
-        """Return the posterior of one sigma that all data sets share, for predicting a new data set."""
+        """Return the posterior of one sigma that all data sets share, for predicting a new data set.
+
+        It is from readings (n_points,) and each hypothesis' predictions (n_samples, n_points).
+        """
         residual = residuals(readings, predicted)
         return PooledSigma((residual**2).sum(axis=1), residual.shape[1], self.sd_floor, self.sd_ceiling)
 
 
 @dataclass(frozen=True, eq=False)
 class PooledSigma:
-    """Posterior of one sigma for a new scan, given all residuals of each hypothesis.
+    """Posterior of the noise sd, sigma, of each hypothesis, given all its residuals, for predicting new readings.
 
     Parameters
     ----------
@@ -216,7 +221,10 @@ class PooledSigma:
         object.__setattr__(self, "square", frozen(self.square))
 
     def log_density(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return new readings' marginal log density, (n_points,), (n_samples, n_points) -> (n_samples, n_points)."""
+        """Return the marginal log density of each new reading.
+
+        (n_points,), (n_samples, n_points) -> (n_samples, n_points)
+        """
         square = self.square[:, None]
         more = log_sigma_integral(
             square + residuals(readings, predicted) ** 2, self.n + 1, self.sd_floor, self.sd_ceiling
@@ -224,7 +232,7 @@ class PooledSigma:
         return np.asarray(more - self._log_norm()[:, None] - 0.5 * _LOG_2PI)
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the joint log density of a new scan, (n_points,), (n_samples, n_points) -> (n_samples,)."""
+        """Return the joint log density of new readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
         residual = residuals(readings, predicted)
         n_new = residual.shape[1]
         square = self.square + (residual**2).sum(axis=1)

@@ -14,9 +14,9 @@ from probewise.recordings.plan import Plan
 
 @dataclass(frozen=True)
 class Budget:
-    """Readings and minutes that may be spent after the first plan; may be infinite.
+    """Readings and minutes that may be spent after the first plan; either may be infinite.
 
-    Minutes are times in the plans, including the breaks between rounds.
+    Minutes are measured by the times in the plans, breaks between rounds included.
     """
 
     readings: float = 400
@@ -28,11 +28,14 @@ class Budget:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
     def minus(self, plan: Plan, after_s: float) -> Budget:
-        """Subtract the cost of a plan that begins after a time; the budget stays at 0 or more."""
+        """Return the budget without the cost of a plan, 0 at least; minutes count from `after_s` to the plan's end."""
         return Budget(max(self.readings - len(plan), 0), max(self.minutes - _minutes_of_plan(plan, after_s), 0.0))
 
     def affordable_scans(self, plan: Plan, after_s: float) -> Plan | None:
-        """Return the leading scans of a plan that fit the budget; None if not even the first does."""
+        """Return the plan's first scans that fit the budget; None if not even one does.
+
+        Minutes count from `after_s`.
+        """
         kept = np.zeros(0, dtype=np.int64)
         for rows in plan.rows_by_scan():
             more = np.concatenate([kept, rows])

@@ -36,14 +36,14 @@ _KEPT_AGAIN_S = 0.5  # an arm takes longer per reading, so that none of its read
 
 
 class RoundsFolder:
-    """The rounds of one investigation, in a folder.
+    """The folder of one investigation, in which the plan and the readings of its rounds are kept.
 
     Parameters
     ----------
     path
         The folder; created with the first round if missing.
     settings
-        Settings that determine the investigation, as JSON.
+        Settings that determine the investigation, as JSON takes them.
     resume
         Whether to resume the investigation in the folder.
 
@@ -66,7 +66,10 @@ class RoundsFolder:
         self._settings = wanted
 
     def record(self, number: int, plan: Plan, asked: str, *, take: Take, progress: Progress = silent) -> Recording:
-        """Take the readings of a round, or those still missing, and write them to the folder."""
+        """Take the readings of a round, or those still missing, write them to the folder, and return them.
+
+        A plan of the round that is in the folder already is used in place of `plan`; `asked` is the plan in words.
+        """
         planned, readings_file = self.path / f"{number}_plan.csv", self.path / f"{number}.csv"
         if not planned.exists():
             self.path.mkdir(parents=True, exist_ok=True)
@@ -95,7 +98,7 @@ class RoundsFolder:
 
     @property
     def last_time_s(self) -> float:
-        """Time of the last reading; 0 if there is none."""
+        """Time of the last reading in seconds; 0 if there is none."""
         return max((float(recording.plan.time_s.max()) for recording in self._recordings_of_rounds()), default=0.0)
 
     def _recordings_of_rounds(self) -> Iterator[Recording]:

@@ -1,4 +1,4 @@
-"""The loop: record a plan, diagnose all readings, plan further ones, until settled or the budget is spent."""
+"""The loop of an investigation: record a plan, diagnose all readings so far, plan further ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from probewise._kinds import require_accepts_positional, require_kind, require_rng, require_whole
-from probewise.diagnosis import Diagnosis, NextMeasurement, SensorPrior, diagnose
+from probewise.diagnosis import Diagnosis, SensorPrior, diagnose
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.investigation.budget import Budget
 from probewise.investigation.rounds import Round, reason_if_settled
@@ -34,18 +34,20 @@ def investigate(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Generator[Round, None, None]:
-    """Record and diagnose until one hypothesis has probability .95, no reading would help, or the budget is spent.
+    """Record and diagnose until a hypothesis has probability 0.95, no reading would help, or the budget is spent.
+
+    It also ends after `rounds` rounds.
 
     Parameters
     ----------
     record
-        Takes the readings of a round's plan.
+        Function that takes the readings: of a round's number, its plan and the plan in words; returns the recording.
     plan
         The first plan.
     sensor
         An earlier calibration, whose posterior becomes the prior; without it each diagnosis calibrates its own.
     effects
-        The vocabulary of effects, by name.
+        The vocabulary: classes of effects, by name.
     budget
         Budget beyond `plan`; default: 400 readings.
     rounds
@@ -59,7 +61,8 @@ def investigate(
 
     Yields
     ------
-    One `Round` per round; the last has a `stop_reason`.
+    Round
+        One per round; the last has a `stop_reason`.
 
     Raises
     ------
@@ -98,20 +101,15 @@ def _rounds_until_stop(
         diagnosis = diagnosed(recordings, rng=rng)
         settled, following = reason_if_settled(diagnosis), diagnosis.next_measurement
         over_s = max(float(each.plan.time_s.max()) for each in recordings)
-        affordable_scans = None if following is None else budget.affordable_scans(following.plan, over_s)
+        affordable = None if following is None else budget.affordable_scans(following.plan, over_s)
         reason = (
             settled
-            or _reason_without_plan(following)
+            or ("no further reading would tell more" if following is None else None)
             or (f"the limit of {rounds} rounds is reached" if number == rounds else None)
-            or ("the budget of readings is spent" if affordable_scans is None else None)
+            or ("the budget of readings is spent" if affordable is None else None)
         )
         yield Round(number, recordings[-1], asked, diagnosis, reason, settled is not None)
-        if reason is not None or following is None or affordable_scans is None:
+        if reason is not None or following is None or affordable is None:
             return
-        budget = budget.minus(affordable_scans, over_s)
-        asked, wanted = following.description, affordable_scans
-
-
-def _reason_without_plan(following: NextMeasurement | None) -> str | None:
-    """Return the reason to stop where no further readings are advised; None if there are some."""
-    return "no further reading would tell more" if following is None else None
+        budget = budget.minus(affordable, over_s)
+        asked, wanted = following.description, affordable

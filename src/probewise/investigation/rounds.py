@@ -1,4 +1,4 @@
-"""The result of one round, and of a whole investigation."""
+"""The results of one round, and of a whole investigation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class Round:
     Attributes
     ----------
     number
-        From 1.
+        Number of the round, from 1.
     recording
         Recording of this round.
     reason_for_readings
@@ -41,7 +41,7 @@ class Round:
 
     @property
     def hypothesis_probabilities(self) -> tuple[tuple[str, float], ...]:
-        """The hypotheses after this round with their probabilities, most probable first."""
+        """Labels of the hypotheses after this round with their probabilities, most probable first."""
         return tuple((h.label, h.probability) for h in self.diagnosis.hypotheses)
 
     # Old names.
@@ -80,9 +80,9 @@ class Investigation(ShowsItself):
 
 
 def reason_if_settled(diagnosis: Diagnosis) -> str | None:
-    """Return a sentence on the leading hypothesis if its probability, `SURE` or more, settles the diagnosis; else None.
+    """Return a sentence on the leading hypothesis if its probability is `SURE` or more; else None.
 
-    Aliased effects, which the verdict does not state, are not settled.
+    None also for the verdict cannot_tell: aliased effects are not settled.
     """
     first = diagnosis.hypotheses[0]
     if diagnosis.verdict == "cannot_tell" or first.probability < SURE:

@@ -1,4 +1,4 @@
-"""A simulated arm for investigations: plans are carried out in a world with concealed effects."""
+"""Simulated recording for investigations: plans are carried out in a world with concealed effects."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LARGEST = 1e9  # largest magnitude of a parameter of an effect
 
 @dataclass(frozen=True)
 class SimulatedRecorder:
-    """Simulates plans in a world; the noise of a round follows from the seed and the round's number."""
+    """A `Take` function that simulates plans in a world; a round's noise follows from the seed and its number."""
 
     world: World
     seed: int
@@ -34,12 +34,12 @@ class SimulatedRecorder:
 
 
 def parse_concealed(text: str) -> tuple[Concealed, ...]:
-    """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing".
+    """Parse concealed effects: NAME:VALUE,VALUE, several joined by +, or "nothing" for none.
 
     Raises
     ------
     ParameterError
-        If the effect is unknown or takes other values.
+        If an effect is unknown or takes other values.
     """
     return () if text == NOTHING else tuple(_parse_one_effect(part) for part in text.split("+"))
 
@@ -47,7 +47,7 @@ def parse_concealed(text: str) -> tuple[Concealed, ...]:
 def _parse_one_effect(text: str) -> Concealed:
     """Parse one effect, NAME:VALUE,VALUE."""
     name, _, numbers = text.partition(":")
-    kinds = _effects_of_numbers()
+    kinds = _kinds_with_numeric_parameters()
     if name not in kinds:
         meant = did_you_mean(name, kinds)
         raise ParameterError(
@@ -66,8 +66,8 @@ def _parse_one_effect(text: str) -> Concealed:
     return effect  # type: ignore[no-any-return]
 
 
-def _effects_of_numbers() -> dict[str, Any]:
-    """Return the effects whose parameters are all numbers, by name."""
+def _kinds_with_numeric_parameters() -> dict[str, Any]:
+    """Return the classes of concealed effects whose parameters are all numbers, by name."""
     every: list[Any] = [getattr(concealed, name) for name in concealed.__all__]
     named = [kind for kind in every if isinstance(getattr(kind, "name", None), str)]
     of_numbers = [kind for kind in named if all(field.type == "float" for field in fields(kind))]

@@ -95,7 +95,7 @@ def test_a_recording_without_effects_is_clean():
 def test_an_alarm_must_stand_at_every_form_of_the_ssf(monkeypatch, seen, p_value, n_asked):
     """One to three Gaussians and a free form are fitted, then fine structure; the next is asked on an alarm."""
     left = list(seen)
-    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.global_p_value", lambda *_: left.pop(0))
+    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.bayes_factor_p_value", lambda *_: left.pop(0))
     found = diagnose(recording("paper", seed=2), rng=np.random.default_rng(0))
     assert sorted(found.judged.order_probabilities) == [1, 2, 3, N_FREE_FORM]
     assert found.p_value == p_value
@@ -146,11 +146,11 @@ def test_backlash_is_named_measured_located_and_repaired():
 
 @pytest.mark.slow
 def test_without_an_alarm_nothing_is_named_and_predictions_are_averaged_all_the_same(monkeypatch):
-    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.global_p_value", lambda *_: 0.2)
+    monkeypatch.setattr("probewise.diagnosis.judgement.global_test.bayes_factor_p_value", lambda *_: 0.2)
     found = diagnose(recording("two_way", hidden.Hysteresis(0.25), seed=1), rng=np.random.default_rng(0))
     assert (found.verdict, found.combination) == ("cannot_tell", ())
     assert found.hypotheses[0].effects == ("hysteresis",)
-    amp = found.repaired.columns("hysteresis")[:, 0]
+    amp = found.repaired.effect_samples("hysteresis")[:, 0]
     # The share that does without it is that of the rest.
     assert np.mean(amp != 0) == pytest.approx(found.hypotheses[0].probability, abs=0.05)
 
@@ -182,7 +182,7 @@ def test_one_way_scans_cannot_tell_play_from_a_pattern_that_lies_elsewhere():
     # The repaired sensor holds what is left open, each in its share: no prediction is surer than the verdict.
     held = set(found.repaired.effects)
     assert {"backlash", "edge_misplacement"} <= held <= {effect.name for effect in found.effects}
-    widths = found.repaired.columns("backlash")[:, 0]
+    widths = found.repaired.effect_samples("backlash")[:, 0]
     of_one = [h.probability for h in found.hypotheses if "backlash" in h.effects]
     assert np.mean(widths != 0) == pytest.approx(sum(of_one), abs=0.15)
     # The advised readings tell the rivals apart by more than three nats.

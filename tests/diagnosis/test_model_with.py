@@ -20,7 +20,7 @@ RECORDING = World(SPOT, concealed=(OffsetDrift(6.0),)).simulate(PLAN, rng=np.ran
 def test_the_effect_chosen_is_fitted():
     found = model_with(RECORDING, ["offset_drift"], rng=np.random.default_rng(1))
     assert found.effects == ("offset_drift",)
-    drift = found.columns("offset_drift")[:, 0]
+    drift = found.effect_samples("offset_drift")[:, 0]
     assert abs(drift.mean() - 6.0) < 4 * drift.std()
     plain = model_with(RECORDING, [], rng=np.random.default_rng(1))
     assert plain.effects == ()

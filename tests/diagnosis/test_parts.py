@@ -36,7 +36,7 @@ from probewise.diagnosis.light_sensor.covariates import covariate_of
 from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, steps_within_scans, white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.locate import places, places_of_effect, windows
+from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
@@ -303,7 +303,7 @@ def test_templates_in_one_direction_have_cosine_one_and_absorbed_ones_none():
 
 def test_windows_never_part_equal_values():
     values = np.repeat(np.arange(10.0), 5)
-    columns, ends = windows(Covariate("place", values, np.arange(50)), 50)
+    columns, ends = window_columns_and_bounds(Covariate("place", values, np.arange(50)), 50)
     assert columns.shape == (50, len(ends))
     for column, (low, high) in zip(columns.T, ends, strict=True):
         np.testing.assert_array_equal(column > 0, (values >= low) & (values <= high))
@@ -317,12 +317,12 @@ def test_a_bump_is_found_where_it_is():
     augmented = np.concatenate([r, [0.0]])
     problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white_noise(n), 1.0, n)
     covariates = [Covariate("time", time, np.arange(n)), Covariate("level", rng.normal(size=n), np.arange(n))]
-    found = places(problem, covariates, ("s",), r, problem.draws(400, rng=rng))
+    found = significant_places(problem, covariates, ("s",), r, problem.draws(400, rng=rng))
     assert found[0].covariate == "time"
     assert found[0].start == pytest.approx(60, abs=8)
     assert found[0].end == pytest.approx(75, abs=8)
     assert found[0].p_value < 0.01
-    assert found[0].witness == "witness_time.svg"
+    assert found[0].figure_name == "witness_time.svg"
     np.testing.assert_array_equal(found[0].values, time)
     assert found[0].curve_mean.max() > 1.0
 

@@ -37,7 +37,7 @@ def saturated():
 @pytest.mark.slow
 def test_the_page_says_what_is_missing_and_what_to_do(saturated):
     drawn = page.figures(saturated)
-    assert {place.witness for place in saturated.where} <= set(drawn)
+    assert {place.figure_name for place in saturated.where} <= set(drawn)
     audit = audit_recorded(saturated)
     html = page.write_page(saturated, drawn, source="some.csv", seed=1, audit=audit)
     screen, rest = html.split("<h2>", 1)
@@ -54,9 +54,9 @@ def test_the_page_says_what_is_missing_and_what_to_do(saturated):
 @pytest.mark.slow
 def test_every_place_has_its_covariate_row_by_row(saturated):
     by_witness = covariate_values(saturated)
-    assert set(by_witness) == {place.witness for place in saturated.where}
+    assert set(by_witness) == {place.figure_name for place in saturated.where}
     for place in saturated.where:
-        values = by_witness[place.witness]
+        values = by_witness[place.figure_name]
         rows = np.isfinite(values)
         assert rows.any()
         if place.start is not None and category_names(saturated, place) is None:
@@ -80,7 +80,7 @@ def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     changed = {"covariate": "scan", "scan": scan, "start": None, "end": None, "values": by_row}
     place = dataclasses.replace(saturated.where[0], **changed, without_effect=False)
     drawn = page.figures(dataclasses.replace(saturated, where=(place,)))
-    shown = drawn[place.witness].decode()
+    shown = drawn[place.figure_name].decode()
     assert shown.count("<!-- one reading -->") == 2
     assert f"(mm), scan {scan}" in shown
 
@@ -218,7 +218,7 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     judged = SimpleNamespace(unknown_shares={"place, smooth": 0.9})
     found = SimpleNamespace(verdict="unknown", judged=judged, where=(*where, dataclasses.replace(where[2], scan="s")))
     monkeypatch.setattr(
-        covariate_view, "covariate_values", lambda d: {place.witness: np.arange(3.0) for place in d.where}
+        covariate_view, "covariate_values", lambda d: {place.figure_name: np.arange(3.0) for place in d.where}
     )
     monkeypatch.setattr(covariate_view, "_views_of_place", lambda d, place, at: [place])
     chance = SimpleNamespace(means=lambda d, view, after: SimpleNamespace(largest_in_sds=sizes[view.covariate]))

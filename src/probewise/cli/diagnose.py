@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
             progress=progress,
         )
         if null is not None:
-            diagnosis = null.with_described_field(diagnosis)
+            diagnosis = null.with_shape_in_next_plan(diagnosis)
         progress("auditing the plan")
         audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)
         progress("drawing the figures")

@@ -23,15 +23,15 @@ from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import Prepared, prepare
 from probewise.diagnosis.repair.best import Best, best_repair
 from probewise.diagnosis.repair.correction import corrected
-from probewise.diagnosis.repair.ensemble import Drawn, draw_models
-from probewise.diagnosis.repair.located import locate
+from probewise.diagnosis.repair.ensemble import DrawnModels, draw_models
+from probewise.diagnosis.repair.places import locate_effects_and_residuals
 from probewise.diagnosis.repair.repair import repair_of
 from probewise.diagnosis.residuals.locate import Place
-from probewise.diagnosis.search.proposed import with_proposals
+from probewise.diagnosis.search.formulas import search_with_formulas
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
-from probewise.diagnosis.search.weighed_twice import Weighing, with_agreement
+from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
+from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agreement
 from probewise.diagnosis.verdict_report.beyond import formula_of, remainder_of
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis, VerdictReport
 from probewise.diagnosis.verdict_report.findings import EffectFound, effects_found, noise_found
@@ -110,10 +110,10 @@ def diagnose_prepared(
 ) -> Diagnosis:
     """Run the pipeline of `diagnose` for any apparatus; see there for returns and raises."""
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
-    searched = with_proposals(searched, progress=progress)
+    searched = search_with_formulas(searched, progress=progress)
     prepared = searched.prepared
     if prepared.too_little:
-        searched = searched.by_prior_alone()
+        searched = searched.with_prior_probabilities()
     elif thorough is not None:
         searched, weighings = thorough(searched)
     progress("testing the residuals")
@@ -123,7 +123,7 @@ def diagnose_prepared(
     drawn = draw_models(searched, test, judged, best, rng=rng, progress=progress)
     found = effects_found(searched, judged.hypotheses, best, drawn.best, rng=rng)
     progress("locating the residuals")
-    where = locate(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
+    where = locate_effects_and_residuals(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
     change = np.zeros(len(prepared.usable))
     if judged.verdict == "unknown" and not best.out_of_vocabulary:
         improvement, change = corrected(searched, test, best, rng=rng)
@@ -134,7 +134,7 @@ def diagnose_prepared(
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)
     grounds = _facts_for_reason(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
-    reason = with_agreement(reason_of(judged, grounds), weighings)
+    reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
     if prepared.thinned:
         reason += f" (From {len(prepared.recording)} of {len(prepared.everything)} readings, evenly spread.)"
     return Diagnosis(
@@ -153,7 +153,7 @@ def _facts_for_reason(
     test: GlobalTest,
     best: Best,
     *,
-    drawn: Drawn,
+    drawn: DrawnModels,
     found: Sequence[EffectFound],
     where: Sequence[Place],
     asked: NextMeasurement | None,
@@ -161,9 +161,9 @@ def _facts_for_reason(
     """Collect the facts for the reason."""
     prepared, shares = searched.prepared, searched.evidences.unknown_shares
     orders = searched.posterior.order_probabilities
-    beside = searched.beside(test.noise)
-    formulas = [effect for effect in best.fit.found.model.effects if out_of_vocabulary((effect.name,))]
-    columns = [drawn.best.columns(effect.name) for effect in formulas]
+    beside = searched.likeliest_beside_unknown(test.noise)
+    formulas = [effect for effect in best.fit.found.model.effects if effects_out_of_vocabulary((effect.name,))]
+    columns = [drawn.best.effect_samples(effect.name) for effect in formulas]
     return Grounds(
         words=prepared.apparatus.words,
         n_readings=len(prepared.usable),

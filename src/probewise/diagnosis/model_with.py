@@ -57,7 +57,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     on_mean = tuple(sorted(name for name, effect in effects.items() if effect.stage is not Stage.NOISE))
     on_noise = tuple(sorted(set(names) - set(on_mean)))
     noise = on_noise if on_noise in found.noise_models else found.certain
-    best = found.best(on_mean, noise) or found.best((), noise)
+    best = found.best_refit_of(on_mean, noise) or found.best_refit_of((), noise)
     assert best is not None  # the calibrated sensor is always fitted
     if not np.isfinite(best.evidence[noise].log_z):
         raise ParameterError("names", ", ".join(noise), "effects of the vocabulary that this recording can show")

@@ -1,4 +1,4 @@
-"""The interface of possible next measurements."""
+"""Possible next measurements, as any apparatus lists them."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ MOST_READINGS = 102
 
 
 class Command(Protocol):
-    """Rows that could be measured next: kind, description, plan and duration."""
+    """A possible next measurement, to be proposed to the user: kind, description, rows and duration."""
 
     @property
     def kind(self) -> str:
-        """Kind of measurement."""
+        """Kind of measurement, in a word or two."""
         ...
 
     @property
     def description(self) -> str:
-        """Description in words."""
+        """The measurement in words, as an instruction."""
         ...
 
     @property
     def plan(self) -> Plan:
-        """The rows."""
+        """Its rows."""
         ...
 
     @property
     def minutes(self) -> float:
-        """Duration in minutes, including the break before them."""
+        """Duration in minutes, including the break before it."""
         ...
 
 
-def rows_of(commands: Sequence[Command]) -> list[IntArray]:
-    """Return the row numbers of each command after concatenation."""
+def rows_by_command(commands: Sequence[Command]) -> list[IntArray]:
+    """Return the row numbers of each command in the plan that concatenates all commands, (n_rows,) each."""
     ends = np.cumsum([len(command.plan) for command in commands])
     return [np.arange(end - len(command.plan), end) for end, command in zip(ends.tolist(), commands, strict=True)]

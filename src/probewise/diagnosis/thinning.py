@@ -17,12 +17,12 @@ _STRETCH = 6  # readings
 def rows_to_diagnose(recording: Recording, most: int = MOST_READINGS) -> IntArray:
     """Choose rows spread over the recording with about `most` usable readings; all rows if there are no more.
 
-    Whole scans are kept, to preserve correlations between readings; if fewer than eight scans would remain, stretches
-    of each scan.
+    Whole scans are chosen, to preserve correlations between readings; if they would be fewer than eight, stretches of
+    six successive rows, evenly spaced.
 
     Returns
     -------
-    Rows, ascending.
+    Row numbers, ascending.
     """
     n_usable, n_points = int(recording.usable.sum()), len(recording)
     if n_usable <= most:

@@ -1,4 +1,4 @@
-"""A sensor over an unknown shape, whose parameters are nuisance parameters of the null."""
+"""The null of a calibrated sensor over an unknown shape, whose parameters are nuisance parameters."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _N_DRAWS, _N_ELITE, _N_ROUNDS = 2000, 40, 8
 
 @dataclass(frozen=True, eq=False)
 class SensorAndShape:
-    """A calibrated sensor with the prior of a shape, wherever no pattern is described.
+    """A calibrated sensor over an unknown shape of known prior, which stands for every pattern not described.
 
-    `starts` (n_starts, n_params) are coordinates near the best fits; see `of`.
+    A `Null`. `starts` (n_starts, n_params) are coordinates from which it is fitted; `of` finds them.
     """
 
     sensor: CalibratedSensor
@@ -42,22 +42,22 @@ class SensorAndShape:
     def of(cls, sensor: SensorPrior, shape: Shape, recording: Recording, *, rng: np.random.Generator) -> Self:
         """Build from a calibrated sensor's posterior and a shape's prior, and search for shapes that fit the readings.
 
-        Of a set of shapes, the best-fitting one is chosen first.
+        Of a set of shapes, only the best-fitting one is kept.
 
         Parameters
         ----------
         sensor
-            As calibrated.
+            The sensor as calibrated.
         shape
-            The possible shape, or set of shapes.
+            The shape with its prior, or a set of shapes.
         recording
-            What was read.
+            The readings over it.
         rng
             Source of randomness, for the search.
         """
         known = sensor_of(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
-        found = [_likely_shapes(cls(known, member, np.empty((0, 0))), recording, rng) for member in members]
+        found = [_search_for_shapes(cls(known, member, np.empty((0, 0))), recording, rng) for member in members]
         best = min(range(len(members)), key=lambda k: found[k][0])
         return cls(known, members[best], found[best][1])
 
@@ -83,12 +83,12 @@ class SensorAndShape:
 
     @property
     def in_bulk(self) -> bool:
-        """False: every sample costs as much as the first."""
+        """Whether many samples cost little more than one: False."""
         return False
 
     @property
     def known_nearby(self) -> bool:
-        """False: a prediction costs as much near another one."""
+        """Whether a prediction near another one costs less: False."""
         return False
 
     @property
@@ -103,25 +103,28 @@ class SensorAndShape:
 
     @property
     def least_readings(self) -> int:
-        """Three readings per parameter of the shape, and three more; the sensor is known."""
+        """Fewest readings for a diagnosis: three per parameter of the shape, and three more; the sensor is known."""
         return 3 * len(self.shape.prior.names) + 3
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
-        """Return whether the sensor admits the effect."""
+        """Return whether the sensor's model can have the effect."""
         return self.sensor.admits(effect)
 
     def theta(self, z: FloatArray) -> FloatArray:
-        """Map coordinates, (n_samples, n_params), to the sensor's columns, then the shape's."""
+        """Map coordinates, (n_samples, n_params), to parameters: the sensor's columns, then the shape's."""
         k = self.sensor.n_params
         return np.concatenate([self.sensor.theta(z[:, :k]), self.shape.prior.from_unit_cube(ndtr(z[:, k:]))], axis=1)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
-        """Build the chain over the shape, and over the patterns that are described."""
+        """Build the model of a plan with effects, over the shape and the patterns that are described."""
         scene = _ShapeAmongPatterns(self.shape, plan)
         return Chain(FreeMixture(self.n_gaussians), FreeLevels(), scene, tuple(effects), n_nodes=n_nodes)
 
-    def with_described_field(self, diagnosis: Diagnosis) -> Diagnosis:
-        """Describe the shape in the next plan by its current estimate, so that the plan can be written."""
+    def with_shape_in_next_plan(self, diagnosis: Diagnosis) -> Diagnosis:
+        """Return the diagnosis with the shape, at its posterior mean, as the unknown patterns of its next plan.
+
+        Only then can that plan be written to a file.
+        """
         asked, names = diagnosis.next_measurement, list(diagnosis.repaired.chain.names)
         if asked is None:
             return diagnosis
@@ -133,10 +136,13 @@ class SensorAndShape:
         patterns = {name: plan.patterns.get(name, shape) for name in plan.pattern_names}
         return replace(diagnosis, next_measurement=replace(asked, plan=replace(plan, patterns=patterns)))
 
+    with_described_field = with_shape_in_next_plan
+    """The old name of `with_shape_in_next_plan`."""
+
 
 @dataclass(frozen=True, eq=False)
 class _ShapeAmongPatterns:
-    """A scene with known patterns, and one unknown shape under every other name."""
+    """A scene of a plan's described patterns, and of one unknown shape under every other name."""
 
     shape: Shape
     plan: Plan
@@ -152,16 +158,22 @@ class _ShapeAmongPatterns:
         return self.shape.prior
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
-        """Return regions by pattern name, theta (n_samples, n_params of the shape)."""
+        """Return the region of each pattern by name, for theta (n_samples, n_params of the shape)."""
         known = known_scene(self.plan).regions(theta)
         unknown = self.shape.region(theta)
         return {name: known.get(name, unknown) for name in self.plan.pattern_names}
 
 
-def _likely_shapes(null: SensorAndShape, recording: Recording, rng: np.random.Generator) -> tuple[float, FloatArray]:
-    """Search for fitting shapes with the prior-mean sensor; return the best sum of squares and the best four shapes.
+def _search_for_shapes(
+    null: SensorAndShape, recording: Recording, rng: np.random.Generator
+) -> tuple[float, FloatArray]:
+    """Search for shapes that fit the readings, with the sensor at its prior mean.
 
-    Random draws of the prior, refined repeatedly about the best ones.
+    Shapes are drawn from the prior, then repeatedly about the best ones.
+
+    Returns
+    -------
+    Sum of squared residuals of the best shape, and coordinates of the four best, (4, n_params).
     """
     usable = recording.usable
     if not usable.any():

@@ -67,9 +67,9 @@ def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
     """
     usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:
-        out[place.witness] = np.full(len(diagnosis.recording), np.nan)
+        out[place.figure_name] = np.full(len(diagnosis.recording), np.nan)
         if place.values is not None:
-            out[place.witness][usable] = place.values
+            out[place.figure_name][usable] = place.values
     return out
 
 

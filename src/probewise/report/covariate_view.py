@@ -97,7 +97,7 @@ def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateV
     places = sorted(alarming, key=lambda place: -_probability_of_dependence(diagnosis, place))
     found = _views_at_period(diagnosis)
     for place in places:
-        found += _views_of_place(diagnosis, place, values[place.witness])
+        found += _views_of_place(diagnosis, place, values[place.figure_name])
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
         found.append(_view_by_change(diagnosis))
     if not found:
@@ -113,20 +113,22 @@ def places_in_order(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[P
     """
     values, seen = covariate_values(diagnosis), {}
     for place in diagnosis.where:
-        views = _views_of_place(diagnosis, place, values[place.witness])
-        seen[place.witness] = any(chance.means(diagnosis, w, after=False).largest_in_sds >= _SEEN for w in views)
-    ordered = sorted(diagnosis.where, key=lambda p: (-_probability_of_dependence(diagnosis, p), not seen[p.witness]))
+        views = _views_of_place(diagnosis, place, values[place.figure_name])
+        seen[place.figure_name] = any(chance.means(diagnosis, w, after=False).largest_in_sds >= _SEEN for w in views)
+    ordered = sorted(
+        diagnosis.where, key=lambda p: (-_probability_of_dependence(diagnosis, p), not seen[p.figure_name])
+    )
     shown: list[Place] = []
     for place in ordered:  # with one scan, a place in all scans and one in that scan are the same
         if not any(_is_same_interval(values, place, other) for other in shown):
             shown.append(place)
-    return [(place, seen[place.witness]) for place in shown]
+    return [(place, seen[place.figure_name]) for place in shown]
 
 
 def _is_same_interval(values: Mapping[str, FloatArray], place: Place, other: Place) -> bool:
     """Return whether two places are the same interval of the same covariate."""
     ends = (place.covariate, place.start, place.end) == (other.covariate, other.start, other.end)
-    own, others = values[place.witness], values[other.witness]
+    own, others = values[place.figure_name], values[other.figure_name]
     return ends and place.start is not None and np.array_equal(own, others, equal_nan=True)
 
 

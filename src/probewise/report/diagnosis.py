@@ -142,9 +142,12 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         model = diagnosis.apparatus.words.model
         only_here = f". The unknown part is corrected in these readings only; {model} does not contain it"
         facts.append(("Residuals", f"{left}{only_here if diagnosis.repair.by_rows else ''}."))
-    if diagnosis.repair.left_open:
+    if diagnosis.repair.combination_shares:
         facts.append(
-            ("In the repaired model", _shares_in_words(diagnosis.repair.left_open, diagnosis.apparatus.words.model))
+            (
+                "In the repaired model",
+                _shares_in_words(diagnosis.repair.combination_shares, diagnosis.apparatus.words.model),
+            )
         )
     return facts
 
@@ -297,7 +300,7 @@ def _unlisted_corrections(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     """List corrections that samples of the repaired model contain, but none of the explanations above."""
     return tuple(
         paragraph(_as_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
-        for _, share, sentence in diagnosis.carried
+        for _, share, sentence in diagnosis.unstated_effects
     )
 
 
@@ -328,7 +331,7 @@ def _place_figures(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Ma
     if not diagnosis.where:
         return (paragraph("No residual is larger than noise explains."),)
     shown = [
-        figure(drawn[place.witness], _place_words(diagnosis, place, seen=seen))
+        figure(drawn[place.figure_name], _place_words(diagnosis, place, seen=seen))
         for place, seen in places_in_order(diagnosis, ResidualNoise.of(diagnosis))
     ]
     opening = paragraph(

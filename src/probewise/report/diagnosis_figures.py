@@ -64,7 +64,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
             )
         )
     for place in diagnosis.where:
-        drawn[place.witness] = _draw_place(diagnosis, chance, place, values[place.witness])
+        drawn[place.figure_name] = _draw_place(diagnosis, chance, place, values[place.figure_name])
     return drawn
 
 

@@ -17,7 +17,7 @@ from probewise.diagnosis.light_sensor.commands import commands, excerpts
 from probewise.diagnosis.light_sensor.scheduling import as_alternatives, in_sequence, postponed
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
-from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
+from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene
@@ -205,7 +205,7 @@ def test_a_scan_over_a_new_sheet_takes_longer():
 
 def test_a_battery_is_expected_to_stay_as_it_was():
     plan = paper_plan()
-    everywhere, rows = as_alternatives(commands(plan)[:3], plan), rows_of(commands(plan)[:3])
+    everywhere, rows = as_alternatives(commands(plan)[:3], plan), rows_by_command(commands(plan)[:3])
     assert [len(own) for own in rows] == [101, 101, 102]
     assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor())

@@ -17,7 +17,7 @@ from probewise.diagnosis.noise.law import NoiseLaw, forms
 from probewise.diagnosis.noise.models import NoiseModel, least_sd, rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.search import search
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import Recording, paper_plan
@@ -43,11 +43,11 @@ def as_declared(recording: Recording) -> Recording:
     return dataclasses.replace(recording, plan=dataclasses.replace(recording.plan, instrumentation=instrumentation))
 
 
-def noises(recording: Recording) -> Noises:
+def noises(recording: Recording) -> NoiseModels:
     extent = Extent.of(recording)
     built = {name: kind.for_extent(extent) for name, kind in VOCABULARY.items() if kind.stage is Stage.NOISE}
     effects = {name: effect for name, effect in built.items() if effect is not None}
-    return Noises(recording, effects, PriorOdds.over(effects))
+    return NoiseModels(recording, effects, PriorOdds.over(effects))
 
 
 def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
@@ -231,5 +231,5 @@ def test_what_rivals_are_told_by_is_the_noise_of_a_reading_rounding_and_all():
     (null,) = found.evidences.fits.values()
     assert null.law.flat > 0
     rms = np.sqrt(np.mean(null.found.residuals**2))
-    assert null.sd == pytest.approx(rms, rel=0.15)
-    assert null.found.sd < 0.5 * null.sd
+    assert null.whitened_sd == pytest.approx(rms, rel=0.15)
+    assert null.found.sd < 0.5 * null.whitened_sd

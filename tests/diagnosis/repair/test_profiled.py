@@ -5,9 +5,9 @@ import pytest
 from scipy.special import ndtr
 
 from probewise.diagnosis.evidence.templates import TemplateMemory
-from probewise.diagnosis.repair.profiled import Profiled
+from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.samples import sample_model
-from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls
 from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.state import SearchState
@@ -29,11 +29,11 @@ def _settled(seed):
     )  # fmt: skip
     prepared = prepare_system(simulator, RunTable({"t": time, "run": run, "y": y}, time="t", run="run"))
     prior = prepared.apparatus.prior_odds(prepared.effects)
-    refits = Refits(prepared.null, Noises(prepared.recording, {}, prior), TemplateMemory(prepared.usable))
+    refits = Refits(prepared.null, NoiseModels(prepared.recording, {}, prior), TemplateMemory(prepared.usable))
     on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.on_noise}
     state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
     fit_nulls(state, prepared, max_order=1)
-    candidate = state.refits.extended(state.null, state.effects["settling"])[0]
+    candidate = state.refits.refit_with_effect(state.null, state.effects["settling"])[0]
     return prepared.recording, candidate, candidate.evidence[()]
 
 
@@ -70,11 +70,11 @@ def test_intervals_of_a_time_constant_hold_what_they_say_of_the_exact_posterior(
     for seed in (1, 2, 3):
         recording, candidate, evidence = _settled(seed)
         found = candidate.found
-        assert Profiled.of(found, evidence.law, recording) is not None
+        assert ProfiledDensity.of(found, evidence.law, recording) is not None
         samples = sample_model(
             found, evidence, recording, weights=candidate.weights, rng=np.random.default_rng(seed), annealed=True
         )
-        low, high = np.quantile(samples.columns("settling")[:, 1], [0.025, 0.975])
+        low, high = np.quantile(samples.effect_samples("settling")[:, 1], [0.025, 0.975])
         chain = found.model.effects[-1].prior.marginals["tau_s"].from_unit(ndtr(_by_chain(recording, found, seed)))
         shares.append(np.mean((chain > low) & (chain < high)))
     assert np.mean(shares) == pytest.approx(0.95, abs=0.04), shares

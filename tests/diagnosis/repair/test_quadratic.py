@@ -9,8 +9,8 @@ import pytest
 
 from probewise.diagnosis.evidence.joint import log_likelihood_of_whitened
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.repair.quadratic import Quadratic
-from probewise.diagnosis.repair.surrogate import Surrogate
+from probewise.diagnosis.repair.quadratic import QuadraticPredictions
+from probewise.diagnosis.repair.surrogate import SurrogatePosterior
 
 CENTER = np.array([0.3, -0.2, 1.0])
 STEPS = np.array([[0.4, 0.1, 0.0], [0.0, 0.3, -0.2], [0.0, 0.0, 0.5]])
@@ -23,7 +23,7 @@ def curve(z):
 
 
 def predicted(quadratic, e):
-    return quadratic.center + quadratic.amounts(e) @ quadratic.changes
+    return quadratic.center + quadratic.amounts_of_changes(e) @ quadratic.changes
 
 
 CARRY = np.where(np.arange(40) % 20 > 0, 0.4, 0.0)
@@ -53,20 +53,20 @@ def test_what_is_quadratic_is_met_everywhere():
         return 2.0 + e @ slopes + np.einsum("ni,nj,ijk->nk", e, e, bends)
 
     e = rng.standard_normal((50, 3))
-    np.testing.assert_allclose(predicted(Quadratic.of(predict, 3, 1e-9), e), predict(e), atol=1e-8)
+    np.testing.assert_allclose(predicted(QuadraticPredictions.of(predict, 3, 1e-9), e), predict(e), atol=1e-8)
 
 
 def test_the_steps_and_their_sums_are_met():
     one = np.eye(3)
     asked = np.concatenate([np.zeros((1, 3)), one, -one, one[[0]] + one[[1]], one[[1]] + one[[2]]])
-    found = Quadratic.of(about_the_center, 3, 1e-9)
+    found = QuadraticPredictions.of(about_the_center, 3, 1e-9)
     np.testing.assert_allclose(predicted(found, asked), about_the_center(asked), atol=1e-9)
 
 
 @pytest.mark.parametrize("sd", [0.01, 1.0])
 def test_what_makes_no_difference_is_left_out(sd):
     """All readings together, what is left out is less than a fiftieth of the noise for each of the nine terms."""
-    full, thin = Quadratic.of(about_the_center, 3, 1e-9), Quadratic.of(about_the_center, 3, sd)
+    full, thin = QuadraticPredictions.of(about_the_center, 3, 1e-9), QuadraticPredictions.of(about_the_center, 3, sd)
     assert thin.changes.shape[0] < full.changes.shape[0] <= 9
     one = np.eye(3)
     assert np.linalg.norm(predicted(full, one) - predicted(thin, one), axis=1).max() < 9 * 0.02 * sd
@@ -74,12 +74,12 @@ def test_what_makes_no_difference_is_left_out(sd):
 
 def test_the_density_is_that_of_its_predictions():
     """Route two: readings predicted one by one and whitened; it looks at a few sums alone."""
-    quadratic, readings = Quadratic.of(about_the_center, 3, 1e-9), noisy(0.05)
+    quadratic, readings = QuadraticPredictions.of(about_the_center, 3, 1e-9), noisy(0.05)
     e = np.random.default_rng(5).standard_normal((30, 3))
     z = CENTER + e @ STEPS
     residuals = (readings - predicted(quadratic, e)).T
     expected = log_likelihood_of_whitened(LAW, LAW(residuals)) - 0.5 * np.sum(z**2, axis=1)
-    near = Surrogate.of(quadratic, CENTER, STEPS, readings, LAW)
+    near = SurrogatePosterior.of(quadratic, CENTER, STEPS, readings, LAW)
     np.testing.assert_allclose(near.log_density(e), expected, rtol=1e-9)
     assert near.log_density(np.full((1, 3), 100.0))[0] == -np.inf
 
@@ -88,11 +88,11 @@ def test_under_a_tail_the_density_falls_off_as_it_should():
     """By the mean of the true fall over the noise: one reading's says little, and thousands differ by chance."""
     tailed = dataclasses.replace(LAW, share=0.1, times=5.0)
     e = 0.3 * np.random.default_rng(6).standard_normal((20, 3))
-    quadratic = Quadratic.of(about_the_center, 3, 1e-9)
+    quadratic = QuadraticPredictions.of(about_the_center, 3, 1e-9)
     falls = []
     for seed in range(60):
         readings = noisy(0.1, seed, tailed)
-        near = Surrogate.of(quadratic, CENTER, STEPS, readings, tailed)
+        near = SurrogatePosterior.of(quadratic, CENTER, STEPS, readings, tailed)
         true = [
             log_likelihood_of_whitened(tailed, tailed((readings - predicted(quadratic, at)).T))
             for at in (e, np.zeros((1, 3)))

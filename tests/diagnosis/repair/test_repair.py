@@ -13,7 +13,7 @@ def repair(absent=None, residuals=(1.0, np.nan)):
     model = SimpleNamespace(
         absent=absent or {},
         chain=SimpleNamespace(effects=(LAG,)),
-        columns=lambda name: np.array([[2.0], [2.0], [0.0], [0.0]]),
+        effect_samples=lambda name: np.array([[2.0], [2.0], [0.0], [0.0]]),
     )
     before = Predicted(np.zeros(2), np.array([1.0, np.nan]))
     return Repair(model, model, None, before, Predicted(np.zeros(2), np.array(residuals)))
@@ -26,10 +26,10 @@ def test_a_repair_that_predicts_the_same_changes_nothing():
 
 def test_what_samples_lack_is_left_open_in_its_share():
     marks = {"lag": np.array([False, False, True, False]), "step": np.array([True, True, True, False])}
-    assert repair(marks).left_open == {("lag",): 0.5, (): 0.25, ("lag", "step"): 0.25}
+    assert repair(marks).combination_shares == {("lag",): 0.5, (): 0.25, ("lag", "step"): 0.25}
 
 
 def test_what_is_carried_and_not_stated_is_said_of_the_samples_that_hold_it():
     marks = {"lag": np.array([False, False, True, True])}
-    assert repair(marks).carried_beside(set()) == (("lag", 0.5, "it lags by 2 s"),)
-    assert repair(marks).carried_beside({"lag"}) == ()
+    assert repair(marks).unstated_effects(set()) == (("lag", 0.5, "it lags by 2 s"),)
+    assert repair(marks).unstated_effects({"lag"}) == ()

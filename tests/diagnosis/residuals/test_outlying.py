@@ -9,8 +9,8 @@ from scipy.stats import betabinom
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.locate import windows
-from probewise.diagnosis.residuals.outlying import score_clustering, tail_probability
+from probewise.diagnosis.residuals.locate import window_columns_and_bounds
+from probewise.diagnosis.residuals.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.recordings import Recording, paper_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -27,7 +27,7 @@ def test_the_evidence_is_that_of_two_beta_binomials_against_one():
     """Of given numbers in and out of a window, the order within each being even."""
     far_out = np.zeros(N)
     far_out[[3, 5, 8, 70]] = 1.0
-    columns, _ = windows(PLACE, N)
+    columns, _ = window_columns_and_bounds(PLACE, N)
     one = betabinom(N, 0.5, 0.5).logpmf(4) - np.log(_choose(N, 4))
     expected = []
     for column in columns.T:
@@ -35,7 +35,7 @@ def test_the_evidence_is_that_of_two_beta_binomials_against_one():
         inside = betabinom(n, 0.5, 0.5).logpmf(k) - np.log(_choose(n, k))
         rest = betabinom(N - n, 0.5, 0.5).logpmf(4 - k) - np.log(_choose(N - n, 4 - k))
         expected.append(inside + rest - one)
-    found = score_clustering(far_out, [PLACE])
+    found = clustering_log_bayes_factors(far_out, [PLACE])
     assert found == {"place, far out": pytest.approx(float(np.log(np.mean(np.exp(expected)))))}
 
 
@@ -47,8 +47,8 @@ def test_together_speaks_for_it_and_scattered_against_it():
     together, scattered = np.zeros(N), np.zeros(N)
     together[100:108] = 1.0
     scattered[np.arange(7, N, 15)] = 1.0
-    assert score_clustering(together, [PLACE])["place, far out"] > 8
-    assert score_clustering(scattered, [PLACE])["place, far out"] < 0
+    assert clustering_log_bayes_factors(together, [PLACE])["place, far out"] > 8
+    assert clustering_log_bayes_factors(scattered, [PLACE])["place, far out"] < 0
 
 
 def test_what_is_in_the_tail_follows_bayes_rule():
@@ -57,10 +57,10 @@ def test_what_is_in_the_tail_follows_bayes_rule():
     residuals[10] = 9.0
     sigma = float(law.scale(law(residuals)[:, None])[0])
     odds = (0.05 / 6) * np.exp(-0.5 * (residuals / sigma / 6) ** 2) / (0.95 * np.exp(-0.5 * (residuals / sigma) ** 2))
-    np.testing.assert_allclose(tail_probability(residuals, law), odds / (1 + odds))
-    assert tail_probability(residuals, law)[10] > 0.999
+    np.testing.assert_allclose(outlier_probabilities(residuals, law), odds / (1 + odds))
+    assert outlier_probabilities(residuals, law)[10] > 0.999
     residuals[10] = 1e6  # where both densities are nothing
-    assert tail_probability(residuals, law)[10] == 1.0
+    assert outlier_probabilities(residuals, law)[10] == 1.0
 
 
 def spotted(rows: np.ndarray) -> Recording:

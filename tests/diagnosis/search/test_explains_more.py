@@ -36,4 +36,4 @@ def _evidences(unknown, *, mean=None, formula=-50.0, **null):
     ids=["noise", "unknown", "mean", "pair", "two faults", "no name of a noise", "formula"],
 )
 def test_a_single_name_explains_more_than_what_has_none_or_does_not(evidences, expected):
-    assert evidences.one_name_explains_more() is expected
+    assert evidences.one_name_outweighs_unnamed() is expected

@@ -46,7 +46,7 @@ def test_a_prediction_leaves_open_what_a_clean_verdict_does(tmp_path):
     assert found.verdict == "clean"
     share = 1 - found.repaired.absent["position_scale"].mean()
     assert 0.02 < share < 0.5
-    assert not np.any(found.repaired.columns("position_scale")[found.repaired.absent["position_scale"]])
+    assert not np.any(found.repaired.effect_samples("position_scale")[found.repaired.absent["position_scale"]])
 
     sensor = found.repaired.fitted_sensor(case.recording, rng=np.random.default_rng(1))
     write_sensor(sensor, tmp_path / "sensor.json")

@@ -21,17 +21,17 @@ def of(log_z):
 )
 def test_a_formula_counts_as_the_one_effect_that_explains_nearly_as_much(wave, known):
     evidences = of({("interference",): wave, ("offset_drift",): 3.0, (FORMULA,): 100.0})
-    assert evidences.reported_as((FORMULA,)) == known
+    assert evidences.reported_names((FORMULA,)) == known
 
 
 @pytest.mark.parametrize(("named", "known"), [(51.0, ("offset_drift",)), (49.0, ("unknown",))])
 def test_a_formula_beside_a_name_counts_as_the_name_if_that_explains_more(named, known):
     evidences = of({("offset_drift",): named, (FORMULA, "offset_drift"): 100.0})
-    assert evidences.reported_as((FORMULA, "offset_drift")) == known
+    assert evidences.reported_names((FORMULA, "offset_drift")) == known
 
 
 def test_names_stay_and_the_unknown_stays():
     evidences = of({("interference",): 5.0})
-    assert evidences.reported_as(("interference",)) == ("interference",)
-    assert evidences.reported_as(("unknown",)) == ("unknown",)
-    assert evidences.reported_as(()) == ()
+    assert evidences.reported_names(("interference",)) == ("interference",)
+    assert evidences.reported_names(("unknown",)) == ("unknown",)
+    assert evidences.reported_names(()) == ()

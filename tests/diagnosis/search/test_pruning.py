@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.noise.law import white_noise
-from probewise.diagnosis.search.pruning import prune
-from probewise.diagnosis.search.unknown import Unknown
+from probewise.diagnosis.search.pruning import prune_out_of_vocabulary
+from probewise.diagnosis.search.unknown import UnknownEffects
 
 N = 50
 NAME, PUSH = ("sensor_tilt",), ("arm_knock",)
@@ -32,17 +32,17 @@ class Held:
     def evidence(self):
         return {(): SimpleNamespace(log_z=self.log_z)}
 
-    sd = 1.0
+    whitened_sd = 1.0
 
     @property
     def found(self):
         return SimpleNamespace(residuals=np.full(N, self.left))
 
-    def as_share(self, log_share, _):
+    def with_factor_and_weights(self, log_share, _):
         return replace(self, log_z=self.log_z + log_share - self.log_share, log_share=log_share)
 
 
-NOISES = SimpleNamespace(over_all=lambda log_z: log_z.get((), -np.inf))
+NOISES = SimpleNamespace(average_log_evidence=lambda log_z: log_z.get((), -np.inf))
 
 
 def by_key(*candidates):
@@ -51,7 +51,9 @@ def by_key(*candidates):
 
 @pytest.mark.parametrize(("ahead", "believed"), [(-1.0, -1.0), (2.0, 0.0), (4.0, 4.0)])
 def test_what_is_ahead_of_a_name_by_less_than_the_readings_tell_is_believed_no_more(ahead, believed):
-    stay, pruned = prune(by_key(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0)), NOISES)
+    stay, pruned = prune_out_of_vocabulary(
+        by_key(Held((), -50.0), Held(NAME, 0.0), Held(PUSH, ahead, left=1.0)), NOISES
+    )
     assert stay[1, PUSH].log_z == pytest.approx(believed)
     assert stay[1, NAME].log_z == 0.0
     assert pruned == set()
@@ -59,13 +61,15 @@ def test_what_is_ahead_of_a_name_by_less_than_the_readings_tell_is_believed_no_m
 
 def test_what_predicts_the_same_as_a_name_is_left_out():
     """Half of the squared distance is 50 * 0.3^2 / 2, less than three nats."""
-    stay, pruned = prune(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
+    stay, pruned = prune_out_of_vocabulary(by_key(Held((), -50.0), Held(NAME, -9.0), Held(PUSH, 0.0, left=0.3)), NOISES)
     assert pruned == {PUSH}
     assert (1, PUSH) not in stay
 
 
 def test_two_names_do_not_speak_for_one_effect_without():
-    stay, _ = prune(by_key(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1)), NOISES)
+    stay, _ = prune_out_of_vocabulary(
+        by_key(Held((), -50.0), Held(("lag", "sensor_tilt"), 0.0), Held(PUSH, 2.0, left=0.1)), NOISES
+    )
     assert stay[1, PUSH].log_z == 2.0
 
 
@@ -75,7 +79,7 @@ def test_two_names_do_not_speak_for_one_effect_without():
     ids=["as much, and nothing left", "something left", "far behind"],
 )
 def test_a_name_speaks_for_bases_that_explain_no_more_and_find_nothing_beside_it(name, beside, speaks):
-    unknown = Unknown(None, None, (), NOISES, lambda worth: 0.0, {(1, (), ()): 0.0, (1, NAME, ()): beside})
+    unknown = UnknownEffects(None, None, (), NOISES, lambda worth: 0.0, {(1, (), ()): 0.0, (1, NAME, ()): beside})
     unknown.prune([Held((), -50.0), Held(NAME, name)])
     assert ((1, (), ()) not in unknown.log_z) == speaks
     assert (1, NAME, ()) in unknown.log_z

@@ -10,9 +10,9 @@ import pytest
 
 from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.search import search as searching
-from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.refits import Refits, _amounts, is_significant
+from probewise.diagnosis.search.refits import Refits, _amounts_in_residual, is_significant
 from probewise.diagnosis.search.searched import Evidences, posterior_of
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.twins import are_proportional
@@ -48,7 +48,7 @@ def _state(prepared):
     prior = prepared.apparatus.prior_odds(prepared.effects)
     extent = Extent.of(prepared.recording)
     on_noise = {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)}
-    refits = Refits(prepared.null, Noises(prepared.recording, on_noise, prior), TemplateMemory(prepared.usable))
+    refits = Refits(prepared.null, NoiseModels(prepared.recording, on_noise, prior), TemplateMemory(prepared.usable))
     on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.on_noise}
     state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
     fit_nulls(state, prepared, max_order=1)
@@ -57,9 +57,9 @@ def _state(prepared):
 
 def test_a_twin_has_the_evidence_of_a_refit_of_its_own(state):
     """An offset that follows the room, by name and as a zero that depends on the room: one curve, two names."""
-    first = state.refits.extended(state.null, state.effects["sensitivity:room"])[0]
-    twin = state.refits.extended(state.null, state.effects["depends:zero:room"])[0]
-    alone = replace(state.refits, known={}).extended(state.null, state.effects["depends:zero:room"])[0]
+    first = state.refits.refit_with_effect(state.null, state.effects["sensitivity:room"])[0]
+    twin = state.refits.refit_with_effect(state.null, state.effects["depends:zero:room"])[0]
+    alone = replace(state.refits, known={}).refit_with_effect(state.null, state.effects["depends:zero:room"])[0]
     assert twin.names == alone.names == ("depends:zero:room",)
     assert twin.evidence is first.evidence
     assert twin.log_z == pytest.approx(alone.log_z, abs=0.02)
@@ -78,24 +78,26 @@ def test_effects_of_different_curves_are_no_twins(state):
 def test_a_fit_at_a_poor_optimum_is_made_again_from_where_one_more_effect_led(prepared):
     state = _state(prepared)
     good = state.refit(state.null, "sensitivity:room")
-    bigger = state.refits.extended(good, state.effects["offset_drift"])[0]
-    state.refit_without(bigger, "offset_drift")
-    assert state.of(("sensitivity:room",)) == [good]  # as good as from there: it stays
-    poor = replace(good.moved(-100.0), found=replace(good.found, objective=good.found.objective + 100.0))
+    bigger = state.refits.refit_with_effect(good, state.effects["offset_drift"])[0]
+    state.refit_subset_from(bigger, "offset_drift")
+    assert state.candidates_of(("sensitivity:room",)) == [good]  # as good as from there: it stays
+    poor = replace(good.shifted(-100.0), found=replace(good.found, objective=good.found.objective + 100.0))
     state.keep(poor)
-    state.refits.replace(good, poor)
-    state.refit_without(bigger, "offset_drift")
-    (again,) = state.of(("sensitivity:room",))
+    state.refits.replace_fit(good, poor)
+    state.refit_subset_from(bigger, "offset_drift")
+    (again,) = state.candidates_of(("sensitivity:room",))
     assert again.log_z == pytest.approx(good.log_z, abs=0.02)
     assert again.log_share == good.log_share
     np.testing.assert_allclose(again.found.predicted, good.found.predicted, atol=1e-3)
-    assert state.refits.extended(state.null, state.effects["sensitivity:room"])[0] is again  # in a second search
+    assert (
+        state.refits.refit_with_effect(state.null, state.effects["sensitivity:room"])[0] is again
+    )  # in a second search
 
 
 def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
-    weighed = state.refits.extended(state.null, state.effects["sensitivity:room"])[0]
+    weighed = state.refits.refit_with_effect(state.null, state.effects["sensitivity:room"])[0]
     assert weighed.evidence[()].log_z > state.null.evidence[()].log_z + 20
-    idle = state.refits.extended(state.null, state.effects["input_offset:force"])[0]
+    idle = state.refits.refit_with_effect(state.null, state.effects["input_offset:force"])[0]
     assert idle.evidence.keys() == state.null.evidence.keys()
     assert not is_significant(idle, state.null)
     assert idle.log_z <= state.null.log_z + 0.02
@@ -103,9 +105,9 @@ def test_only_a_fit_that_gains_is_weighed_under_every_noise(state):
 
 def test_a_second_search_makes_hardly_a_refit_again(prepared, monkeypatch):
     fitted = []
-    whole = Refits.weighed
+    whole = Refits.fit_and_weigh
     monkeypatch.setattr(
-        Refits, "weighed", lambda self, model, *a, **k: fitted.append(model.names) or whole(self, model, *a, **k)
+        Refits, "fit_and_weigh", lambda self, model, *a, **k: fitted.append(model.names) or whole(self, model, *a, **k)
     )
     first = searching.search(prepared)
     made = list(fitted)
@@ -132,14 +134,14 @@ def test_amounts_of_one_value_for_each_run_leave_what_they_have_in_common_to_the
     residual = runs @ values + 6e-3 * trace / np.linalg.norm(trace)
     plain = np.linalg.lstsq(projected, residual)[0]
     assert np.abs(plain - values).max() > 3.0
-    np.testing.assert_allclose(_amounts(projected, residual), values, atol=0.02)
+    np.testing.assert_allclose(_amounts_in_residual(projected, residual), values, atol=0.02)
 
 
 def test_of_one_column_the_amount_is_that_of_least_squares():
     rng = np.random.default_rng(1)
     column, residual = rng.normal(size=(20, 1)), rng.normal(size=20)
     exact = float(column[:, 0] @ residual / (column[:, 0] @ column[:, 0]))
-    np.testing.assert_allclose(_amounts(column, residual), [exact])
+    np.testing.assert_allclose(_amounts_in_residual(column, residual), [exact])
 
 
 def test_a_slope_that_differs_from_run_to_run_is_fitted_as_well_as_one_straight_line_for_each():
@@ -154,7 +156,7 @@ def test_a_slope_that_differs_from_run_to_run_is_fitted_as_well_as_one_straight_
         simulate=lambda p, u: p["zero"] + p["slope"] * u["force"], run="run",
     )  # fmt: skip
     state = _state(prepare_system(simulator, table))
-    found = state.refits.extended(state.null, state.effects["differs:slope"])[0].found
+    found = state.refits.refit_with_effect(state.null, state.effects["differs:slope"])[0].found
     lines = np.column_stack([np.ones(_N), force[:, None] * (run[:, None] == np.arange(6.0))])
     best = y - lines @ np.linalg.lstsq(lines, y)[0]
     assert np.sum(found.residuals**2) == pytest.approx(np.sum(best**2), rel=0.02)
@@ -169,10 +171,14 @@ def test_what_was_not_refitted_promises_no_more_than_the_refits_kept(prepared):
     state.about_null |= {(tuple(sorted(pair)), ()): promised for pair in pairs}
 
     def posterior():
-        return posterior_of(Evidences(state.candidates, state.screened()), state.prior, certain=(), n_forms=1)
+        return posterior_of(
+            Evidences(state.candidates, state.screened_log_evidences()), state.prior, certain=(), n_forms=1
+        )
 
-    searching._refit_late(state, posterior, silent)
-    left = {names: value for (names, _), value in state.screened().items() if names not in state.undetected}
+    searching._refit_favoured_by_screening(state, posterior, silent)
+    left = {
+        names: value for (names, _), value in state.screened_log_evidences().items() if names not in state.undetected
+    }
     assert len(left) >= 2
     assert all(value < max(c.log_z for c in state.candidates.values()) + 3.0 for value in left.values())
     assert state.optimism > 400

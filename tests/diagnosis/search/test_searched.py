@@ -15,7 +15,7 @@ PRIOR = PriorOdds(n_named=2, n_unnamed=0, n_noises=1)
 class Fit(SimpleNamespace):
     """As much of a weighed fit as its evidence."""
 
-    def moved(self, by):
+    def shifted(self, by):
         return Fit(evidence={k: SimpleNamespace(log_z=e.log_z + by) for k, e in self.evidence.items()})
 
 
@@ -48,7 +48,7 @@ def test_orders_are_those_of_the_clean_mean_alone():
 
 
 def test_evidence_that_is_moved_moves_what_is_unknown_beside_it():
-    moved = EVIDENCES.moved({(1, ()): 2.0})
+    moved = EVIDENCES.shifted({(1, ()): 2.0})
     assert moved.unknown[1, (), ()] == 3.0
     assert [moved.fits[key].evidence[()].log_z for key in ((1, ()), (1, ("lag",)))] == [2.0, 5.0]
     assert EVIDENCES.unknown[1, (), ()] == 1.0

@@ -13,7 +13,7 @@ from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search import thorough
 from probewise.diagnosis.search.search import search
-from probewise.diagnosis.search.weighed_twice import Weighing, with_agreement
+from probewise.diagnosis.search.weighed_twice import Weighing, sentence_with_agreement
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import Normal, Product
 from probewise.recordings import Plan, Recording, paper_plan
@@ -74,7 +74,9 @@ def test_the_weighing_says_first_how_long_it_may_take_and_then_how_far_it_is(ste
 
 def test_the_time_of_a_weighing_grows_with_its_live_points_and_its_hypotheses(stepped):
     leaders = thorough._leading_hypotheses(stepped)
-    few, many = (thorough._estimated_minutes(leaders, stepped, n, rng=np.random.default_rng(0)) for n in (100, 10_000))
+    few, many = (
+        thorough._least_and_most_minutes(leaders, stepped, n, rng=np.random.default_rng(0)) for n in (100, 10_000)
+    )
     assert few[0] < few[1] < many[1]
     assert thorough._minutes_in_words((3.2, 14.1)) == "3 to 15 minutes"
 
@@ -133,7 +135,7 @@ def test_a_prior_that_holds_more_than_what_was_found_in_it_is_a_doubt(stepped, m
     assert all("holds more" in w.doubts[-1] for w in weighings)
     assert all(w.agree for w in weighings)
     assert found is stepped
-    assert "agrees to a nat and its own error, but it doubts itself" in with_agreement("A reason.", weighings)
+    assert "agrees to a nat and its own error, but it doubts itself" in sentence_with_agreement("A reason.", weighings)
 
 
 @pytest.mark.slow
@@ -196,14 +198,16 @@ def test_within_a_nat_laplace_stands(stepped, monkeypatch):
 def test_a_run_with_doubts_does_not_win(stepped, monkeypatch):
     found, weighings = moved(stepped, monkeypatch, 5.0, doubts=("few effective samples",))
     assert found is stepped
-    assert "left as they were, but it doubts itself" in with_agreement("A reason.", weighings)
+    assert "left as they were, but it doubts itself" in sentence_with_agreement("A reason.", weighings)
 
 
 def test_the_reason_says_whether_they_agree():
     near, far = Weighing(("lag",), 1, -10.0, -10.4, 0.1), Weighing((), 1, -12.0, -14.0, 0.1)
-    assert with_agreement("A reason.", ()) == "A reason."
-    assert with_agreement("A reason.", (near,)) == "A reason; nested sampling agrees to a nat and its own error."
-    assert "clean by −2.0 nats" in with_agreement("A reason.", (near, far))
+    assert sentence_with_agreement("A reason.", ()) == "A reason."
+    assert (
+        sentence_with_agreement("A reason.", (near,)) == "A reason; nested sampling agrees to a nat and its own error."
+    )
+    assert "clean by −2.0 nats" in sentence_with_agreement("A reason.", (near, far))
 
 
 @pytest.mark.slow

@@ -5,14 +5,14 @@ from typing import cast
 import numpy as np
 from heater import runs
 
-from probewise.diagnosis.system.commands import as_alternatives, in_sequence, run_commands
+from probewise.diagnosis.system.commands import as_alternatives, in_sequence, possible_run_commands
 from probewise.systems import RunTable
 
 TABLE = runs()
 
 
 def offered(controls=("power_w",), table=TABLE):
-    return {c.table.scan_names[0]: c for c in run_commands(table, "temp_c", controls, "s")}
+    return {c.table.scan_names[0]: c for c in possible_run_commands(table, "temp_c", controls, "s")}
 
 
 def test_without_controls_recorded_runs_are_taken_again():

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.search.proposed import may_be_incomplete
+from probewise.diagnosis.search.formulas import needs_more_than_memoryless_noise
 from probewise.diagnosis.search.searched import Posterior
 from probewise.diagnosis.system.diagnose import diagnose_system
 from probewise.systems import RunTable, Simulator
@@ -38,7 +38,7 @@ def test_a_square_wave_is_no_pair_of_sinusoids():
     assert found.verdict == "unknown"
     (wave,) = [e for e in found.repaired.chain.effects if e.name.startswith("formula:")]
     assert wave.expression.startswith("a while")
-    values = dict(zip(wave.prior.names, found.repaired.columns(wave.name).mean(axis=0), strict=True))
+    values = dict(zip(wave.prior.names, found.repaired.effect_samples(wave.name).mean(axis=0), strict=True))
     assert 1 / values["hz"] == pytest.approx(23.0, rel=0.01)
     assert values["a"] == pytest.approx(0.23, abs=0.05)
 
@@ -71,4 +71,4 @@ def test_a_product_of_columns_is_no_pair_of_names():
 def test_formulas_are_weighed_wherever_more_than_noise_without_a_memory_leads(mean, noise, asked):
     """A walk takes up what changes slowly, and one name part of what a formula does."""
     searched = SimpleNamespace(posterior=Posterior({(mean, noise): 0.95, (("drag",), ()): 0.05}, {}))
-    assert may_be_incomplete(searched) is asked
+    assert needs_more_than_memoryless_noise(searched) is asked

@@ -100,7 +100,7 @@ def predict_runs(
             drawn[name] = system.marginals[name].from_unit((rng.permutation(n) + rng.random(n)) / n)
         else:
             effect = next(own_name for own_name in own if name.startswith(f"{own_name}."))
-            drawn[name] = draw_for_new_run(samples.columns(effect)[chosen], rng=rng)
+            drawn[name] = draw_for_new_run(samples.effect_samples(effect)[chosen], rng=rng)
     theta = np.stack([(known | drawn)[name] for name in wider.names], axis=1)
     with np.errstate(all="ignore"):
         predicted = np.concatenate([wider.predict(part, table) for part in np.array_split(theta, max(n // 500, 1))])

@@ -14,9 +14,9 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.evidence.laplace import Blocks, Linearised
 from probewise.diagnosis.fitting.fit import Fit
-from probewise.diagnosis.scheduling import MOST_READINGS, rows_of
+from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
 from probewise.effects import NamedEffect, name_of_first_copy
 
 ALIAS_COSINE = 0.9
@@ -77,13 +77,13 @@ def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[A
     problem, found
         The null fit, linearised and as a fit.
     """
-    prepared, screening = searched.prepared, searched.screening
+    prepared, misfit_templates = searched.prepared, searched.misfit_templates
     telling: dict[str, FloatArray] = {}
     chosen: dict[str, NamedEffect[Any]] = {}
     for name, effect in prepared.effects.items():
-        if name in prepared.on_noise or out_of_vocabulary((name,)) or name_of_first_copy(name) is not None:
+        if name in prepared.on_noise or effects_out_of_vocabulary((name,)) or name_of_first_copy(name) is not None:
             continue
-        templates = screening.templates.of(screening.about, effect.with_fewer_variants())
+        templates = misfit_templates.templates.of(misfit_templates.about, effect.with_fewer_variants())
         blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
@@ -119,7 +119,7 @@ def with_separating_plans(
         name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale
         for name, (model, z, _, scale) in shapes.items()
     }
-    for scan, rows in zip(scans, rows_of(scans), strict=True):
+    for scan, rows in zip(scans, rows_by_command(scans), strict=True):
         for first, second in best:
             sign = np.sign(float(shapes[first][2] @ shapes[second][2])) or 1.0
             apart = there[first][rows] - sign * there[second][rows]

@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.scheduling import MOST_READINGS, Command, rows_of
+from probewise.diagnosis.scheduling import MOST_READINGS, Command, rows_by_command
 from probewise.recordings.plan import Plan
 
 _STRIDES = (2, 4)
@@ -103,7 +103,7 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
     offered = [offered[k] for k in _shortlisted(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
-    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_of(offered)
+    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_by_command(offered)
     predictives = [rival.predictive(everywhere, sd) for rival in rivals]
 
     chosen: list[int] = []
@@ -159,7 +159,7 @@ def _shortlisted(
     """Keep, for each pair of rivals, the few scans in which their predictions differ most per minute."""
     if not offered:
         return []
-    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_of(offered)
+    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_by_command(offered)
     means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
     minutes = np.array([option.minutes for option in offered])
     kept: dict[int, None] = {}

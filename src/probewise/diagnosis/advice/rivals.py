@@ -33,7 +33,7 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     ranked = sorted(probabilities, key=lambda names: -probabilities[names])
     found = _leading_fits(searched, null, {names: probabilities[names] for names in ranked})
     prepared = searched.prepared
-    sd, plan, apparatus = found[0].sd, prepared.recording.plan, prepared.apparatus
+    sd, plan, apparatus = found[0].whitened_sd, prepared.recording.plan, prepared.apparatus
     as_calibrated = f"{apparatus.words.null} as calibrated"
     rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated) for candidate in found]
     if len(rivals) > 1:
@@ -51,7 +51,7 @@ def _leading_fits(searched: Searched, null: WeighedFit, ranked: Mapping[Names, f
     """Return the fits of the leading hypotheses on the mean, by their probabilities, the most probable first."""
     found: list[WeighedFit] = []
     for names, probability in ranked.items():
-        candidate = searched.best(names, searched.certain) if names else null
+        candidate = searched.best_refit_of(names, searched.certain) if names else null
         # The rival of a named effect is the next hypothesis, however improbable; that of clean, a possible weak effect.
         second = len(found) == 1 and bool(found[0].names)
         if candidate is not None and (not found or second or probability >= _LEAST_PROBABILITY):
@@ -71,7 +71,7 @@ def _insignificant_rival(searched: Searched, null: WeighedFit, name: str) -> Riv
     effect, found = searched.prepared.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(found, best.law)
-    templates = searched.screening.templates.of(found, effect)
+    templates = searched.misfit_templates.templates.of(found, effect)
     sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
     at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / _UNDETECTED))))
     setting = templates.settings[at][0].copy()
@@ -85,7 +85,7 @@ def _insignificant_rival(searched: Searched, null: WeighedFit, name: str) -> Riv
     for _ in range(_SIZES if amplitudes else 1):
         z = np.concatenate([found.z, model.coordinates_of_last_effect(setting[None, :])[0]])
         z[: len(found.z)] += problem.absorbed(found, change(z))  # the sensor refitted to readings with the effect
-        if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.sd:
+        if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.whitened_sd:
             root = np.zeros((len(z), len(z)))  # its size is fixed
             root[: len(found.z), : len(found.z)] = _root_of(null)
             return Rival(f"{spoken_name(name)} too weak to be detected so far", model, z, root, 0.0)
@@ -95,5 +95,5 @@ def _insignificant_rival(searched: Searched, null: WeighedFit, name: str) -> Riv
 
 def _root_of(candidate: WeighedFit) -> FloatArray:
     """Return a square root of the covariance of a fit's coordinates, for white noise."""
-    slopes, sd = candidate.found.slopes, candidate.sd
+    slopes, sd = candidate.found.slopes, candidate.whitened_sd
     return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd))

@@ -10,7 +10,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.convergence import require_converged
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.residuals.locate import global_p_value
+from probewise.diagnosis.residuals.locate import bayes_factor_p_value
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
@@ -44,7 +44,7 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
     if not prepared.too_little:
         require_converged(null.found, Linearised.of(null.found, null.law))
     draws = problem.draws(N_DRAWS, rng=rng)
-    p_value = global_p_value(problem, searched.looks(null.found), draws)
+    p_value = bayes_factor_p_value(problem, searched.banks_for_test(null.found), draws)
     p_value = _at_every_order(searched, null, noise, p_value, rng=rng)
     # Constant readings have no noise to compare a residual with.
     return GlobalTest(null, noise, problem, draws, 1.0 if prepared.has_equal_readings else p_value)
@@ -70,5 +70,5 @@ def _at_every_order(
         beside = prepared.apparatus.fine_structure(found, prepared.usable) if fine else None
         problem = Linearised.of(found, rival.evidence[noise].law, beside)
         draws = problem.draws(N_DRAWS, rng=rng)
-        p_value = max(p_value, global_p_value(problem, searched.looks(found), draws))
+        p_value = max(p_value, bayes_factor_p_value(problem, searched.banks_for_test(found), draws))
     return p_value

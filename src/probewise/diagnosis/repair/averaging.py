@@ -84,15 +84,15 @@ def over_hypotheses(
     absent: dict[str, list[BoolArray]] = {name: [] for name in effects}
     for part, count in zip(parts, counts, strict=True):
         rows = rng.permutation(n)[:count]
-        head = len(part.chain.names) - sum(part.columns(name).shape[1] for name in effects)
+        head = len(part.chain.names) - sum(part.effect_samples(name).shape[1] for name in effects)
         columns = [_with_more_gaussians(part.theta[rows, :head], part.n_gaussians, largest.n_gaussians)]
         for effect in cast(Sequence[NamedEffect[Any]], chain.effects):
             absent[effect.name].append(np.full(count, effect.name not in part.effects))
             if effect.name in part.effects:
-                columns.append(part.columns(effect.name)[rows])
+                columns.append(part.effect_samples(effect.name)[rows])
                 continue
             holder = next(other for other in parts if effect.name in other.effects)
-            idle = holder.columns(effect.name)[rows]
+            idle = holder.effect_samples(effect.name)[rows]
             for k, value in (effect.nothing or {}).items():
                 idle[:, k] = value
             columns.append(idle)

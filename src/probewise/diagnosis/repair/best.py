@@ -64,14 +64,14 @@ def best_repair(
     null, noise = test.null, test.noise
     if judged.verdict == "unknown":
         leading = searched.leading_out_of_vocabulary()
-        fit = (searched.best(leading, noise) if leading else searched.beside(noise)) or null
+        fit = (searched.best_refit_of(leading, noise) if leading else searched.likeliest_beside_unknown(noise)) or null
         return judged, Best.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
     on_noise = searched.prepared.on_noise
     if judged.verdict in ("named", "noise", "clean"):
         stated = tuple(name for name in judged.combination if name in on_noise)
         noise = searched.posterior.likeliest_noise(stated)
     on_mean = tuple(name for name in judged.combination if name not in on_noise)
-    best = Best.of(searched, test, searched.best(on_mean, noise) or null, noise, rng=rng)
+    best = Best.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
     if judged.verdict == "named" and predicts_far_worse(
         best.improvement
     ):  # a fit that fails on held-out readings is no repair

@@ -20,7 +20,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.repair.best import Best
 from probewise.diagnosis.repair.improvement import N_DRAWS, Improvement
-from probewise.diagnosis.residuals.locate import ALARM, global_p_value
+from probewise.diagnosis.residuals.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.search.searched import Searched
 
 _ABOUT_EQUAL = 5.0  # nats
@@ -83,7 +83,7 @@ def corrected(
     improvement, change
         The improvement of `best` including the correction, and the correction of the usable readings, (n_usable,).
     """
-    prepared, bases, problem = searched.prepared, searched.screening.unknown_bases, best.problem
+    prepared, bases, problem = searched.prepared, searched.misfit_templates.unknown_bases, best.problem
     found, gain = best.fit.found, best.improvement
     parts, part_names = prepared.apparatus.held_out_parts(prepared.recording)
     fixed = correct(found, problem, bases, parts)
@@ -120,7 +120,9 @@ def corrected(
             heldout_sd=math.hypot(gain.heldout_sd, held.sd),
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
             rms_after=float(np.sqrt(np.mean(found.residuals**2))),
-            p_value_after=global_p_value(problem, searched.looks(best.fit.found), problem.draws(N_DRAWS, rng=rng)),
+            p_value_after=bayes_factor_p_value(
+                problem, searched.banks_for_test(best.fit.found), problem.draws(N_DRAWS, rng=rng)
+            ),
         )
         if gain.p_value_after >= ALARM or not held.by_scan:
             break

@@ -1,4 +1,4 @@
-"""Posterior samples of refitted hypotheses: of one, or averaged over those that remain possible."""
+"""Posterior samples of refitted hypotheses: of one, or averaged over several by their probability."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, s
 from probewise.diagnosis.repair.best import Best, predicts_far_worse
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
 from probewise.progress import Progress, silent
 
 _LEAST_OF_AN_ORDER = 0.2  # probability below which an SSF order is left out of the average
@@ -27,10 +27,10 @@ _DOUBT_BESIDE = 0.5  # weight of the null for a named effect with an unknown eff
 
 
 @dataclass(frozen=True, eq=False)
-class Ensemble:
-    """Cached posterior samples of hypotheses under one noise model.
+class HypothesisSamples:
+    """Cached posterior samples of the hypotheses of a search under one noise model.
 
-    Models can be combined only if their SSFs are all mixtures of Gaussians, or all free forms.
+    Only hypotheses with SSFs of one form can be averaged: all mixtures of Gaussians, or all free forms.
     """
 
     searched: Searched
@@ -39,48 +39,54 @@ class Ensemble:
     progress: Progress = silent
     _known: dict[tuple[Names, bool], ModelSamples] = field(default_factory=dict)
 
-    def of(self, candidate: WeighedFit) -> ModelSamples:
-        """Draw from the posterior of a candidate's hypothesis, averaged over its probable SSF orders."""
+    def averaged_over_orders(self, candidate: WeighedFit) -> ModelSamples:
+        """Return posterior samples of a candidate's hypothesis, drawn once, averaged over its probable SSF orders."""
         key = candidate.names, candidate.found.model.sensor.exchangeable
         if key not in self._known:
-            alike = self._of_form(candidate, candidate.names)
+            alike = self._candidates_of_same_form(candidate, candidate.names)
             log_z = np.array([c.evidence[self.noise].log_z for c in alike])
             weights = np.exp(log_z - log_z.max())
             kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
-            parts = [self._samples_of(c) for c in itertools.compress(alike, kept)]
+            parts = [self._draw_samples(c) for c in itertools.compress(alike, kept)]
             self._known[key] = over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
         return self._known[key]
 
-    def likely(self, best: WeighedFit) -> dict[Names, float]:
-        """Return the probabilities of the hypotheses that can be averaged with the best candidate."""
+    def compatible_probabilities(self, best: WeighedFit) -> dict[Names, float]:
+        """Return the probability of each hypothesis whose SSF has the best candidate's form; their sum is one.
+
+        A user's own effects are excluded unless the best candidate has them.
+        """
         out: dict[Names, float] = {}
         prepared = self.searched.prepared
         own = prepared.apparatus.own_effects(prepared.effects)
         for names in dict.fromkeys(names for _, names in self.searched.evidences.fits):
-            log_z = [c.evidence[self.noise].log_z for c in self._of_form(best, names)]
+            log_z = [c.evidence[self.noise].log_z for c in self._candidates_of_same_form(best, names)]
             # A file cannot hold a user's own effect; it is kept only if it is in the best hypothesis.
             if log_z and not own & ({*names} - {*best.names}):
                 out[names] = float(np.logaddexp.reduce(log_z)) + self.searched.prior.log_mean(names)
         total = np.logaddexp.reduce(list(out.values()))
         return {names: math.exp(value - total) for names, value in out.items()}
 
-    def averaged(self, best: WeighedFit, probabilities: Mapping[Names, float]) -> ModelSamples:
-        """Average the samples of the best candidate and its compatible rivals by probability."""
-        kept = [(self.of(best), best, probabilities[best.names])]
+    def averaged_over_hypotheses(self, best: WeighedFit, probabilities: Mapping[Names, float]) -> ModelSamples:
+        """Average the samples of the best candidate and of its most probable compatible rivals, by probability.
+
+        At most six hypotheses; those of a probability below 0.02 are left out.
+        """
+        kept = [(self.averaged_over_orders(best), best, probabilities[best.names])]
         for names in sorted(set(probabilities) - {best.names}, key=lambda names: -probabilities[names]):
             if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST:
                 break
-            rival = max(self._of_form(best, names), key=lambda c: c.evidence[self.noise].log_z)
+            rival = max(self._candidates_of_same_form(best, names), key=lambda c: c.evidence[self.noise].log_z)
             if all(side_by_side(c.found.model.effects, rival.found.model.effects) for _, c, _ in kept):
-                kept.append((self.of(rival), rival, probabilities[names]))
+                kept.append((self.averaged_over_orders(rival), rival, probabilities[names]))
         if len(kept) == 1:
             return kept[0][0]
         parts, shares = [part for part, _, _ in kept], np.array([p for _, _, p in kept])
         null = self.searched.nulls[max(part.n_gaussians for part in parts)]
         return over_hypotheses(parts, shares, null, self.searched.prepared.recording.plan, rng=self.rng)
 
-    def _of_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
-        """List the refitted candidates of a combination whose SSF has the best one's form."""
+    def _candidates_of_same_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
+        """List the refitted candidates of a combination, one per SSF order, whose SSF has the best one's form."""
         form = best.found.model.sensor.exchangeable
         return [
             c
@@ -88,7 +94,7 @@ class Ensemble:
             if key == names and c.found.model.sensor.exchangeable == form
         ]
 
-    def _samples_of(self, candidate: WeighedFit) -> ModelSamples:
+    def _draw_samples(self, candidate: WeighedFit) -> ModelSamples:
         evidence, recording = candidate.evidence[self.noise], self.searched.prepared.recording
         return sample_model(
             candidate.found, evidence, recording, weights=candidate.weights, rng=self.rng, progress=self.progress
@@ -96,8 +102,8 @@ class Ensemble:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """Posterior samples of the null, of the best hypothesis, and of the averaged model."""
+class DrawnModels:
+    """Posterior samples: of the null, of the best hypothesis, and of the repaired `model`, an average of hypotheses."""
 
     null: ModelSamples
     best: ModelSamples
@@ -112,31 +118,33 @@ def draw_models(
     *,
     rng: np.random.Generator,
     progress: Progress = silent,
-) -> Drawn:
+) -> DrawnModels:
     """Draw from the posterior of the repaired model, averaged over hypotheses that the verdict leaves open.
 
     The best hypothesis alone would be overconfident if the effect is unknown, or if it leads by little.
     """
-    ensemble, fit, null = Ensemble(searched, best.noise, rng, progress), best.fit, test.null
-    model = samples = ensemble.of(fit)
+    cached, fit, null = HypothesisSamples(searched, best.noise, rng, progress), best.fit, test.null
+    model = samples = cached.averaged_over_orders(fit)
     if judged.verdict == "unknown":
         doubt = _DOUBT_BESIDE
         if best.out_of_vocabulary:
             doubt = max(1 - searched.posterior.by_mean[best.out_of_vocabulary], _LEAST_DOUBT)
-        model = ensemble.averaged(fit, {fit.names: 1 - doubt, (): doubt})
+        model = cached.averaged_over_hypotheses(fit, {fit.names: 1 - doubt, (): doubt})
     elif judged.verdict in ("named", "cannot_tell") and fit.names:
-        model = ensemble.averaged(fit, ensemble.likely(fit))
+        model = cached.averaged_over_hypotheses(fit, cached.compatible_probabilities(fit))
     elif not (judged.too_little or judged.withdrawn):
-        model = _average_of_hypotheses(ensemble, searched, test, best.noise)
-    return Drawn(samples if fit is null else ensemble.of(null), samples, model)
+        model = _average_of_named_and_null(cached, searched, test, best.noise)
+    return DrawnModels(samples if fit is null else cached.averaged_over_orders(null), samples, model)
 
 
-def _average_of_hypotheses(ensemble: Ensemble, searched: Searched, test: GlobalTest, noise: Names) -> ModelSamples:
-    """Average over hypotheses if none is stated: named ones by probability, and the null for the rest."""
+def _average_of_named_and_null(
+    cached: HypothesisSamples, searched: Searched, test: GlobalTest, noise: Names
+) -> ModelSamples:
+    """Average over named hypotheses by probability, and the null for the rest; used if the verdict names none."""
     by_mean = searched.posterior.by_mean
-    named = {names for _, names in searched.evidences.fits if not out_of_vocabulary(names)}
-    fit = searched.best(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
-    if fit.names and predicts_far_worse(Best.of(searched, test, fit, noise, rng=ensemble.rng).improvement):
-        return ensemble.of(test.null)
-    shares = {names: by_mean.get(names, 0.0) for names in ensemble.likely(fit) if names}
-    return ensemble.averaged(fit, {**shares, (): max(1 - sum(shares.values()), 0.0)})
+    named = {names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)}
+    fit = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
+    if fit.names and predicts_far_worse(Best.of(searched, test, fit, noise, rng=cached.rng).improvement):
+        return cached.averaged_over_orders(test.null)
+    shares = {names: by_mean.get(names, 0.0) for names in cached.compatible_probabilities(fit) if names}
+    return cached.averaged_over_hypotheses(fit, {**shares, (): max(1 - sum(shares.values()), 0.0)})

@@ -1,4 +1,4 @@
-"""The gain of a repair over the null."""
+"""The gain of a repaired model over the null: in evidence, on held-out readings, in residuals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from probewise.diagnosis.evidence.held_out import held_out_gain
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.residuals.locate import global_p_value
+from probewise.diagnosis.residuals.locate import bayes_factor_p_value
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
@@ -19,7 +19,11 @@ N_DRAWS = 499
 
 @dataclass(frozen=True)
 class Improvement:
-    """The gain of the repaired model over the null."""
+    """The gain of the repaired model over the null.
+
+    `log_evidence` in nats; `heldout_log_density_per_reading` and its sd in nats per held-out reading, `heldout_by_scan`
+    by part; rms residuals in the unit of the readings; `p_value_after` of the global test of the repaired model.
+    """
 
     log_evidence: float
     heldout_log_density_per_reading: float
@@ -38,11 +42,11 @@ def improvement_of(
     Parameters
     ----------
     searched, test
-        Result of the search; test of the null.
+        Result of the search; global test of the null.
     best, noise, after
         The best fit, its noise model, and its linearisation.
     rng
-        Random generator, for the null distribution of the test of the residuals.
+        Random generator, for the null distribution of the test of the repaired model.
     """
     null = test.null
     rms = [float(np.sqrt(np.mean(c.found.residuals**2))) for c in (null, best)]
@@ -52,5 +56,5 @@ def improvement_of(
     law, prepared = best.evidence[noise].law, searched.prepared
     parts = prepared.apparatus.held_out_parts(prepared.recording)
     held = held_out_gain(null.found, best.found, prepared.recording, law, parts)
-    p_after = global_p_value(after, searched.looks(best.found), after.draws(N_DRAWS, rng=rng))
+    p_after = bayes_factor_p_value(after, searched.banks_for_test(best.found), after.draws(N_DRAWS, rng=rng))
     return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_value_after=p_after)

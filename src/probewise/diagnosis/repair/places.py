@@ -1,4 +1,4 @@
-"""Places of the effects of a repair, and of other significant residuals."""
+"""Places, in the covariates, of the effects of a repair and of other significant residuals."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.judgement.global_test import N_DRAWS, GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
 from probewise.diagnosis.repair.best import Best
-from probewise.diagnosis.residuals.locate import Place, places, places_of_effect
+from probewise.diagnosis.residuals.locate import Place, places_of_effect, significant_places
 from probewise.diagnosis.search.searched import Searched
 
 
-def locate(
+def locate_effects_and_residuals(
     searched: Searched,
     test: GlobalTest,
     judged: Judged,
@@ -23,19 +23,21 @@ def locate(
     *,
     rng: np.random.Generator,
 ) -> tuple[Place, ...]:
-    """Locate the effects of the repair, the largest first; then other significant residuals.
+    """Return the places of the repair's effects, largest first, then of other significant residuals of the null.
+
+    One place per figure: of several with the same figure, only the first is kept.
 
     Parameters
     ----------
     searched, test, judged, best
-        What was found.
+        Result of the search; global test of the null; the verdict; the repair.
     sizes
-        Lambda of each effect.
+        Lambda of each effect, by name.
     rng
-        Random generator, for the null distribution of a second test of residuals that only outlying readings show.
+        Random generator, for a second test under normal noise, if heavy-tailed noise leaves nothing significant.
     """
     prepared, problem, law = searched.prepared, test.problem, test.problem.law
-    covariates, residuals = searched.screening.covariates, test.null.found.residuals
+    covariates, residuals = searched.misfit_templates.covariates, test.null.found.residuals
     plan, found = prepared.recording.plan.take(prepared.usable), best.fit.found
     scans = next((c for c in covariates if c.name == "scan"), None)
     named: list[Place] = []
@@ -48,12 +50,12 @@ def locate(
                 effect, change, shows_in, scans, plan, residuals, p_value=judged.p_value, size=size, sd=problem.sd
             )
     scan_names = prepared.recording.plan.scan_names
-    scanned = places(problem, covariates, scan_names, residuals, test.draws)
+    scanned = significant_places(problem, covariates, scan_names, residuals, test.draws)
     if judged.verdict == "unknown" and not (named or scanned) and law.share:
         # Under heavy-tailed noise, residuals in outlying readings only are not significant.
         white = Linearised.of(test.null.found, law.plain())
-        scanned = places(white, covariates, scan_names, residuals, white.draws(N_DRAWS, rng=rng))
+        scanned = significant_places(white, covariates, scan_names, residuals, white.draws(N_DRAWS, rng=rng))
     first: dict[str, Place] = {}
     for place in [*named, *scanned]:
-        first.setdefault(place.witness, place)
+        first.setdefault(place.figure_name, place)
     return tuple(first.values())

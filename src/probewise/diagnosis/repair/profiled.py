@@ -1,8 +1,8 @@
-"""A proposal along the one coordinate in which a posterior is least like its Laplace approximation.
+"""A proposal density for importance sampling, profiled along the coordinate in which a posterior is least normal.
 
-Laplace's approximation about slices (Rue, Martino and Chopin 2009): the other coordinates are fitted anew at fixed
-values of that one, such as a time constant, and are normal about each fit. Samples drawn by weight from a normal
-approximation never reach a tail that it lacks.
+Laplace's approximation in slices (Rue, Martino and Chopin 2009): at fixed values of that coordinate, such as a time
+constant, the others are refitted, and are normal about each fit. A normal approximation in all coordinates would have
+too light a tail there, which importance weights cannot restore.
 """
 
 from __future__ import annotations
@@ -33,19 +33,19 @@ _INDEPENDENT = 0.25  # least effective sample size, as a share of the samples wa
 
 
 @dataclass(frozen=True, eq=False)
-class Profiled:
-    """A density of coordinates: that of coordinate `at` by the evidence of its slices, the others Student-t in each.
+class ProfiledDensity:
+    """A density of a fit's coordinates: one by the evidence of slices at fixed values, the others Student-t in each.
 
     Parameters
     ----------
     at
-        The coordinate.
+        Index of the sliced coordinate.
     nodes
         Its values in the slices, rising, (n_nodes,).
     modes
         The other coordinates' best values in each slice, (n_nodes, n_params - 1).
     roots
-        Cholesky factors of their covariances there, (n_nodes, n_params - 1, n_params - 1).
+        Lower Cholesky factors of their covariances there, (n_nodes, n_params - 1, n_params - 1).
     log_evidence
         Log evidence of each slice, up to a constant, (n_nodes,).
     """
@@ -58,21 +58,24 @@ class Profiled:
 
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, recording: Recording) -> Self | None:
-        """Profile the least normal of the coordinates in which the effects of a fit are nonlinear.
+        """Profile each nonlinear coordinate of the effects of a fit, and return the density that is least normal.
 
-        None if there is none, or its slices cannot be fitted.
+        None if there is no such coordinate, or none whose slices can be fitted.
         """
         slopes = law(found.slopes)
         sd = max(float(law.scale(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.information)
         covariance = np.linalg.inv(slopes.T @ slopes / sd**2 + np.eye(len(found.z)))
         tried = [
-            cls._along_coordinate(found, law, recording, at, covariance, float(sd))
-            for at in _nonlinear_coordinates(found)
+            cls._of_coordinate(found, law, recording, at, covariance, float(sd)) for at in _nonlinear_coordinates(found)
         ]
-        return max((profile for profile in tried if profile is not None), key=lambda p: p._curvature, default=None)
+        return max(
+            (profile for profile in tried if profile is not None),
+            key=lambda p: p._departure_from_normal_nats,
+            default=None,
+        )
 
     @classmethod
-    def _along_coordinate(
+    def _of_coordinate(
         cls, found: Fit, law: NoiseLaw, recording: Recording, at: int, covariance: FloatArray, sd: float
     ) -> Self | None:
         nodes = found.z[at] + _NODES * np.sqrt(covariance[at, at])
@@ -84,8 +87,11 @@ class Profiled:
         rest, usable = np.delete(np.arange(len(found.z)), at), recording.usable
         readings, n, eye = recording.readings[usable], len(nodes), np.eye(len(found.z))
 
-        def sliced(z: FloatArray) -> tuple[FloatArray, FloatArray]:
-            """Return the log posterior of each slice, (n_nodes,), and slopes, (n_nodes, n_points + 1, n_params)."""
+        def heights_and_slopes(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+            """Return each slice's log posterior, (n_nodes,), and its whitened slopes by the others, then residuals.
+
+            The second is (n_nodes, n_params, n_points): n_params - 1 rows of slopes, and one of residuals.
+            """
             near = z[:, None, :] + _STEP * np.concatenate([np.zeros((1, len(rest))) @ eye[rest], eye[rest]])
             predicted = found.model.predict(near.reshape(-1, z.shape[1]))[:, usable]
             whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
@@ -95,21 +101,21 @@ class Profiled:
             joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
             return np.where(np.isfinite(height), height, -np.inf), joined
 
-        state = z, *sliced(z)
+        state = z, *heights_and_slopes(z)
         for _ in range(_ROUNDS):
             for _ in range(_STEPS):
                 curvature, downhill = _normal_equations(state[2], state[0][:, rest], sd)
                 tried = state[0].copy()
                 tried[:, rest] += np.clip(np.linalg.solve(curvature, downhill[:, :, None])[:, :, 0], -1.0, 1.0)
                 tried = np.clip(tried, -FARTHEST, FARTHEST)
-                state = _higher_slices(state, (tried, *sliced(tried)))
+                state = _higher_of_each_slice(state, (tried, *heights_and_slopes(tried)))
             # A slice that went astray begins again from its neighbour's fit, towards the middle.
             towards = np.arange(n) - np.sign(np.arange(n) - int(np.argmax(state[1])))
             tried = state[0][towards]
             tried[:, at] = nodes
-            state = _higher_slices(state, (tried, *sliced(tried)))
+            state = _higher_of_each_slice(state, (tried, *heights_and_slopes(tried)))
         z, height, joined = state
-        there = _slices_about_best(height)
+        there = _near_best_mask(height)
         if there.sum() < len(_NODES) // 2:
             return None
         curvature, _ = _normal_equations(joined[there], z[there][:, rest], sd)
@@ -118,8 +124,8 @@ class Profiled:
         return cls(at, nodes[there], z[there][:, rest], roots, height[there] + volume)
 
     @property
-    def _curvature(self) -> float:
-        """Largest difference in nats from a normal density, three sds from its middle."""
+    def _departure_from_normal_nats(self) -> float:
+        """Largest difference in nats from a normal log density, within three sds of the best slice."""
         spacing = float(np.median(np.diff(self.nodes)))
         best = int(np.argmax(self.log_evidence))
         apart = (self.nodes - self.nodes[best]) / spacing
@@ -133,35 +139,38 @@ class Profiled:
 
     @cached_property
     def _cell_probabilities(self) -> FloatArray:
-        """Probability of each cell of the coordinate, (n_cells,)."""
+        """Probability of each of the equal cells between the first and the last node, (n_cells,)."""
         middle = 0.5 * (self._cell_edges[1:] + self._cell_edges[:-1])
         log_density = np.interp(middle, self.nodes, self.log_evidence)
         shares = np.exp(log_density - log_density.max())
         return np.asarray(shares / shares.sum())
 
-    def _normal_at(self, value: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Return the others' middle (n_samples, n_params - 1), and the number of the nearest slice, (n_samples,)."""
+    def _means_and_nearest_slices(self, value: FloatArray) -> tuple[FloatArray, IntArray]:
+        """Interpolate the other coordinates' modes at values of the sliced one, and find the nearest slices.
+
+        Returns (n_samples, n_params - 1), and indices of slices, (n_samples,).
+        """
         middle = np.stack([np.interp(value, self.nodes, column) for column in self.modes.T], axis=1)
         return middle, np.argmin(np.abs(value[:, None] - self.nodes), axis=1)
 
-    def draws(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
+    def draw(self, n_samples: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw coordinates, (n_samples, n_params)."""
         cell = rng.choice(_N_CELLS, n_samples, p=self._cell_probabilities)
         value = self._cell_edges[cell] + np.diff(self._cell_edges)[cell] * rng.random(n_samples)
-        middle, slice_of = self._normal_at(value)
+        middle, slice_of = self._means_and_nearest_slices(value)
         eps = rng.standard_normal(middle.shape) / np.sqrt(rng.chisquare(_FREEDOM, (n_samples, 1)) / _FREEDOM)
         rest = middle + np.einsum("nij,nj->ni", self.roots[slice_of], eps)
         return np.insert(rest, self.at, value, axis=1)
 
-    def weighed(
+    def importance_resample(
         self, log_p: Callable[[FloatArray], FloatArray], *, n_first: int, n_wanted: int, rng: np.random.Generator
     ) -> FloatArray | None:
-        """Draw coordinates of a posterior by weight, (n_wanted, n_params); None if too few are independent.
+        """Draw from a posterior of log density `log_p` by weighting `n_first` draws: coordinates, (n_wanted, n_params).
 
-        Weights are truncated at the mean weight times the square root of the number of draws (Ionides 2008), so that
-        no draw in a heavy tail dominates.
+        None if the effective sample size is below a quarter of `n_wanted`. Weights are truncated at the mean weight
+        times the square root of the number of draws (Ionides 2008), so that no draw in a heavy tail dominates.
         """
-        first = self.draws(n_first, rng=rng)
+        first = self.draw(n_first, rng=rng)
         gain = log_p(first) - self.log_density(first)
         if not np.isfinite(gain).any():
             return None
@@ -173,7 +182,7 @@ class Profiled:
     def log_density(self, z: FloatArray) -> FloatArray:
         """Return the log density of coordinates, up to a constant, (n_samples, n_params) -> (n_samples,)."""
         value, rest = z[:, self.at], np.delete(z, self.at, axis=1)
-        middle, slice_of = self._normal_at(value)
+        middle, slice_of = self._means_and_nearest_slices(value)
         eps = np.linalg.solve(self.roots[slice_of], (rest - middle)[:, :, None])[:, :, 0]
         volume = np.log(np.diagonal(self.roots, axis1=1, axis2=2)).sum(axis=1)
         cell = np.clip(np.searchsorted(self._cell_edges, value) - 1, 0, _N_CELLS - 1)
@@ -187,8 +196,8 @@ Slices = tuple[FloatArray, FloatArray, FloatArray]
 """Coordinates (n_nodes, n_params), log posteriors (n_nodes,), whitened derivatives with residuals."""
 
 
-def _higher_slices(old: Slices, new: Slices) -> Slices:
-    """Take each slice from the fit that is higher."""
+def _higher_of_each_slice(old: Slices, new: Slices) -> Slices:
+    """Return, of each slice, the fit with the higher log posterior."""
     higher = new[1] > old[1]
     return (
         np.where(higher[:, None], new[0], old[0]),
@@ -197,8 +206,8 @@ def _higher_slices(old: Slices, new: Slices) -> Slices:
     )
 
 
-def _slices_about_best(height: FloatArray) -> BoolArray:
-    """Return the slices about the best, as far as none is far below it, (n_nodes,)."""
+def _near_best_mask(height: FloatArray) -> BoolArray:
+    """Mark the slices about the best one, up to the first on either side 30 nats or more below it, (n_nodes,)."""
     best = int(np.argmax(height))
     low = np.flatnonzero(~(height > height[best] - _FAR))
     out = np.zeros(len(height), dtype=np.bool_)
@@ -207,7 +216,7 @@ def _slices_about_best(height: FloatArray) -> BoolArray:
 
 
 def _nonlinear_coordinates(found: Fit) -> list[int]:
-    """List the coordinates of effects that are no amplitudes."""
+    """List the indices of the effects' coordinates other than amplitudes."""
     out = []
     for effect in found.model.effects:
         first = found.model.coordinates_of(effect.name).start
@@ -216,9 +225,10 @@ def _nonlinear_coordinates(found: Fit) -> list[int]:
 
 
 def _normal_equations(joined: FloatArray, rest: FloatArray, sd: float) -> tuple[FloatArray, FloatArray]:
-    """Return curvature and gradient of each slice's log posterior by its coordinates `rest` (n_nodes, n_rest).
+    """Return the Gauss-Newton matrix and the gradient of each slice's log posterior by its coordinates `rest`.
 
-    `joined` (n_nodes, n_rest + 1, n_points): derivatives of whitened residuals, and the residuals.
+    `rest` is (n_nodes, n_rest); `joined` (n_nodes, n_rest + 1, n_points) holds the derivatives of whitened residuals,
+    then the residuals.
     """
     gram = joined @ joined.transpose(0, 2, 1) / sd**2
     return gram[:, :-1, :-1] + np.eye(rest.shape[1]), -gram[:, :-1, -1] - rest

@@ -1,7 +1,7 @@
-"""A second-order surrogate of a model's predictions about a point, for moving thousands of samples.
+"""A quadratic surrogate of a model's predictions about a point, cheap enough to move thousands of samples.
 
-Its steps are those of the approximate posterior, so that it interpolates over the relevant region instead of
-extrapolating from a point. Negligible changes of the readings are left out.
+It is fitted at steps of the size of the approximate posterior, so that it interpolates over the relevant region instead
+of extrapolating from a point. Negligible changes of the readings are left out.
 """
 
 from __future__ import annotations
@@ -17,11 +17,12 @@ _NEGLIGIBLE = 0.02  # noise sds, over all readings together: smaller changes at 
 
 
 @dataclass(frozen=True, eq=False)
-class Quadratic:
-    """Second-order predictions at `e` steps from a point: `center` + `amounts(e)` @ `changes`.
+class QuadraticPredictions:
+    """Quadratic predictions at steps `e` from a point: `center` + `amounts_of_changes(e)` @ `changes`.
 
-    `center` (n_points,) are the predictions there, `changes` (n_changes, n_points) orthonormal; their amounts are
-    products of steps, single and by `pairs`, times `shares` (n_terms, n_changes).
+    `center` (n_points,) are the predictions at the point, `changes` (n_changes, n_points) orthonormal changes of them.
+    Their amounts are the steps and the products of `pairs` of steps (n_terms in all), times `shares` (n_terms,
+    n_changes).
     """
 
     center: FloatArray
@@ -30,8 +31,8 @@ class Quadratic:
     changes: FloatArray
 
     @classmethod
-    def of(cls, predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float) -> Quadratic:
-        """Build the surrogate, exact at every single step in both directions and at the sum of any two.
+    def of(cls, predict: Callable[[FloatArray], FloatArray], n_params: int, sd: float) -> QuadraticPredictions:
+        """Build the surrogate; it is exact, but for negligible changes, at every step, its reverse, and sums of two.
 
         Parameters
         ----------
@@ -40,7 +41,7 @@ class Quadratic:
         n_params
             Number of parameters, one step each.
         sd
-            Noise of a reading.
+            Noise sd of a reading: changes far smaller are neglected.
         """
         first, second = np.triu_indices(n_params)
         apart = first != second
@@ -56,7 +57,7 @@ class Quadratic:
         root = np.sqrt(lengths[kept])
         return cls(y[0], (first, second), axes[:, kept] * root, (axes[:, kept] / root).T @ terms)
 
-    def amounts(self, e: FloatArray) -> FloatArray:
-        """Return the amount of each change, (n_samples, n_changes)."""
+    def amounts_of_changes(self, e: FloatArray) -> FloatArray:
+        """Return the amount of each change at steps `e`, (n_samples, n_params) -> (n_samples, n_changes)."""
         first, second = self.pairs
         return np.asarray(np.concatenate([e, e[:, first] * e[:, second]], axis=1) @ self.shares)

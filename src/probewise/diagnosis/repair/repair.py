@@ -1,4 +1,4 @@
-"""The calibrated and the repaired model: posterior samples, predictions, and the gain."""
+"""The calibrated and the repaired model: posterior samples, predictions and residuals, and the gain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.best import Best
-from probewise.diagnosis.repair.ensemble import Drawn
+from probewise.diagnosis.repair.ensemble import DrawnModels
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import NamedEffect
@@ -22,7 +22,7 @@ from probewise.effects import NamedEffect
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
-    """Predictions of every row and residuals, (n_points,); residuals are NaN without a usable reading."""
+    """A model's predicted readings of every row, and residuals, NaN without a usable reading: (n_points,) each."""
 
     readings: FloatArray
     residuals: FloatArray
@@ -39,13 +39,13 @@ class Repair:
     Parameters
     ----------
     null, model
-        The two models.
+        Posterior samples of the calibrated and of the repaired model.
     improvement
-        Gain of the second.
+        Gain of the repaired model.
     before, after
-        Predictions of each, for all rows.
+        Predictions and residuals of the calibrated and of the repaired model, for all rows.
     by_rows
-        Whether an unknown effect is corrected by rows; `improvement` includes that, `model` does not.
+        Whether an unknown effect is corrected row by row; `improvement` and `after` include that, `model` does not.
     """
 
     null: ModelSamples
@@ -57,23 +57,29 @@ class Repair:
 
     @property
     def changes_predictions(self) -> bool:
-        """Whether the predictions of the repaired and the calibrated model differ."""
+        """Whether the residuals of the repaired and of the calibrated model differ."""
         return not np.array_equal(self.before.residuals, self.after.residuals, equal_nan=True)
 
     @property
-    def left_open(self) -> dict[tuple[str, ...], float]:
-        """Shares of the model's samples by the effects that they contain and not all do, largest first."""
+    def combination_shares(self) -> dict[tuple[str, ...], float]:
+        """Share of the repaired model's samples by combination of those effects that not all samples contain.
+
+        Largest first; {} if all samples contain the same effects.
+        """
         absent = self.model.absent
         if not absent:
             return {}
         held = Counter(zip(*(np.where(marks, "", name).tolist() for name, marks in absent.items()), strict=True))
         return {tuple(filter(None, names)): n / held.total() for names, n in held.most_common()}
 
-    def carried_beside(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
-        """List effects that the model contains but the verdict does not state: name, share of the samples, sentence."""
+    left_open = combination_shares
+    """The old name of `combination_shares`."""
+
+    def unstated_effects(self, stated: set[str]) -> tuple[tuple[str, float, str], ...]:
+        """List the repaired model's effects that are not `stated`: name, share of the samples with it, sentence."""
         out = []
         for effect in cast(Sequence[NamedEffect[Any]], self.model.chain.effects):
-            values = self.model.columns(effect.name)
+            values = self.model.effect_samples(effect.name)
             marks = self.model.absent.get(effect.name)
             held = values if marks is None else values[~marks]
             if effect.name not in stated and len(held):
@@ -81,16 +87,19 @@ class Repair:
                 out.append((effect.name, len(held) / len(values), sentence))
         return tuple(out)
 
+    carried_beside = unstated_effects
+    """The old name of `unstated_effects`."""
 
-def repair_of(prepared: Prepared, test: GlobalTest, best: Best, drawn: Drawn, change: FloatArray) -> Repair:
-    """Predict every row with both models, including rows not used in the diagnosis.
+
+def repair_of(prepared: Prepared, test: GlobalTest, best: Best, drawn: DrawnModels, change: FloatArray) -> Repair:
+    """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
 
     Parameters
     ----------
     prepared, test, best, drawn
-        What was found.
+        Input of the search; global test of the null; the best fit; samples of the models.
     change
-        The correction of the usable readings by rows, (n_usable,); unused readings have none.
+        Correction of the predictions by rows, (n_usable,), 0 if there is none.
     """
     null, fit = test.null.found, best.fit.found
     everything = prepared.everything
@@ -101,10 +110,10 @@ def repair_of(prepared: Prepared, test: GlobalTest, best: Best, drawn: Drawn, ch
     else:
         by_rows = np.zeros(len(prepared.recording))
         by_rows[prepared.usable] = change
-        before = Predicted(_best_prediction(null), prepared.spread(null.residuals))
-        after = Predicted(_best_prediction(fit) + by_rows, prepared.spread(fit.residuals - change))
+        before = Predicted(_predictions_of_all_rows(null), prepared.spread(null.residuals))
+        after = Predicted(_predictions_of_all_rows(fit) + by_rows, prepared.spread(fit.residuals - change))
     return Repair(drawn.null, drawn.model, best.improvement, before, after, by_rows=bool(np.any(change)))
 
 
-def _best_prediction(found: Fit) -> FloatArray:
+def _predictions_of_all_rows(found: Fit) -> FloatArray:
     return np.asarray(found.model.predict(found.z[None, :])[0])

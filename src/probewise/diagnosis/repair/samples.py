@@ -1,4 +1,4 @@
-"""Posterior samples of a chain with its effects, the final model of a diagnosis."""
+"""Posterior samples of a sensor model with its effects: the models that a diagnosis returns."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
 from probewise.diagnosis.repair.annealing import Density, anneal, importance_resample
-from probewise.diagnosis.repair.profiled import Profiled
-from probewise.diagnosis.repair.quadratic import Quadratic
-from probewise.diagnosis.repair.surrogate import Surrogate
+from probewise.diagnosis.repair.profiled import ProfiledDensity
+from probewise.diagnosis.repair.quadratic import QuadraticPredictions
+from probewise.diagnosis.repair.surrogate import SurrogatePosterior
 from probewise.effects import NUISANCES, Extent, NamedEffect, NoiseEffect, Quantisation, lattice_step_sd
 from probewise.inference import sd_ceiling, sd_floor
 from probewise.progress import Progress, silent
@@ -41,12 +41,12 @@ _MOVES_NEAR = 20
 
 @dataclass(frozen=True, eq=False)
 class ModelSamples:
-    """Equally weighted posterior samples of a chain with effects.
+    """Equally weighted posterior samples of a model (`chain`) with effects.
 
-    `theta` (n_samples, n_params), columns as `chain.names`; `noise_sd` (n_samples,) of one reading;
-    `effects` names all effects, including noise effects, in the order of their columns; `nuisance` the parameters of
-    this recording only; `exchangeable` Gaussians are ordered by mass; `absent` marks the samples, (n_samples,), without
-    an effect.
+    `theta` (n_samples, n_params) has columns `chain.names`; `noise_sd` (n_samples,) is that of one reading; `effects`
+    names all effects, including noise effects, in the order of their columns; `nuisance` names parameters of this
+    recording only; `exchangeable`: whether permuting the SSF's Gaussians changes nothing; `absent` marks, by effect,
+    the samples without it, (n_samples,).
     """
 
     chain: Predictor
@@ -62,16 +62,19 @@ class ModelSamples:
         object.__setattr__(self, "theta", frozen(self.theta))
         object.__setattr__(self, "noise_sd", frozen(self.noise_sd))
 
-    def columns(self, effect: str) -> FloatArray:
-        """Select samples of one effect's parameters, (n_samples, n_params of the effect)."""
+    def effect_samples(self, effect: str) -> FloatArray:
+        """Return the samples of one effect's parameters, (n_samples, n_params of the effect)."""
         at = [i for i, name in enumerate(self.chain.names) if name.startswith(f"{effect}.")]
         return self.theta[:, at]
 
+    columns = effect_samples
+    """The old name of `effect_samples`."""
+
     def fitted_sensor(self, recording: Recording, *, rng: np.random.Generator) -> FittedSensor:
-        """Convert to a FittedSensor, for predictions, the robot, and sensor.json."""
+        """Convert to a FittedSensor, for predictions, the robot, and sensor.json; `recording` is what was fitted."""
         kept = [i for i, name in enumerate(self.chain.names) if name not in self.nuisance]
         from_chain = sorted_by_mass(self.theta, self.n_gaussians) if self.exchangeable else self.theta
-        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_usual_step_mm(recording))
+        pixel_mm = choose_pixel_mm(from_chain, self.n_gaussians, step_mm=_median_step_mm(recording))
         field = mean_field(from_chain[:100], self.n_gaussians, pixel_mm=pixel_mm)
         usable = recording.usable
         residuals = recording.readings[usable] - self.chain.predict(self.theta[:50], recording.plan)[:, usable]
@@ -109,25 +112,25 @@ def sample_model(
     annealed: bool = True,
     progress: Progress = silent,
 ) -> ModelSamples:
-    """Draw from the posterior about a fit, under its noise model.
+    """Draw samples of a model from its posterior about a fit, under one noise model.
 
-    Samples of the Laplace approximation are annealed through a second-order surrogate: with several Gaussians the
-    posterior is curved, and samples of the Laplace approximation predict new angles worse by tens of nats. Where many
-    samples cost little more than one, and an effect has a nonlinear coordinate, they are drawn about slices of it
-    instead.
+    Samples of the Laplace approximation are moved to the posterior in two stages, the first through a quadratic
+    surrogate: with several Gaussians the posterior is curved, and Laplace's samples predict new angles worse by tens of
+    nats. Where many samples cost little more than one, and an effect has a nonlinear coordinate, they are drawn from a
+    `ProfiledDensity` by importance instead.
 
     Parameters
     ----------
     found, noise
-        The fit and its evidence under a noise model, whose nodes are drawn by weight.
+        The fit and its evidence under a noise model; parameters of noise effects are drawn about its nodes, by weight.
     recording
         What was fitted.
     weights
-        For each effect, the probability of each of its variants.
+        Probability of each variant of each effect, by the effect's name.
     rng
         Source of randomness.
     annealed
-        Whether samples are annealed to the posterior, or left as draws of the Laplace approximation.
+        Whether samples are moved to the posterior; otherwise they stay those of the Laplace approximation.
     progress
         Called with the progress of annealing.
     """
@@ -162,7 +165,7 @@ def sample_model(
         each = [own.sigma * (1.0 if of_lattice else own.widening) for own in noise.nodes.laws]
         noise_sd = np.array(each)[nodes]
     else:
-        noise_sd = _without_rounding(noise_sd, rounding, law.n_points)
+        noise_sd = _sd_without_rounding(noise_sd, rounding, law.n_points)
     return ModelSamples(
         chain, theta, noise_sd, names, null.n_gaussians, nuisance=null.nuisance, exchangeable=null.exchangeable
     )
@@ -177,7 +180,7 @@ def _posterior_draws(
     *,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Draw coordinates, (N_SAMPLES, n_params), from the Laplace approximation, then anneal to the posterior."""
+    """Draw coordinates, (N_SAMPLES, n_params), from the posterior; from Laplace's approximation unless `annealed`."""
     law, model = noise.law, found.model
     whitened, turned = law(found.residuals)[:, None], law(found.slopes)
     sigma = law.scale(whitened)
@@ -196,43 +199,46 @@ def _posterior_draws(
         return np.asarray(center + draws @ steps)
     problem, usable = JointProblem(model, recording, noise.at_best), recording.usable
 
-    def posterior(z: FloatArray) -> FloatArray:
+    def log_posterior(z: FloatArray) -> FloatArray:
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
-    profiled = Profiled.of(found, law, recording) if model.sensor.in_bulk else None
+    profiled = ProfiledDensity.of(found, law, recording) if model.sensor.in_bulk else None
     if profiled is not None:
-        weighed = profiled.weighed(posterior, n_first=_N_PROFILED, n_wanted=N_SAMPLES, rng=rng)
+        weighed = profiled.importance_resample(log_posterior, n_first=_N_PROFILED, n_wanted=N_SAMPLES, rng=rng)
         if weighed is not None:
             return weighed
-    quadratic = Quadratic.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
-    near = Surrogate.of(quadratic, center, steps, recording.readings[usable], law)
+    quadratic = QuadraticPredictions.of(lambda e: model.predict(center + e @ steps)[:, usable], len(center), sd)
+    near = SurrogatePosterior.of(quadratic, center, steps, recording.readings[usable], law)
 
-    def of_laplace(e: FloatArray) -> FloatArray:
+    def log_laplace(e: FloatArray) -> FloatArray:
         return np.asarray(-0.5 * np.sum(e**2, axis=1))
 
-    def of_posterior(e: FloatArray) -> FloatArray:
-        return posterior(center + e @ steps)
+    def log_posterior_of_steps(e: FloatArray) -> FloatArray:
+        return log_posterior(center + e @ steps)
 
-    def carried(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
+    def resampled_or_annealed(first: FloatArray, log_q: Density, log_p: Density, n_moves: int, n: int) -> FloatArray:
         weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng)
         if weighed is not None:
             return weighed
         return anneal(first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
 
-    e = carried(draws, of_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
-    return center + carried(e, near.log_density, of_posterior, _MOVES, N_SAMPLES) @ steps
+    e = resampled_or_annealed(draws, log_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
+    return center + resampled_or_annealed(e, near.log_density, log_posterior_of_steps, _MOVES, N_SAMPLES) @ steps
 
 
-def _without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:
-    """Subtract the rounding variance from a residual's sd, down to the accuracy of the total."""
+def _sd_without_rounding(sd: FloatArray, step: FloatArray, n_points: int) -> FloatArray:
+    """Return the noise sd without the rounding variance, but no less than the accuracy of the total; (n_samples,)."""
     return np.asarray(np.sqrt(np.maximum(sd**2 - step**2 / 12, sd**2 * np.where(step > 0, math.sqrt(8 / n_points), 1))))
 
 
 def _draws_about_nodes(
     effect: NoiseEffect, noise: NoiseEvidence, nodes: IntArray, *, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw one effect's parameters uniformly about the drawn nodes, half way to the next: (n_samples, n_params)."""
+    """Draw a noise effect's parameters uniformly about drawn nodes, half way to the next: (n_samples, n_params).
+
+    `nodes` (n_samples,) are indices of nodes; parameters that are the same in all nodes stay as they are.
+    """
     settings = noise.nodes.settings[:, noise.noise.columns_of(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)
     if own is not None:
@@ -244,7 +250,7 @@ def _draws_about_nodes(
     return np.where(spread, effect.prior.from_unit_cube(moved), values)
 
 
-def _usual_step_mm(recording: Recording) -> float:
+def _median_step_mm(recording: Recording) -> float:
     plan = recording.plan
     moves = np.hypot(np.diff(plan.x_mm), np.diff(plan.y_mm))[np.diff(plan.scan) == 0]
     moves = moves[moves > 0]

@@ -1,4 +1,4 @@
-"""A surrogate of a posterior about a point: second-order predictions under the noise model."""
+"""A surrogate of a posterior about a point: quadratic predictions under the noise model."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.joint import log_likelihood_of_whitened
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.noise.law import NoiseLaw
-from probewise.diagnosis.repair.quadratic import Quadratic
+from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 
 
 @dataclass(frozen=True, eq=False)
-class Surrogate:
-    """Log density of coordinates z = center + e @ steps, as a function of e, (n_samples, n_params).
+class SurrogatePosterior:
+    """An approximate posterior of coordinates z = center + e @ steps, as a function of e, (n_samples, n_params).
 
     The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-observations. `residual`
-    (n_changes + 1,) and `changes` (n_changes + 1, n_changes) are whitened, in the axes of the space that they span,
-    where a sum of squares has few terms.
+    (n_changes + 1,), at the center, and `changes` (n_changes + 1, n_changes) are whitened, in orthonormal axes of the
+    space that they span, where a sum of squares has few terms.
     """
 
-    quadratic: Quadratic
+    quadratic: QuadraticPredictions
     center: FloatArray
     steps: FloatArray
     law: NoiseLaw
@@ -33,13 +33,13 @@ class Surrogate:
     @classmethod
     def of(
         cls,
-        quadratic: Quadratic,
+        quadratic: QuadraticPredictions,
         center: FloatArray,
         steps: FloatArray,
         readings: FloatArray,
         law: NoiseLaw,
     ) -> Self:
-        """Build from predictions and readings, (n_points,)."""
+        """Build from quadratic predictions of the usable readings, the readings, (n_points,), and the noise."""
         residual = law(readings - quadratic.center)[:, None]
         residual = law.as_normal(residual, np.maximum(law.scale(residual), 1e-150))
         _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
@@ -47,8 +47,8 @@ class Surrogate:
         return cls(quadratic, center, steps, normal, turned[:, -1], turned[:, :-1])
 
     def log_density(self, e: FloatArray) -> FloatArray:
-        """Return the unnormalised log posterior, (n_samples,); minus infinity outside the prior's bounds."""
+        """Return the unnormalised log posterior at steps e, (n_samples,); minus infinity beyond six prior sds."""
         z = self.center + e @ self.steps
-        whitened = self.residual[:, None] - self.changes @ self.quadratic.amounts(e).T
+        whitened = self.residual[:, None] - self.changes @ self.quadratic.amounts_of_changes(e).T
         height = log_likelihood_of_whitened(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)

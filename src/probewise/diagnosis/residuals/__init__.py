@@ -1,1 +1,1 @@
-"""Residual analysis: global test, location in covariates, and basis functions for unknown effects."""
+"""Analysis of residuals: p-values, places in covariates, and basis functions for unknown effects."""

@@ -1,8 +1,8 @@
-"""Basis functions over every covariate for effects out of vocabulary.
+"""Basis functions over every covariate, for unknown effects: changes of the readings that no named effect describes.
 
-A mismatch that depends smoothly on a covariate adds to the readings, multiplies the signal, or displaces the sensor:
-smooth functions of the covariate, alone, times the signal, and times the slope of the readings along the motion. Others
-are steps (change points), windows, one value per scan or angle, or memory of earlier readings.
+A mismatch that depends smoothly on a covariate adds to the readings, multiplies the signal, or displaces the sensor. So
+there are smooth functions of the covariate: alone, times the signal, and times the slope of the readings along the
+motion. Other bases are steps (change points), windows, one value per scan or angle, and memories of earlier readings.
 """
 
 from __future__ import annotations
@@ -25,42 +25,48 @@ _MEMORIES = (3.0, 10.0, 30.0)  # readings
 
 
 @dataclass(frozen=True, eq=False)
-class _MismatchFactors:
-    """Factors of the kinds of mismatch, (n_points,) each: additive, gain, displacement along the axis of motion."""
+class _BasisMultipliers:
+    """What a function of a covariate is multiplied by to give a basis, (n_points,) each.
+
+    `adds`: 1, an added error; `gain`: the signal; `shift`: the slope along the axis of motion, a displacement;
+    `turned`: the sign of the motion, an error that reverses with it.
+    """
 
     adds: FloatArray
     gain: FloatArray
     shift: FloatArray
-    turned: FloatArray  # sign of the motion
+    turned: FloatArray
     n_scans: int
 
 
-def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, starts: IntArray) -> Bank:
-    """Build the basis functions.
+def bank_of_unknown_effects(
+    covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, starts: IntArray
+) -> Bank:
+    """Build the template bank of unknown effects: basis functions over every covariate.
 
     Parameters
     ----------
     covariates
-        Covariates of the recording.
+        Covariates of the usable readings.
     signal, slope
-        Predicted reading above its minimum, and its slope along the motion, (n_usable,).
+        Predicted reading above its minimum, and its slope along the motion, (n_usable,) each.
     starts
-        First row of each scan among the usable ones.
+        Index of the first usable row of each scan, (n_scans,).
 
     Returns
     -------
-    The bases, labelled by family; families have equal prior weight, however many bases they hold.
+    Bank of bases, (n_usable, n_columns) each, labelled by family; families have equal prior weight.
     """
     sign = np.zeros(len(signal))
     for covariate in covariates:
         if covariate.name == "direction":
             sign[covariate.rows] = covariate.values
     along_axis = slope * np.where(sign == 0, 1.0, sign)
-    ways = _MismatchFactors(np.ones(len(signal)), signal, along_axis, sign, len(starts))
+    ways = _BasisMultipliers(np.ones(len(signal)), signal, along_axis, sign, len(starts))
     found = [
         (_family_name(covariate, template), template)
         for covariate in covariates
-        for template in _bases_of(covariate, ways)
+        for template in _bases_of_covariate(covariate, ways)
     ]
     found += [("what was seen before", template) for template in _memory_bases(signal, starts)]
     found += [("ends of scans", template) for template in _end_transients(len(signal), starts)]
@@ -68,10 +74,11 @@ def unknown_templates(covariates: Sequence[Covariate], signal: FloatArray, slope
     return Bank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 
 
-def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
-    """Leave out bases whose projection has a cosine of 0.9 or more with that of a named effect.
+def bases_unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
+    """Return the bases without those of one column that are nearly collinear with a named effect's template.
 
-    A window that extends to the end of the recording, for instance, is the effect of a light switched on.
+    That is, whose projections orthogonal to the null have a cosine of 0.9 or more. A window that extends to the end of
+    the recording, for instance, is the effect of a light switched on.
     """
     single = np.flatnonzero(bases.widths == 1)
     if single.size == 0 or named.widths.size == 0:
@@ -85,12 +92,12 @@ def unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
 
 
 def _family_name(covariate: Covariate, template: FloatArray) -> str:
-    """Return the family of a template; smooth bases are separate from the many local ones, to keep their weight."""
+    """Return the label of a template's family; a covariate's many local bases form a family apart from smooth ones."""
     where = covariate.name if covariate.scan is None else f"{covariate.name} within scans"
     return where if template.shape[1] > 1 or covariate.name == "slope" else f"{where}, locally"
 
 
-def _bases_of(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArray]:
+def _bases_of_covariate(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:
     if covariate.groups:
         yield from _group_bases(covariate, ways)
     elif covariate.scan is not None:
@@ -133,7 +140,7 @@ def _bases_of(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArr
             yield _cosine_bases(covariate, way, 8)
 
 
-def _group_bases(covariate: Covariate, ways: _MismatchFactors) -> Iterator[FloatArray]:
+def _group_bases(covariate: Covariate, ways: _BasisMultipliers) -> Iterator[FloatArray]:
     codes = np.unique(covariate.values, return_inverse=True)[1]
     if codes.max() >= _MOST_GROUPS:
         return
@@ -145,7 +152,7 @@ def _group_bases(covariate: Covariate, ways: _MismatchFactors) -> Iterator[Float
 
 
 def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
-    """Yield memories of earlier readings in the scan: exponential averages with several constants, and the maximum."""
+    """Yield memories of the scan's earlier readings: exponential averages with the maximum, and the maximum alone."""
     held = np.empty((len(signal), len(_MEMORIES) + 1))
     keep = np.exp(-1 / np.array(_MEMORIES))
     first = np.zeros(len(signal), dtype=np.bool_)
@@ -162,9 +169,9 @@ def _memory_bases(signal: FloatArray, starts: IntArray) -> Iterator[FloatArray]:
 
 
 def _end_transients(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
-    """Yield columns that decay exponentially from a scan's start and that grow towards its end, over 2 and 8 readings.
+    """Yield pairs of columns: decay from a scan's start, growth towards its end, over 2 and over 8 readings.
 
-    They are the same for all scans; for few scans there is also one pair for each.
+    A pair is the same in all scans; with up to 24 scans, there are also bases of one pair per scan.
     """
     first = np.repeat(starts, np.diff(starts, append=n_points))
     last = np.repeat(np.append(starts[1:], n_points) - 1, np.diff(starts, append=n_points))
@@ -178,7 +185,7 @@ def _end_transients(n_points: int, starts: IntArray) -> Iterator[FloatArray]:
 
 
 def _cosine_bases(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatArray:
-    """Return cosines along the covariate, with resolution in proportion to the square of `way`."""
+    """Return cosines along the covariate times `way`, (n_points, n_columns), finer where `way` squared is larger."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     distinct, codes = np.unique(values, return_inverse=True)
     share = np.cumsum(np.bincount(codes, weight + 1e-3 * weight.mean()))
@@ -192,7 +199,7 @@ def _cosine_bases(covariate: Covariate, way: FloatArray, n_terms: int) -> FloatA
 
 
 def _step_bases(covariate: Covariate, way: FloatArray) -> Iterator[FloatArray]:
-    """Yield steps at change points with equal shares of the sum of `way` squared."""
+    """Yield 15 bases, `way` after a change point and 0 before, with equal sums of `way` squared between them."""
     values, weight = covariate.values, way[covariate.rows] ** 2
     order = np.argsort(values, kind="stable")
     share = np.cumsum(weight[order])

@@ -1,4 +1,4 @@
-"""A covariate of residuals."""
+"""A covariate of residuals: a quantity of each reading on which a mismatch could depend."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from probewise._arrays import FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Covariate:
-    """One covariate of the usable rows.
+    """One covariate (time, place, level, ...) of the usable readings.
 
-    `values` (n_usable,) in its unit; `rows` the usable rows for which it is defined; `groups`: it is categorical (an
-    orientation, a scan); `scan`: the name of the scan to which it is restricted, or None.
+    `rows` (n_rows,): indices of the usable readings for which it is defined; `values` (n_rows,): its values there, in
+    its unit; `groups`: whether it is categorical (an orientation, a scan); `scan`: name of the scan to which it is
+    restricted, or None.
     """
 
     name: str

@@ -1,7 +1,8 @@
-"""Global p-value of a fit, and significant windows of residuals in every covariate.
+"""The p-value of a fit, and the windows of each covariate in which its residuals are significant.
 
 The null distribution of every statistic comes from one pivotal bootstrap, r* = P eps: residuals of a linearised fit to
-pure noise, without refits. It accounts for multiple comparisons, because each draw is compared in the same ways.
+pure noise (P projects onto what the fit leaves), without refits. It accounts for multiple comparisons, because each
+draw is compared in the same ways.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ _PLAIN = 0.25  # p-value of the first draws above which more draws are not neede
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A window of a covariate in which residuals are significant, with their mean curve.
+    """A window of a covariate in which residuals, or an effect, are significant, with the curve of mean residuals.
 
-    `start`, `end` in the covariate's unit, None for a scan; the curve is the mean residual in bins of the covariate,
-    with the noise sd of that mean. `values` (n_usable,) are the covariate at each usable reading, NaN if undefined, as
-    used for the window; `without_effect`: they are predicted readings without the effect, which the calibrated model
-    lacks.
+    `start`, `end` in the covariate's unit; None for a whole `scan`. `z`: the statistic of the window in noise sds; for
+    an effect, its lambda. The curve is the mean residual in bins of the covariate, with the noise sd of that mean.
+    `values` (n_usable,): the covariate at each usable reading, NaN if undefined; `without_effect`: they are readings
+    predicted without the effect.
     """
 
     covariate: str
@@ -60,62 +61,66 @@ class Place:
             object.__setattr__(self, name, frozen(getattr(self, name)))
 
     @property
-    def witness(self) -> str:
-        """Name of the figure file that shows it."""
+    def figure_name(self) -> str:
+        """Name of the figure file that shows it, "witness_COVARIATE.svg"."""
         where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
         return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
 
+    witness = figure_name
+    """The old name of `figure_name`."""
 
-def global_p_value(problem: Linearised, banks: Sequence[Bank], draws: FloatArray) -> float:
-    """Test whether the mean is complete: the sum of all Bayes factors against its null distribution.
+
+def bayes_factor_p_value(problem: Linearised, banks: Sequence[Bank], draws: FloatArray) -> float:
+    """Test for a missing effect on the mean, by the weighted mean of the Bayes factors of all templates.
 
     Parameters
     ----------
     problem
         The fit under the noise model found.
     banks
-        All templates compared, with labels; each label has equal weight.
+        All templates compared, with labels; each label has equal weight, divided among its templates.
     draws
-        Residuals under the null, shape (n_rows, n_draws). If the first few show no significance, the others are not
-        used.
+        Residuals under the null, (n_rows, n_draws). Only the first fifth is used if that gives a p-value above 0.25.
 
     Returns
     -------
-    The p-value. Below the resolution of the draws, it is the bound P(Bayes factor > b) < 1/b.
+    The p-value: the share of draws with as large a mean; for a mean b beyond their resolution, the bound 1/b.
     """
     families = [(number, label) for number, bank in enumerate(banks) for label in bank.labels]
     names = list(dict.fromkeys(families))
     codes = np.array([names.index(family) for family in families])
     log_weight = -np.log(np.bincount(codes)[codes]) - math.log(len(names))
 
-    def total(residuals: FloatArray) -> FloatArray:
+    def log_mean_bayes_factor(residuals: FloatArray) -> FloatArray:
         scores = np.concatenate([bank.log_bayes_factors(problem, residuals) for bank in banks])
         return np.asarray(logsumexp(scores + log_weight[:, None], axis=0))
 
-    seen = float(total(problem.residual[:, None])[0])
+    seen = float(log_mean_bayes_factor(problem.residual[:, None])[0])
     n_draws = draws.shape[1]
     if seen > math.log(10 * n_draws):
         return math.exp(-seen)
     above = np.zeros(0)
     for first, last in ((0, n_draws // 5), (n_draws // 5, n_draws)):
-        above = np.append(above, total(draws[:, first:last]) >= seen)
+        above = np.append(above, log_mean_bayes_factor(draws[:, first:last]) >= seen)
         if above.mean() > _PLAIN:
             break
     return float((1 + above.sum()) / (1 + len(above)))
 
 
-def windows(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
-    """List windows over the order statistics of a covariate, widths geometric, half overlapping.
+def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
+    """Build windows over the sorted values of a covariate: each half as wide as the last, half overlapping.
+
+    Of a categorical covariate, one window per value.
 
     Returns
     -------
-    Indicator columns (n_points, n_windows) and each one's least and largest value.
+    Indicator columns, (n_points, n_windows), and the covariate's least and largest value in each window.
     """
     values, rows = covariate.values, covariate.rows
     columns: list[FloatArray] = []
     ends: list[tuple[float, float]] = []
 
-    def add(members: FloatArray, low: float, high: float) -> None:
+    def add_window(members: FloatArray, low: float, high: float) -> None:
         column = np.zeros(n_points)
         column[rows[members.astype(np.int64)]] = 1.0
         columns.append(column)
@@ -123,7 +128,7 @@ def windows(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple
 
     if covariate.groups:
         for value in np.unique(values):
-            add(np.flatnonzero(values == value).astype(np.float64), float(value), float(value))
+            add_window(np.flatnonzero(values == value).astype(np.float64), float(value), float(value))
         return np.stack(columns, axis=1), ends
     order = np.argsort(values, kind="stable")
     edges = np.concatenate([[0], np.flatnonzero(np.diff(values[order])) + 1, [len(values)]])
@@ -138,21 +143,21 @@ def windows(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple
             if high - low >= _LEAST_ROWS and high - low < n and (low, high) not in looked:
                 looked.add((low, high))
                 members = order[low:high]
-                add(members.astype(np.float64), float(values[members[0]]), float(values[members[-1]]))
+                add_window(members.astype(np.float64), float(values[members[0]]), float(values[members[-1]]))
         width //= 2
     if not columns:
         return np.zeros((n_points, 0)), []
     return np.stack(columns, axis=1), ends
 
 
-def places(
+def significant_places(
     problem: Linearised,
     covariates: Sequence[Covariate],
     scan_names: Sequence[str],
     residuals: FloatArray,
     draws: FloatArray,
 ) -> list[Place]:
-    """Find the most significant window of each covariate, strongest first; none of a p-value above 0.05.
+    """Return the most significant window of each covariate with a p-value up to 0.05, most significant first.
 
     Parameters
     ----------
@@ -161,7 +166,7 @@ def places(
     covariates
         Covariates to search.
     scan_names
-        Names of the scans, for the covariate `scan`.
+        Names of the scans or runs, for the covariates `scan` and `run`.
     residuals
         Reading minus prediction, (n_points,), for the mean curves.
     draws
@@ -171,7 +176,7 @@ def places(
     norms = np.sqrt(np.maximum(np.sum(draws**2, axis=0), 1e-300) / problem.n_points)
     own_norm = math.sqrt(float(problem.residual @ problem.residual) / problem.n_points) or 1.0
     for covariate in covariates:
-        columns, ends = windows(covariate, problem.n_points)
+        columns, ends = window_columns_and_bounds(covariate, problem.n_points)
         if not ends:
             continue
         projected = problem.project(columns)
@@ -192,7 +197,7 @@ def places(
         scan = covariate.scan
         if covariate.name in _RUNS:
             scan, start, end = scan_names[int(kept[best][0])], None, None
-        curve = _mean_curve(covariate, residuals, problem.sd)
+        curve = _mean_curve_fields(covariate, residuals, problem.sd)
         out.append(Place(covariate.name, scan, start, end, p_value, float(scores[best]), **curve))
     return sorted(out, key=lambda place: (place.p_value, -place.z))
 
@@ -209,12 +214,14 @@ def places_of_effect(
     size: float,
     sd: float,
 ) -> list[Place]:
-    """Locate a named effect: the interval of a covariate in which it exceeds half its maximum.
+    """Locate a named effect: the interval of a covariate in which it is at least half its maximum.
+
+    In `level` a twentieth suffices; in `run`, it is the run of the largest change. One place, or one per scan.
 
     Parameters
     ----------
     effect
-        The effect; one that is bound to scans is located in those in which it is significant.
+        The effect; one that is bound to scans is located in those in which its change is not negligible.
     change
         Its change of the readings, (n_points,).
     covariate
@@ -222,43 +229,43 @@ def places_of_effect(
     scans
         The covariate `scan`, if there are several.
     plan
-        Of the readings.
+        Plan of the usable readings.
     residuals
         Residuals of the null, (n_points,), for the mean curve.
     p_value, size
-        p-value of the global test, and lambda.
+        p-value of the global test, and the effect's lambda.
     sd
-        Of the noise.
+        Noise sd of a reading.
     """
     name = covariate.name
     if name == "run":
         strongest = plan.scan_names[int(plan.scan[np.argmax(np.abs(change))])]
-        return [Place(name, strongest, None, None, p_value, size, **_mean_curve(covariate, residuals, sd))]
+        return [Place(name, strongest, None, None, p_value, size, **_mean_curve_fields(covariate, residuals, sd))]
     if scans is not None and (name == "scan" or (effect.scans and "scan" in effect.covariates)):
-        curve = _mean_curve(scans, residuals, sd)
+        curve = _mean_curve_fields(scans, residuals, sd)
         return [
             Place("scan", scan, None, None, p_value, size, **curve)
-            for scan in _significant_scans(effect.scans, change, plan)
+            for scan in _scans_with_effect(effect.scans, change, plan)
         ]
     strength = np.abs(change[covariate.rows])
     # An effect with a threshold in level begins where it is first significant.
     significant = strength >= (_SIGNIFICANT if name == "level" else 0.5) * strength.max()
     values = covariate.values[significant]
-    curve = _mean_curve(covariate, residuals, sd)
+    curve = _mean_curve_fields(covariate, residuals, sd)
     start, end = float(values.min()), float(values.max())
     return [Place(name, None, start, end, p_value, size, **curve, without_effect=name == "level")]
 
 
-def _significant_scans(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
-    """Return the scans in which a change is significant, strongest first; over a uniform sheet, there may be none."""
+def _scans_with_effect(scans: Sequence[str], change: FloatArray, plan: Plan) -> list[str]:
+    """List the scans in which an effect's change is a twentieth of its largest or more, strongest first."""
     rows = {scan: plan.scan == plan.scan_names.index(scan) for scan in scans}
     strength = {scan: float(np.abs(change[own]).max(initial=0.0)) for scan, own in rows.items()}
     significant = [scan for scan in scans if strength[scan] >= _SIGNIFICANT * max(strength.values())]
     return sorted(significant, key=lambda scan: -strength[scan])
 
 
-def _mean_curve(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
-    """Return the covariate at each reading, and the curve of mean residuals."""
+def _mean_curve_fields(covariate: Covariate, residuals: FloatArray, sd: float) -> dict[str, Any]:
+    """Return fields of a `Place`: the covariate at each reading, and the curve of mean residuals in bins of it."""
     values, mine = covariate.values, residuals[covariate.rows]
     if covariate.groups:
         parts = [np.flatnonzero(values == value) for value in np.unique(values)]

@@ -15,7 +15,7 @@ from probewise._arrays import FloatArray
 from probewise.diagnosis.evidence.screening import log_mean
 from probewise.diagnosis.noise.law import NoiseLaw, Tail
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.locate import windows
+from probewise.diagnosis.residuals.locate import window_columns_and_bounds
 
 FAR_OUT = ", far out"
 """Suffix of the names of families of unknown effects in which outlying readings cluster."""
@@ -23,14 +23,14 @@ FAR_OUT = ", far out"
 _A = 0.5  # parameter of the beta prior of the share of outlying readings (Jeffreys)
 
 
-def tail_probability(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
-    """Return the probability that each reading is in the tail of the noise distribution, (n_points,)."""
+def outlier_probabilities(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
+    """Return each reading's probability to be of the wide component of heavy-tailed noise, (n_points,)."""
     whitened = law(residuals)
     return Tail(law.share, law.times).wide((whitened / law.scale(whitened[:, None])[0]) ** 2)
 
 
-def score_clustering(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
-    """Return log Bayes factors for a different share of outlying readings in a window of a covariate.
+def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
+    """Return, by covariate, the log Bayes factor for another share of outlying readings in a window than elsewhere.
 
     Parameters
     ----------
@@ -41,13 +41,13 @@ def score_clustering(far_out: FloatArray, covariates: Sequence[Covariate]) -> di
 
     Returns
     -------
-    Log Bayes factors, averaged over the windows of each covariate.
+    By the covariate's name with the suffix `FAR_OUT`; Bayes factors are averaged over its windows.
     """
     n, total = len(far_out), float(far_out.sum())
     even = float(betaln(total + _A, n - total + _A) - betaln(_A, _A))
     scores: dict[str, list[FloatArray]] = {}
     for covariate in covariates:
-        columns, _ = windows(covariate, n)
+        columns, _ = window_columns_and_bounds(covariate, n)
         if columns.shape[1]:
             inside, many = far_out @ columns, columns.sum(axis=0)
             outside, few = total - inside, n - many

@@ -1,1 +1,1 @@
-"""Search for the best hypotheses: refits, evidences, and a second evidence by nested sampling."""
+"""Search for the combinations of effects that explain a recording: refits, evidences, probabilities."""

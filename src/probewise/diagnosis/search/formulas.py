@@ -1,4 +1,7 @@
-"""Search again with formulas, unless noise without memory explains the readings: a name may replace a formula."""
+"""A second search, with formulas, unless noise without memory explains the readings.
+
+Formulas are effects out of vocabulary that the apparatus proposes.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +24,15 @@ _MOST = 8  # formulas that are refitted
 _WITHIN = 12.0  # nats behind the best of what was refitted, within which screening must see a formula
 
 
-def with_proposals(searched: Searched, *, progress: Progress = silent) -> Searched:
-    """Search again with the formulas that screening favours; return the search unchanged if there are none.
+def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> Searched:
+    """Return a second search that includes the formulas favoured by screening; the given one if there are none.
 
-    Named effects can partly explain what one formula explains, and then predict other runs badly: a square law an
-    exponential leak, a step and a sensitivity together a product. Noise with memory absorbs slow changes.
+    The given one is also returned if the budget of refits is spent. Named effects can partly explain what one formula
+    explains, and then predict other runs badly: a square law an exponential leak, a step and a sensitivity together a
+    product. Noise with memory absorbs slow changes.
     """
     prepared = searched.prepared
-    if not may_be_incomplete(searched) or prepared.apparatus.refit_budget_is_spent():
+    if not needs_more_than_memoryless_noise(searched) or prepared.apparatus.refit_budget_is_spent():
         return searched
     proposals = prepared.apparatus.proposals()
     if not proposals:
@@ -36,7 +40,7 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
     progress("weighing formulas")
     every = {**prepared.effects, **proposals}
     prior = prepared.apparatus.prior_odds(every)
-    score = _log_evidences(searched, proposals)
+    score = _log_evidence_by_formula(searched, proposals)
     odds = {name: value + prior.log_mean((name,)) - prior.log_mean(()) for name, value in score.items()}
     best = max(fit.log_z + searched.prior.log_mean(names) for (_, names), fit in searched.evidences.fits.items())
     ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
@@ -48,21 +52,24 @@ def with_proposals(searched: Searched, *, progress: Progress = silent) -> Search
     return searched if prepared.apparatus.refit_budget_is_spent() else again
 
 
-def may_be_incomplete(searched: Searched) -> bool:
-    """Return whether effects on the mean or noise with memory have together a probability above 0.1."""
+def needs_more_than_memoryless_noise(searched: Searched) -> bool:
+    """Return whether hypotheses with an effect on the mean, or noise with memory, have a probability above 0.1."""
     plain = (p for (mean, noise), p in searched.posterior.probabilities.items() if not (mean or WITH_MEMORY & {*noise}))
     return 1.0 - sum(plain) > _LEFT_FROM
 
 
-def _log_evidences(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
-    """Return the largest log evidence of each formula with its prior, beside the null or the best single name."""
+def _log_evidence_by_formula(searched: Searched, proposals: Mapping[str, NamedEffect[Any]]) -> dict[str, float]:
+    """Return, by formula, its log evidence by screening beside the null or the best single effect, the larger one.
+
+    The log prior of that null or effect is included, that of the formula is not.
+    """
     usable, null = searched.prepared.usable, searched.null
     singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]
     parents = [null, *sorted(singles, key=lambda fit: -fit.log_z)[:1]]
     memory, out = TemplateMemory(usable), dict[str, float]()
     bank: Bank = memory.bank(null.found, list(proposals.values()))
     for parent in parents:
-        for _, evidence in parent.steering():
+        for _, evidence in parent.leading_noises():
             scores = score_effects(Linearised.of(parent.found, evidence.law), bank)
             for name, own in scores.items():
                 value = evidence.log_z + searched.prior.log_mean(parent.names) + log_mean(own)

@@ -1,4 +1,4 @@
-"""Forward beam selection: screen what could be added to a fit, refit the best combinations of each size."""
+"""Forward beam selection: screen the effects that could be added to a fit, refit the best combinations of each size."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from probewise.diagnosis.search.constants import (
     STEERING,
 )
 from probewise.diagnosis.search.state import SearchState, rivals_of
-from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
 from probewise.effects import AGAIN, name_of_first_copy
 
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A possible refit: the candidate `parent` with one more effect, and its log evidence `score` by screening."""
+    """A possible refit: the candidate `parent` with the effect `added`; `score` is its log evidence by screening."""
 
     score: float
     parent: WeighedFit
@@ -38,13 +38,16 @@ class Proposal:
 
 
 def select_forward(state: SearchState, *, depth: int) -> None:
-    """Refit the best combinations of each size, each extended from the best of the size before."""
+    """Refit the best combinations of each size up to `depth`, extended from the best of the size before.
+
+    Candidates are stored in the state.
+    """
     null = state.null
     state.progress("screening effects")
     if depth > 1:
         _screen_pairs(state, null)
-    freedom = null.degrees_of_freedom
-    within = {c: ORDERS_WITHIN if c.degrees_of_freedom <= freedom else STEERING for c in state.nulls}
+    freedom = null.ssf_degrees_of_freedom
+    within = {c: ORDERS_WITHIN if c.ssf_degrees_of_freedom <= freedom else STEERING for c in state.nulls}
     parents = [c for c in state.nulls if c.log_z > null.log_z - within[c]]
     for size in range(1, min(depth, len(state.effects)) + 1):
         asked = _proposals_to_refit(state, null, parents, size)
@@ -56,7 +59,7 @@ def select_forward(state: SearchState, *, depth: int) -> None:
             found = state.refit(parent, proposal.added)
             refitted.append(found)
             if size == 1 and found is not None and state.refits.sensor is not None:
-                state.refit_without(found, proposal.added)
+                state.refit_subset_from(found, proposal.added)
         state.share = 1.0
         kept = list({c.names: c for c in refitted if c is not None}.values())
         if not kept:
@@ -67,24 +70,26 @@ def select_forward(state: SearchState, *, depth: int) -> None:
 def _proposals_to_refit(
     state: SearchState, null: WeighedFit, parents: Sequence[WeighedFit], size: int
 ) -> list[Proposal]:
-    """Return the combinations of one size to refit, each extended from one of the parents."""
+    """Choose the combinations of one size to refit, each a parent with one more effect."""
     proposals: dict[Names, Proposal] = {}
     for parent in parents:
         proposals = proposals_for(state, parent, proposals)
     if size == 1:
-        alone = [proposals[names] for names in _refitted_alone(state, null, proposals)]
+        alone = [proposals[names] for names in _single_effects_to_refit(state, null, proposals)]
         return [*alone[:1], *_proposals_under_plain_noise(state, null), *alone[1:]]
     if size == 2:
-        proposals = _with_scores_about_null(state, proposals)
-    chosen = promising(state, proposals, width=BEAM, behind=STEERING)
-    chosen += [names for names in _both_copies(state, null) if names in proposals and names not in chosen]
+        proposals = _with_scores_raised(state, proposals)
+    chosen = promising_combinations(state, proposals, width=BEAM, behind=STEERING)
+    chosen += [
+        names for names in _pairs_of_repeatable_effects(state, null) if names in proposals and names not in chosen
+    ]
     return [proposals[names] for names in chosen]
 
 
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
-    """Store the log evidence of pairs of effects about a null, by templates, under the noise models of `steering`."""
-    for noise, evidence in null.steering():
-        singles = state.scores(null, evidence.law, null)
+    """Store the log evidence of pairs of the best effects by templates about a null, under its leading noises."""
+    for noise, evidence in null.leading_noises():
+        singles = state.log_bayes_factors_by_effect(null, evidence.law, null)
         alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:PAIRED]
         if not ranked or log_mean(singles[ranked[0]]) < PAIRED_FROM:
@@ -96,20 +101,20 @@ def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
 
 
 def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
-    """Screen every effect that a fit does not hold yet, by its templates about the null of the same SSF.
+    """Screen every effect that a candidate does not contain, by its templates about the null of the same SSF order.
 
-    The state keeps the log evidence of each combination.
+    The log evidence of each resulting combination is stored in the state.
 
     Returns
     -------
-    The best proposal, new or given, for each resulting combination.
+    `proposals` with the new ones added, the best for each combination.
     """
     null = state.candidates[parent.n_gaussians, ()]
-    against = 0.0 if parent.names else state.complexity_penalty(parent.degrees_of_freedom)
+    against = 0.0 if parent.names else state.complexity_penalty(parent.ssf_degrees_of_freedom)
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)
-    for noise, evidence in parent.steering():
-        for name, own in state.scores(parent, evidence.law, null).items():
+    for noise, evidence in parent.leading_noises():
+        for name, own in state.log_bayes_factors_by_effect(parent, evidence.law, null).items():
             first = name_of_first_copy(name)
             if name in parent.names or (first is not None and first not in parent.names):
                 continue
@@ -122,41 +127,46 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     return out
 
 
-def promising(state: SearchState, proposals: Mapping[Names, Proposal], *, width: int, behind: float) -> list[Names]:
-    """Choose the combinations with the best odds by screening, at most `width` of them in the vocabulary.
+def promising_combinations(
+    state: SearchState, proposals: Mapping[Names, Proposal], *, width: int, behind: float
+) -> list[Names]:
+    """Choose the proposed combinations that are most probable by screening, at most `width` in the vocabulary.
 
-    Combinations more than `behind` nats behind the best refitted one that they compete with are left out.
+    Those more than `behind` nats behind the best refitted combination that they compete with are left out.
     """
     odds = {names: proposal.score + state.prior.log_mean(names) for names, proposal in proposals.items()}
     ranked = sorted(odds, key=lambda names: -odds[names])
-    named, rest = [n for n in ranked if not out_of_vocabulary(n)], [n for n in ranked if out_of_vocabulary(n)]
+    named, rest = (
+        [n for n in ranked if not effects_out_of_vocabulary(n)],
+        [n for n in ranked if effects_out_of_vocabulary(n)],
+    )
     return [
         names
         for names in [*named[:width], *rest[:MOST_OUT_OF_VOCABULARY]]
-        if odds[names] >= max(state.odds(c) for c in rivals_of(names, state.candidates.values())) - behind
+        if odds[names] >= max(state.log_posterior(c) for c in rivals_of(names, state.candidates.values())) - behind
     ]
 
 
-def _refitted_alone(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Names]:
+def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Mapping[Names, Proposal]) -> list[Names]:
     """Choose the effects to refit alone: the leader, those not far behind, and those that screening cannot judge.
 
     Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
-    null absorbs nearly completely to first order.
+    null absorbs nearly completely to first order, nor one of two copies of an effect. Each is a combination of one.
     """
     ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_mean(names)))
     faint, about = set[str](), Linearised.of(null.found, null.law)
-    for bank in state.banks(null):
+    for bank in state.template_banks(null):
         left = bank.unabsorbed_shares(about)
         faint |= {name for name, of in bank.members.items() if ABSORBED < left[of].max() < FAINT}
     # One of two waves alone explains little: the other is noise to it.
     twice = {name for name in state.effects if name + AGAIN in state.effects}
     always = state.tried_always | faint | twice
-    chosen = promising(state, proposals, width=SINGLES, behind=REFITTED_WITHIN)
+    chosen = promising_combinations(state, proposals, width=SINGLES, behind=REFITTED_WITHIN)
     return list(dict.fromkeys([*ranked[:1], *chosen, *(names for names in ranked if names[0] in always)]))
 
 
-def _both_copies(state: SearchState, null: WeighedFit) -> list[Names]:
-    """Return the pairs of an effect that may occur twice, if it explains something alone under the simplest noise.
+def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[Names]:
+    """Return the pairs (effect, its copy) of effects that may occur twice and are significant alone in simplest noise.
 
     While only one of two waves is fitted, the other looks like noise with memory, which may hide both.
     """
@@ -165,20 +175,22 @@ def _both_copies(state: SearchState, null: WeighedFit) -> list[Names]:
     return [
         (first, again)
         for first, again in pairs
-        if any(c.evidence[plain].log_z > null.evidence[plain].log_z + PAIRED_FROM for c in state.of((first,)))
+        if any(
+            c.evidence[plain].log_z > null.evidence[plain].log_z + PAIRED_FROM for c in state.candidates_of((first,))
+        )
     ]
 
 
 def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
-    """Propose the effects that lead about the null as fitted under the simplest noise, if it predicts differently.
+    """Propose the effects that lead about the null refitted under the simplest noise; none if that fit is the same.
 
-    A random walk or a correlation of the noise absorbs the missing effect, and the null is fitted in its presence:
-    the effect may then be undetectable.
+    Where noise with memory (a random walk, a correlation) leads, it absorbs a missing effect, and the effect may be
+    undetectable about the null that was fitted under it.
     """
-    plain = state.refits.under_plain_noise(null)
+    plain = state.refits.null_under_plain_noise(null)
     if plain is None:
         return []
-    scores = state.scores(plain, plain.law, plain)
+    scores = state.log_bayes_factors_by_effect(plain, plain.law, plain)
     odds = {
         name: log_mean(own) + state.prior.log_mean((name,))
         for name, own in scores.items()
@@ -188,8 +200,8 @@ def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[P
     return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_mean(())]
 
 
-def _with_scores_about_null(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
-    """Raise the score of each proposal to that of its combination about the null, if that is larger."""
+def _with_scores_raised(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:
+    """Return the proposals, each with the larger of its score and that of its combination by pairs about the null."""
     best: dict[Names, float] = {}
     for (names, _), value in state.about_null.items():
         best[names] = max(value, best.get(names, value))

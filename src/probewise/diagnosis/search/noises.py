@@ -1,4 +1,4 @@
-"""The competing noise models of a recording, with their prior probabilities."""
+"""The competing noise models of a recording: their prior probabilities, and the evidence of a fit under each."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ WITH_MEMORY = frozenset({CorrelatedNoise.name, RandomWalk.name})
 
 
 @dataclass(eq=False)
-class Noises:
+class NoiseModels:
     """The noise models of one recording: each noise effect alone, and pairs and triples if fewer are significant.
 
-    `certain` are noise effects that the readings show beyond doubt, part of every model; `least_sd` is the least
-    plausible sd of a reading.
+    `models`: noise models by the names of their effects; `certain`: noise effects that the readings show beyond doubt,
+    part of every model; `least_sd`: the least plausible sd of a reading.
     """
 
     recording: Recording
@@ -55,56 +55,60 @@ class Noises:
         self._hidden = hides_the_noise(self._step, self.recording)
         others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
         single = [tuple(sorted({*names, *self.certain})) for names in combinations_of(others, 1)]
-        self.models = {names: self._model(names) for names in single}
+        self.models = {names: self._build_model(names) for names in single}
 
-    def _model(self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None) -> NoiseModel:
+    def _build_model(
+        self, names: Names, likely: Mapping[str, tuple[FloatArray, FloatArray]] | None = None
+    ) -> NoiseModel:
         # Certain effects are not re-estimated about each fit, whose own residual may be larger.
         effects = tuple(self.effects[n] for n in names)
         rounding = self._step if self._hidden and names == self.certain else 0.0
         return NoiseModel(effects, self.recording, {**self._known, **(likely or {})}, rounding, self.least_sd)
 
     def log_prior(self, names: Names) -> float:
-        """Log prior of a noise model."""
-        return self.prior.log_noise(self._without_certain(names))
+        """Return the log prior probability of a noise model; certain effects do not count."""
+        return self.prior.log_noise(self._uncertain_names(names))
 
-    def over_all(self, log_z: Mapping[Names, float]) -> float:
-        """Return the log evidence averaged over noise models; minus infinity for none."""
+    def average_log_evidence(self, log_z: Mapping[Names, float]) -> float:
+        """Return the log of the evidence averaged over these noise models by their priors; minus infinity for none."""
         values = [value + self.log_prior(names) for names, value in log_z.items()]
         return float(logsumexp(values)) if values else -math.inf
 
-    def weigh(self, found: Fit) -> dict[Names, NoiseEvidence]:
-        """Compute the evidence of a fit under every noise model."""
+    def evidence_by_noise(self, found: Fit) -> dict[Names, NoiseEvidence]:
+        """Compute the evidence of a fit under every noise model, by its names."""
         return {names: weigh(found, model) for names, model in self.models.items()}
 
-    def best(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
-        """Return the evidence under the most probable noise model."""
+    def best_evidence(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
+        """Return that of these evidences whose noise model is most probable, priors included."""
         return evidence[max(evidence, key=lambda names: evidence[names].log_z + self.log_prior(names))]
 
-    def pair_up(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
-        """If a noise effect is significant about a fit, add the pairs with it; if a pair is, the triples.
+    def add_significant_pairs(self, found: Fit, evidence: Mapping[Names, NoiseEvidence]) -> bool:
+        """Add pairs of noise effects to the models if a single one is significant about a fit; triples if a pair is.
+
+        Only those within three nats of the best are added.
 
         Returns
         -------
-        Whether pairs were tried.
+        Whether any were tried.
         """
         known, singles = dict(evidence), list(evidence)
         for size in range(1, MOST_FAULTS):
-            of_size = {names: e for names, e in known.items() if len(self._without_certain(names)) == size}
+            of_size = {names: e for names, e in known.items() if len(self._uncertain_names(names)) == size}
             first = max(of_size, key=lambda names: of_size[names].log_z, default=self.certain)
             parts = [n for n in known if set(n) < set(first)]
             if not parts or known[first].log_z < max(known[n].log_z for n in parts) + NOISE_PAIR_WITHIN:
                 return size > 1
-            likely = {name: known[first].likely_nodes(name) for name in self._without_certain(first)}
+            likely = {name: known[first].likely_nodes(name) for name in self._uncertain_names(first)}
             best = max(e.log_z + self.log_prior(names) for names, e in known.items())
             for other in singles:
                 both = tuple(sorted({*first, *other}))
-                if len(self._without_certain(both)) != size + 1 or set(both) >= WITH_MEMORY:
+                if len(self._uncertain_names(both)) != size + 1 or set(both) >= WITH_MEMORY:
                     continue
-                model = self._model(both, likely | self.models[other].every_third())
+                model = self._build_model(both, likely | self.models[other].every_third())
                 own = weigh(found, model)
                 if own.log_z + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
                     self.models[both], known[both] = model, own
         return True
 
-    def _without_certain(self, names: Names) -> Names:
+    def _uncertain_names(self, names: Names) -> Names:
         return tuple(n for n in names if n not in self.certain)

@@ -12,10 +12,10 @@ from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 
 def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None:
-    """Fit the null, or each form of the SSF: one Gaussian, the free form, more Gaussians.
+    """Fit the given null; if there is none, each form of the SSF: one Gaussian, the free form, more Gaussians.
 
-    Up to one more than `max_order`, as long as the last is not far behind the best. Noise effects that are significant
-    only in pairs are added once a null is fitted.
+    At most `max_order` + 1 Gaussians, and no more where the last one was far behind the best. The fits are stored in
+    the state. Then pairs of noise effects are added to the noise models, if single ones are significant.
     """
     noises, refits, null = state.noises, state.refits, prepared.null
     recording = prepared.recording
@@ -23,26 +23,26 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
 
     n_forms = 1 if null is not None or max_order == 1 else max_order + 2
 
-    def kept(form: Start, law: NoiseLaw) -> WeighedFit:
+    def fit_and_keep(form: Start, law: NoiseLaw) -> WeighedFit:
         state.progress("fitting the sensor alone", len(state.sensors), n_forms)
         sensor, starts = form
         state.sensors[sensor.n_gaussians] = sensor
-        return state.keep(refits.weighed(Model(sensor, (), plan), starts, law))
+        return state.keep(refits.fit_and_weigh(Model(sensor, (), plan), starts, law))
 
     if null is not None:
-        kept((null, null.starts), law)
+        fit_and_keep((null, null.starts), law)
     else:
         forms = prepared.apparatus.null_forms(recording)
-        last = kept(forms.simplest(), law)
+        last = fit_and_keep(forms.simplest(), law)
         if max_order > 1:
-            best = max(kept(forms.free(last.found), refits.law_of(last)).log_z, last.log_z)
+            best = max(fit_and_keep(forms.free(last.found), refits.likeliest_law(last)).log_z, last.log_z)
             for n in range(2, max_order + 2):
                 # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
                 if n > 2 and last.log_z < best - STEERING:
                     break
-                last = kept(forms.one_more(last.found, n), refits.law_of(last))
+                last = fit_and_keep(forms.one_more(last.found, n), refits.likeliest_law(last))
                 best = max(best, last.log_z)
-    if noises.pair_up(state.null.found, state.null.evidence):
+    if noises.add_significant_pairs(state.null.found, state.null.evidence):
         state.progress("weighing pairs of noises")
         for candidate in state.nulls:
-            state.keep(candidate.with_evidence(noises.weigh(candidate.found)))
+            state.keep(candidate.with_evidence(noises.evidence_by_noise(candidate.found)))

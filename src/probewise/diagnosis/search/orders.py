@@ -1,4 +1,4 @@
-"""Refit combinations at the SSF orders that could rival the one they were found at."""
+"""Refit combinations at the SSF orders (numbers of Gaussians) that could rival the one they were found at."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 
 
-def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
-    """Refit the most probable combinations at other plausible SSF orders.
+def refit_at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
+    """Refit the most probable combinations (`by_mean`: probabilities) at other plausible SSF orders.
 
     An unknown effect may lead at an order at which no named effect was tried; named ones must then be tried there.
     """
@@ -23,15 +23,15 @@ def at_other_orders(state: SearchState, by_mean: Mapping[Names, float]) -> None:
     leaders = sorted((names for names in by_mean if names not in ((), ("unknown",))), key=lambda n: -by_mean[n])
     for k, names in enumerate(leaders[:MOST_AT_OTHER_ORDERS]):
         state.progress("refitting at other numbers of Gaussians", k, min(len(leaders), MOST_AT_OTHER_ORDERS))
-        held = state.of(names)
+        held = state.candidates_of(names)
         if held and by_mean[names] >= REFITTED_AT_OTHER_ORDERS * known:
             source = max(held, key=lambda c: c.log_z)
-            for n in _rival_orders(state, source):
-                _carry_over(state, source, n)
+            for n in _orders_to_refit(state, source):
+                _refit_at_order(state, source, n)
 
 
-def _rival_orders(state: SearchState, source: WeighedFit) -> list[int]:
-    """List the SSF orders at which a combination fitted at one order is worth refitting."""
+def _orders_to_refit(state: SearchState, source: WeighedFit) -> list[int]:
+    """List the other SSF orders at which a candidate's combination should be refitted."""
     own = state.candidates[source.n_gaussians, ()].log_z
     behind = own - REFITTED_WITHIN
     return [
@@ -39,26 +39,26 @@ def _rival_orders(state: SearchState, source: WeighedFit) -> list[int]:
         for n, sensor in state.sensors.items()
         if (n, source.names) not in state.candidates
         # A freer SSF that the evidence rejects by itself is also rejected with an effect.
-        and (sensor.degrees_of_freedom < source.degrees_of_freedom or state.candidates[n, ()].log_z > behind)
-        and (sensor.degrees_of_freedom <= source.degrees_of_freedom + 1 or state.candidates[n, ()].log_z > own)
+        and (sensor.degrees_of_freedom < source.ssf_degrees_of_freedom or state.candidates[n, ()].log_z > behind)
+        and (sensor.degrees_of_freedom <= source.ssf_degrees_of_freedom + 1 or state.candidates[n, ()].log_z > own)
     ]
 
 
-def _carry_over(state: SearchState, source: WeighedFit, n: int) -> None:
-    """Refit a candidate's effects at another SSF order; keep it where they are significant."""
+def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
+    """Refit a candidate's effects at SSF order `n`; store the fit if the effects are significant there."""
     null, sensor = state.candidates[n, ()], state.sensors[n]
     own = source.found.z[source.found.model.sensor.n_params :]
-    candidate = state.refits.weighed(
+    candidate = state.refits.fit_and_weigh(
         Model(sensor, source.found.model.effects, source.found.model.plan),
         np.concatenate([null.found.z, own])[None, :],
-        state.refits.law_of(source),
+        state.refits.likeliest_law(source),
         max_steps=15,
     )
     log_share = (
         source.log_share
-        + state.complexity_penalty(source.degrees_of_freedom)
+        + state.complexity_penalty(source.ssf_degrees_of_freedom)
         - state.complexity_penalty(sensor.degrees_of_freedom)
     )
-    candidate = candidate.as_share(log_share, source.weights)
+    candidate = candidate.with_factor_and_weights(log_share, source.weights)
     if is_significant(candidate, null):
         state.keep(candidate)

@@ -1,4 +1,4 @@
-"""Joint nonlinear refits with Laplace evidence: of a model, or a candidate with one more effect."""
+"""Joint nonlinear refits with Laplace evidence: of a model, or of a candidate with one more effect."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.search.constants import ALIASED_NATS, FEW_VARIANTS, SAME_MODE, STEERING, VARIANTS_TRIED
-from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.twins import Swap, are_proportional
+from probewise.diagnosis.search.noises import NoiseModels
+from probewise.diagnosis.search.twins import TwinSwap, are_proportional
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.effects import NamedEffect
 
@@ -34,32 +34,35 @@ _SAME_START = 0.1  # in prior sds: starts that are closer together are duplicate
 
 @dataclass(frozen=True, eq=False)
 class Refits:
-    """Refits of one recording, cached: a given null, the noise models, and the templates."""
+    """The refits of one recording, each made once; a second search of the recording reuses them.
+
+    `sensor` is the given null, if any.
+    """
 
     sensor: Null | None
-    noises: Noises
+    noises: NoiseModels
     templates: TemplateMemory
     known: dict[tuple[WeighedFit, NamedEffect[Any], float], Extended] = field(default_factory=dict, repr=False)
     """Refits with one more effect, by the candidate, the effect, and the nats against it."""
-    twins: dict[WeighedFit, tuple[WeighedFit, Swap]] = field(default_factory=dict, repr=False)
+    twins: dict[WeighedFit, tuple[WeighedFit, TwinSwap]] = field(default_factory=dict, repr=False)
     """Refits taken from those of twins, with the refit and the exchange of effects."""
     plain: dict[WeighedFit, WeighedFit | None] = field(default_factory=dict, repr=False)
     """Nulls as fitted under the plainest noise, where they predict otherwise."""
     scored: dict[tuple[Fit, NoiseLaw, Bank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
     """Log Bayes factors of the templates of a bank, by label."""
 
-    def scores(self, found: Fit, law: NoiseLaw, bank: Bank) -> dict[str, FloatArray]:
-        """Return the log Bayes factors of a bank's templates about a fit, by label, (n_templates,) each."""
+    def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw, bank: Bank) -> dict[str, FloatArray]:
+        """Return the log Bayes factors of a bank's templates about a fit, by label; one per template."""
         key = found, law, bank
         if key not in self.scored:
             self.scored[key] = score_effects(Linearised.of(found, law), bank)
         return self.scored[key]
 
-    def law_of(self, candidate: WeighedFit) -> NoiseLaw:
-        """Return the most probable noise distribution about a fit."""
-        return self.noises.best(candidate.evidence).law
+    def likeliest_law(self, candidate: WeighedFit) -> NoiseLaw:
+        """Return the noise distribution of a candidate's most probable noise model."""
+        return self.noises.best_evidence(candidate.evidence).law
 
-    def weighed(
+    def fit_and_weigh(
         self,
         model: Model,
         starts: FloatArray,
@@ -68,107 +71,115 @@ class Refits:
         *,
         beyond: WeighedFit | None = None,
     ) -> WeighedFit:
-        """Fit under one noise distribution, compute the evidence under all, and refit if another is more probable.
+        """Fit a model from the best of `starts`, (n_starts, n_params), and compute its evidence under all noise models.
 
-        A fit that gains nothing `beyond` another one takes over the evidence of that one, to save the computation,
-        unless the noise has memory: there it may still gain under white noise.
+        The fit is under `law`, and is repeated if another noise distribution proves more probable. A fit that is not
+        significantly better than `beyond` takes over that one's evidence, to save the computation, unless the noise
+        has memory: there it may still gain under white noise.
         """
-        found = self._fit(model, starts, law, max_steps)
+        found = self._fit_from_best_start(model, starts, law, max_steps)
         if beyond is not None and not law.has_memory and not _improves_fit(found, beyond.found, law):
             return WeighedFit.of(found, law, beyond.evidence, 0.0)
         for _ in range(2):
-            evidence = self.noises.weigh(found)
-            best = self.noises.best(evidence).law
+            evidence = self.noises.evidence_by_noise(found)
+            best = self.noises.best_evidence(evidence).law
             if best.alike(law):
                 break
             law = best
-            found = self._fit(model, found.z[None, :], law, max_steps)
+            found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
         else:
-            evidence = self.noises.weigh(found)
+            evidence = self.noises.evidence_by_noise(found)
         return WeighedFit.of(found, law, evidence, log_detectable(found, law, self.templates.usable))
 
-    def is_better_at(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
-        """Return whether a candidate's model, its effects in any order, is better at z (n_params,) than at its fit."""
+    def fits_better_at(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
+        """Return whether a candidate's model, its effects in any order, fits better at z (n_params,) than its fit."""
         found, law = candidate.found, candidate.law
         readings = found.predicted + found.residuals
         whitened = law(readings - model.predict(z[None, :])[0, self.templates.usable])[:, None]
         there = float(law.minus_log_likelihood(whitened, law.scale(whitened))[0]) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 
-    def under_plain_noise(self, null: WeighedFit) -> WeighedFit | None:
-        """Fit a given null under the simplest noise too; None if it predicts the same, or its noise has no memory."""
-        if self.sensor is None or not self.law_of(null).has_memory:
+    def null_under_plain_noise(self, null: WeighedFit) -> WeighedFit | None:
+        """Return the given null refitted under the simplest noise.
+
+        None if that predicts the same, if the most probable noise has no memory, or if no null is given.
+        """
+        if self.sensor is None or not self.likeliest_law(null).has_memory:
             return None
         if null not in self.plain:
             law = null.evidence[self.noises.certain].law
-            found = self._fit(null.found.model, np.stack([null.found.z, *self.sensor.starts]), law, 30)
+            found = self._fit_from_best_start(null.found.model, np.stack([null.found.z, *self.sensor.starts]), law, 30)
             apart = float(np.sum(law(found.residuals - null.found.residuals) ** 2))
             alike = apart < 2 * ALIASED_NATS * found.sd**2
-            self.plain[null] = None if alike else WeighedFit.of(found, law, self.noises.weigh(found), 0.0)
+            self.plain[null] = None if alike else WeighedFit.of(found, law, self.noises.evidence_by_noise(found), 0.0)
         return self.plain[null]
 
-    def extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
-        """Refit with one more effect, for its likely variants, unless that was done before.
+    def refit_with_effect(self, parent: WeighedFit, effect: NamedEffect[Any], against: float = 0.0) -> Extended:
+        """Refit a candidate with one more effect, in its likely variants, unless that was done before.
 
         An effect that changes the readings exactly as one refitted before takes over its fit and evidence.
 
         Returns
         -------
-        The best variant, its evidence averaged over all variants and reduced by `against` nats; and the closed-form
-        scores of the effect, by the noise models of `steering`.
+        The fit of the best variant, with the evidence averaged over all variants and reduced by `against` nats; and the
+        effect's log Bayes factor by screening, by noise model.
         """
         key = parent, effect, against
         if key not in self.known:
-            twin = self._as_twin(parent, effect, against) or self._beside_twin(parent, effect, against)
-            self.known[key] = twin or self._extended(parent, effect, against)
+            twin = self._taken_from_twin(parent, effect, against) or self._taken_from_twin_of_parent(
+                parent, effect, against
+            )
+            self.known[key] = twin or self._refit_likely_variants(parent, effect, against)
         return self.known[key]
 
-    def replace(self, held: WeighedFit, better: WeighedFit) -> None:
-        """Put a better fit of the same combination in the place of the one that was found before."""
+    def replace_fit(self, held: WeighedFit, better: WeighedFit) -> None:
+        """Replace a refit with one more effect by a better fit of the same combination, for later calls."""
         self.known.update({key: (better, scores) for key, (fit, scores) in self.known.items() if fit is held})
 
-    def _as_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
-        """Return the earlier refit of a twin with this effect in its place; None if no twin was refitted."""
+    def _taken_from_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
+        """Return an earlier refit of the parent with a twin of this effect, the effect in its place; None: no twin."""
         own = self.templates.of(parent.found, effect)
         for (held, other, less), (candidate, scores) in list(self.known.items()):
             if held is parent and less == against and are_proportional(own, self.templates.of(held.found, other)):
-                swap = Swap(other.name, self.templates.of(held.found, other), effect.name, own)
-                twin = swap.exchanged(candidate, self.templates.usable)
+                swap = TwinSwap(other.name, self.templates.of(held.found, other), effect.name, own)
+                twin = swap.candidate_with_twin(candidate, self.templates.usable)
                 if twin is not None:
                     self.twins[twin] = candidate, swap
                     return twin, scores
         return None
 
-    def _beside_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
-        """Reuse the refit of this effect with a twin of the parent's last effect; None if there is none."""
+    def _taken_from_twin_of_parent(
+        self, parent: WeighedFit, effect: NamedEffect[Any], against: float
+    ) -> Extended | None:
+        """Return an earlier refit of this effect beside a twin of the parent's last effect, swapped; None: no twin."""
         first, swap = self.twins.get(parent, (None, None))
         known = None if first is None else self.known.get((first, effect, against))
         if known is None or swap is None:
             return None
-        twin = swap.exchanged(known[0], self.templates.usable)
+        twin = swap.candidate_with_twin(known[0], self.templates.usable)
         return None if twin is None else (twin, known[1])
 
-    def _extended(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
+    def _refit_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
         templates = self.templates.of(parent.found, effect)
         own = Bank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
 
-        def scores_about(problem: Linearised) -> FloatArray:
+        def log_bayes_factors_about(problem: Linearised) -> FloatArray:
             return score_effects(problem, own)[effect.name]
 
         by_noise = {
-            noise: log_mean(scores_about(Linearised.of(parent.found, evidence.law)))
-            for noise, evidence in parent.steering()
+            noise: log_mean(log_bayes_factors_about(Linearised.of(parent.found, evidence.law)))
+            for noise, evidence in parent.leading_noises()
         }
-        problem = Linearised.of(parent.found, self.law_of(parent))
-        scores = scores_about(problem)
+        problem = Linearised.of(parent.found, self.likeliest_law(parent))
+        scores = log_bayes_factors_about(problem)
         weights = templates.weights(scores)
         # Under heavy-tailed noise, a few readings changed by an effect count as outliers; so start from white noise
         # too.
-        plain = self._under_simplest_noise(parent, problem)
-        seen = [(problem, scores), *((about, scores_about(about)) for about in plain)]
+        plain = self._linearised_under_simplest_noise(parent, problem)
+        seen = [(problem, scores), *((about, log_bayes_factors_about(about)) for about in plain)]
         likeliest = (int(np.argmax(templates.weights(own_scores))) for _, own_scores in seen[1:])
         tried = list(dict.fromkeys([*_variants_to_refit(templates, weights), *likeliest]))
-        refitted = [self._of_variant(parent, effect, templates, k, seen) for k in tried]
+        refitted = [self._refit_variant(parent, effect, templates, k, seen) for k in tried]
         # Evidence from refits of variants replaces that from screening.
         log_z = np.array([candidate.log_z for candidate in refitted])
         best = int(np.argmax(log_z))
@@ -180,15 +191,17 @@ class Refits:
         log_share += math.log(effect.n_peaks)
         # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
         # a change point is far better known. To first order: only where that leads to the variant of the best refit.
-        law = self.law_of(refitted[best])
+        law = self.likeliest_law(refitted[best])
         if len(weights) > 1 and not law.alike(problem.law):
             later = next((own_scores for about, own_scores in seen if law.alike(about.law)), None)
-            later = templates.weights(scores_about(Linearised.of(parent.found, law)) if later is None else later)
+            later = templates.weights(
+                log_bayes_factors_about(Linearised.of(parent.found, law)) if later is None else later
+            )
             weights = later if int(np.argmax(later)) == tried[best] else weights
-        return refitted[best].as_share(log_share, {**parent.weights, effect.name: weights}), by_noise
+        return refitted[best].with_factor_and_weights(log_share, {**parent.weights, effect.name: weights}), by_noise
 
-    def _fit(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
-        """Take a few steps from each start, then converge from the best."""
+    def _fit_from_best_start(self, model: Model, starts: FloatArray, law: NoiseLaw, max_steps: int) -> Fit:
+        """Fit a few steps from each start, (n_starts, n_params), then to convergence from the best."""
         recording = self.noises.recording
         if len(starts) > 1:
             best = min(fits(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
@@ -197,7 +210,7 @@ class Refits:
             starts = best.z[None, :]
         return require_finite(fit(model, recording, starts[0], law, max_steps=max_steps))
 
-    def _of_variant(
+    def _refit_variant(
         self,
         parent: WeighedFit,
         effect: NamedEffect[Any],
@@ -205,7 +218,7 @@ class Refits:
         variant: int,
         seen: Sequence[tuple[Linearised, FloatArray]],
     ) -> WeighedFit:
-        """Refit with one variant of one more effect, from its best bank entries under each noise distribution."""
+        """Refit with one variant of one more effect, from its best templates in each of the linearisations `seen`."""
         own = np.flatnonzero(templates.choice == variant)
         model = parent.found.model.with_effect(templates.variants[variant])
         ranked = [(about, scores, own[np.argsort(-scores[own])]) for about, scores in seen]
@@ -213,7 +226,7 @@ class Refits:
         starts: list[FloatArray] = []
         for about, at in chosen:
             columns = templates.columns[at]
-            amount = _amounts(about.project(columns), about.residual)
+            amount = _amounts_in_residual(about.project(columns), about.residual)
             setting = effect.start(templates.settings[at], amount)
             # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
             # one.
@@ -225,26 +238,26 @@ class Refits:
         if self.sensor is not None and len(self.sensor.starts) > 1:
             # With several modes of the null, the best one may change with the effect.
             starts += [np.concatenate([z, starts[0][len(z) :]]) for z in self.sensor.starts]
-        fitted = [self.weighed(model, np.stack(starts), seen[0][0].law, beyond=parent)]
+        fitted = [self.fit_and_weigh(model, np.stack(starts), seen[0][0].law, beyond=parent)]
         if seen[0][0].law.has_memory:  # to a walk a slow effect is noise: its amplitude would stay at 0
             plain = self.noises.certain
             for about, scores in seen[1:]:
                 promised = parent.evidence[plain].log_z + log_mean(scores)
                 if fitted[0].evidence[plain].log_z < promised - STEERING:
-                    fitted.append(self.weighed(model, np.stack(starts), about.law, beyond=parent))
-        return max(fitted, key=lambda candidate: self.noises.over_all(_log_z_by_noise(candidate)))
+                    fitted.append(self.fit_and_weigh(model, np.stack(starts), about.law, beyond=parent))
+        return max(fitted, key=lambda candidate: self.noises.average_log_evidence(_log_z_by_noise(candidate)))
 
-    def _under_simplest_noise(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
-        """Linearise a fit under the simplest noise distribution too, if it is a different one."""
+    def _linearised_under_simplest_noise(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
+        """Return a fit's linearisation under the simplest noise distribution; [] if `problem` is under the same."""
         plain = parent.evidence[self.noises.certain].law
         return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
 
 
-def _amounts(projected: FloatArray, residual: FloatArray) -> FloatArray:
-    """Return the amounts (n_columns,) of projected columns (n_rows, n_columns) in a residual, within their prior.
+def _amounts_in_residual(projected: FloatArray, residual: FloatArray) -> FloatArray:
+    """Return the amounts, (n_columns,), of projected columns, (n_rows, n_columns), in a residual.
 
-    One value for each run leaves next to nothing of what all runs have in common, since a parameter takes that up: by
-    least squares alone all runs begin far off, with the parameter as far on the other side, and the fit stays there.
+    Several columns have a normal prior. An effect of one value per run is collinear in its sum with a parameter: by
+    least squares alone all runs would start far off, the parameter as far on the other side, and the fit stay there.
     """
     n = projected.shape[1]
     if n == 1:
@@ -258,7 +271,7 @@ def _log_z_by_noise(candidate: WeighedFit) -> dict[Names, float]:
 
 
 def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
-    """Return whether an added effect is significant: the fit improves by more than expected per parameter."""
+    """Return whether a candidate fits significantly better than its parent: twice the log likelihood gains over 3."""
     return _improves_fit(candidate.found, parent.found, candidate.law)
 
 
@@ -271,10 +284,10 @@ def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
 
 
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:
-    """Choose the variants of an effect to refit: the leading one, and the next if they are bound to scans.
+    """List the indices of the variants to refit, best first: the leading one, and the next if bound to scans.
 
     Two scans of opposite direction are aliased to first order; a refit shows which one was turned by 30 degrees. If
-    there are few variants (a tank may overflow to waste or into the next one), all are refitted.
+    there are one or two variants (a tank may overflow to waste or into the next one), all are refitted.
     """
     if len(weights) <= FEW_VARIANTS:
         return [int(k) for k in np.argsort(-weights)]

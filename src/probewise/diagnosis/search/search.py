@@ -1,6 +1,6 @@
-"""Search for the set of effects that explains the recording.
+"""Search for the combinations of effects that explain a recording.
 
-Hypotheses are subsets of effects on the mean, under every noise model and several SSF orders, with or without an
+Hypotheses are combinations of effects on the mean, under every noise model and several SSF orders, with or without an
 unknown effect. Templates screen them; a beam of the best is refitted jointly and nonlinearly, with Laplace evidences.
 """
 
@@ -18,7 +18,7 @@ from probewise.diagnosis.evidence.templates import TemplateMemory
 from probewise.diagnosis.noise.law import steps_within_scans
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
-from probewise.diagnosis.residuals.bases import unknown_templates, unlike_named
+from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.search.backward_elimination import eliminate_backward
 from probewise.diagnosis.search.constants import (
@@ -32,15 +32,15 @@ from probewise.diagnosis.search.constants import (
     WITH_UNKNOWN,
 )
 from probewise.diagnosis.search.forward_selection import select_forward
-from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls
-from probewise.diagnosis.search.orders import at_other_orders
-from probewise.diagnosis.search.pruning import prune
+from probewise.diagnosis.search.orders import refit_at_other_orders
+from probewise.diagnosis.search.pruning import prune_out_of_vocabulary
 from probewise.diagnosis.search.refits import Refits
-from probewise.diagnosis.search.searched import Evidences, Posterior, Screening, Searched, posterior_of
+from probewise.diagnosis.search.searched import Evidences, MisfitTemplates, Posterior, Searched, posterior_of
 from probewise.diagnosis.search.state import SearchState
-from probewise.diagnosis.search.unknown import Unknown
-from probewise.diagnosis.search.weighed_fit import out_of_vocabulary
+from probewise.diagnosis.search.unknown import UnknownEffects
+from probewise.diagnosis.search.weighed_fit import effects_out_of_vocabulary
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.progress import Progress, silent
 
@@ -54,23 +54,28 @@ def search(
     after: Searched | None = None,
     progress: Progress = silent,
 ) -> Searched:
-    """Compute the evidence of combinations of effects.
+    """Compute evidence and probability of combinations of effects, with and without an unknown effect.
 
     Parameters
     ----------
     prepared
-        Input of the diagnosis.
+        The readings, the effects, and the null if one is given.
     prior
         Prior odds; by default those of the apparatus.
     max_order
-        Largest number of Gaussians tried without a given null, plus one if it is not far behind. Default: three, or one
-        for few readings.
+        Largest number of Gaussians of the SSF if no null is given; one more is tried if this is not far behind.
+        Default: three, or one for fewer than 40 readings.
     depth
-        Largest size of a combination.
+        Largest number of effects of a combination.
     after
         An earlier search of the same recording with a given null, with fewer effects: its fits are not made again.
     progress
         Called at every refit.
+
+    Returns
+    -------
+    Searched
+        Evidences and probabilities of all hypotheses, and the refits.
     """
     recording, effects = prepared.recording, prepared.effects
     if max_order is None:
@@ -78,7 +83,7 @@ def search(
     prior = prior or prepared.apparatus.prior_odds(effects)
     on_mean, on_noise = _effects_on_mean_and_noise(prepared)
     refits = (
-        Refits(prepared.null, Noises(recording, on_noise, prior), TemplateMemory(prepared.usable))
+        Refits(prepared.null, NoiseModels(recording, on_noise, prior), TemplateMemory(prepared.usable))
         if after is None
         else after.refits
     )
@@ -87,35 +92,35 @@ def search(
         own = frozenset(on_mean)  # about a shape that is far off without the right effect, screening is no guide
     spent = prepared.apparatus.spent_refit_budget()
 
-    def is_over(share: float) -> bool:
-        """Return whether a share of the budget that an earlier search left is spent."""
+    def share_is_spent(share: float) -> bool:
+        """Return whether this share of the budget of refits is spent, of what an earlier search left of it."""
         return prepared.apparatus.refit_budget_is_spent(spent + share * max(1.0 - spent, 0.0))
 
-    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, is_over)
+    state = SearchState(on_mean, prior, noises, templates, refits, own, progress, share_is_spent)
     if after is None:
         fit_nulls(state, prepared, max_order=max_order)
     else:
         state.sensors |= after.nulls
         state.candidates |= {key: fit for key, fit in after.evidences.fits.items() if not fit.names}
     unknown = _unknown_effects_of(state, prepared, after)
-    screening = Screening(templates, state.null.found, unknown.bases, unknown.covariates)
+    misfit_templates = MisfitTemplates(templates, state.null.found, unknown.bases, unknown.covariates)
 
     def evidences() -> Evidences:
-        return Evidences(state.candidates, state.screened(), unknown.log_z, unknown.shares)
+        return Evidences(state.candidates, state.screened_log_evidences(), unknown.log_z, unknown.shares)
 
     def posterior() -> Posterior:
         return posterior_of(evidences(), prior, certain=noises.certain, n_forms=len(state.sensors))
 
     select_forward(state, depth=depth)
     if prepared.null is not None:
-        _refit_null(state)
+        _refit_null_from_effects(state)
     eliminate_backward(state)
     # With a form of the SSF that the readings reject, an unknown effect would only stand in for the form.
     unknown.weigh([c for c in state.nulls if c.log_z > state.null.log_z - EXTENDED_WITHIN])
-    _refit_late(state, posterior, progress)
+    _refit_favoured_by_screening(state, posterior, progress)
     if prepared.null is None:
-        at_other_orders(state, posterior().by_mean)
-    state.candidates, state.pruned = prune(state.candidates, noises)
+        refit_at_other_orders(state, posterior().by_mean)
+    state.candidates, state.pruned = prune_out_of_vocabulary(state.candidates, noises)
     progress("weighing what has no name")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
@@ -126,7 +131,7 @@ def search(
         noise_models=noises.models,
         certain=noises.certain,
         nulls=state.sensors,
-        screening=screening,
+        misfit_templates=misfit_templates,
         refits=refits,
         evidences=evidences(),
         posterior=posterior(),
@@ -134,17 +139,18 @@ def search(
 
 
 def _effects_on_mean_and_noise(prepared: Prepared) -> tuple[dict[str, NamedEffect[Any]], dict[str, NoiseEffect]]:
-    """Divide the effects into those on the mean and those on the noise."""
+    """Return the effects on the mean, and those on the noise, by name."""
     effects, on_noise = prepared.effects, prepared.on_noise
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
     return on_mean, {name: cast(NoiseEffect, effects[name]) for name in effects if name in on_noise}
 
 
-def _refit_late(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:
-    """Refit what screening believes in; if it is still ahead then, correct it by the least that the refits fell short.
+def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Posterior], progress: Progress) -> None:
+    """Refit the combinations that are probable by screening alone, until none is or six were refitted.
 
-    Screening is linear: where an effect gains hundreds of nats, the gain of another one beside it may be wrong by a
-    hundred.
+    In the second case, all other screened evidences are reduced by the least amount by which a refit fell short of its
+    own (`state.optimism`). Screening is linear: where an effect gains hundreds of nats, the gain of another one beside
+    it may be wrong by a hundred.
     """
     shortfalls: list[float] = []
     for k in range(MOST_REFITTED_LATE):
@@ -155,47 +161,50 @@ def _refit_late(state: SearchState, posterior: Callable[[], Posterior], progress
         if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
             return
         promised = state.log_evidence(names)
-        state.reach(names)
+        state.refit_stepwise(names)
         shortfalls.append(promised - state.log_evidence(names))
     state.optimism = max(min(shortfalls), 0.0)
 
 
-def _refit_null(state: SearchState) -> None:
-    """Refit the null from the best fits of one effect, whose gain may be due to a better mode of the null."""
+def _refit_null_from_effects(state: SearchState) -> None:
+    """Refit the null from the best fits with one effect, whose gain may be due to a better mode of the null.
+
+    A better fit replaces the null in the state.
+    """
     null = state.null
     single = [c for c in state.candidates.values() if len(c.names) == 1 and c.log_z > null.log_z]
     for candidate in sorted(single, key=lambda c: -c.log_z)[:NULL_TRIED_AGAIN]:
         start = candidate.found.z[: null.found.model.sensor.n_params]
-        again = state.refits.weighed(null.found.model, start[None, :], candidate.law)
+        again = state.refits.fit_and_weigh(null.found.model, start[None, :], candidate.law)
         if again.log_z > state.null.log_z + SAME_MODE:
             state.keep(again)
 
 
-def _unknown_effects_of(state: SearchState, prepared: Prepared, after: Searched | None) -> Unknown:
-    """Build the basis functions of unknown effects about the best null; those of an earlier search serve again."""
-    named = [effect for name, effect in state.effects.items() if not out_of_vocabulary((name,))]
+def _unknown_effects_of(state: SearchState, prepared: Prepared, after: Searched | None) -> UnknownEffects:
+    """Build the evidence of unknown effects, with bases about the best null, or those of the search `after`."""
+    named = [effect for name, effect in state.effects.items() if not effects_out_of_vocabulary((name,))]
     if after is None:
-        bases, covariates = _unknown_bases(state, prepared, named)
+        bases, covariates = _unknown_bases_and_covariates(state, prepared, named)
     else:
-        bases, covariates = after.screening.unknown_bases, after.screening.covariates
+        bases, covariates = after.misfit_templates.unknown_bases, after.misfit_templates.covariates
     each = state.prior.unknown_complexity_penalty
-    return Unknown(
-        state.refits.scores,
+    return UnknownEffects(
+        state.refits.log_bayes_factors_by_label,
         bases,
         covariates,
         state.noises,
         lambda degrees_of_freedom: state.complexity_penalty(degrees_of_freedom, each),
-        n_choices=lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
+        log_n_choices=lambda names: math.log(math.comb(len(named), len(names)) / len(named)) if len(names) > 1 else 0.0,
     )
 
 
-def _unknown_bases(
+def _unknown_bases_and_covariates(
     state: SearchState, prepared: Prepared, named: Sequence[NamedEffect[Any]]
 ) -> tuple[Bank, tuple[Covariate, ...]]:
     null, recording = state.null, prepared.recording
     covariates, slope = prepared.apparatus.covariates(null.found, recording)
     level = null.found.predicted
     starts = np.flatnonzero(steps_within_scans(recording) == 0)
-    bases = unknown_templates(covariates, level - level.min(), slope, starts)
-    problem = Linearised.of(null.found, state.refits.law_of(null))
-    return unlike_named(bases, state.templates.bank(null.found, named), problem), tuple(covariates)
+    bases = bank_of_unknown_effects(covariates, level - level.min(), slope, starts)
+    problem = Linearised.of(null.found, state.refits.likeliest_law(null))
+    return bases_unlike_named(bases, state.templates.bank(null.found, named), problem), tuple(covariates)

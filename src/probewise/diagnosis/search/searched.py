@@ -1,4 +1,4 @@
-"""The result of a search: evidence and posterior probability of every hypothesis."""
+"""The result of a search: evidence and posterior probability of every hypothesis, and the refits."""
 
 from __future__ import annotations
 
@@ -20,7 +20,12 @@ from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.search.constants import ALIASED_NATS
 from probewise.diagnosis.search.refits import Refits
-from probewise.diagnosis.search.weighed_fit import WeighedFit, expected_nats, in_vocabulary, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import (
+    WeighedFit,
+    effects_out_of_vocabulary,
+    expected_log_bayes_factor,
+    noise_effects_in_vocabulary,
+)
 from probewise.effects import PROPOSAL, is_out_of_vocabulary
 from probewise.sensor import Stage
 
@@ -31,7 +36,8 @@ _NEARLY_ALL = 0.9  # of a formula's gain: one name that explains as much stays, 
 class Evidences:
     """Log evidences of hypotheses.
 
-    Hypotheses are pairs (mean, noise) of names; the mean ("unknown",) is an unknown effect, alone or beside others.
+    A hypothesis is a pair (mean, noise): the names of its effects on the mean, and on the noise. The mean ("unknown",)
+    stands for an unknown effect, alone or beside others.
 
     Parameters
     ----------
@@ -42,7 +48,7 @@ class Evidences:
     unknown
         Unknown effects beside fits: (SSF order, mean, noise) -> log evidence.
     unknown_shares
-        Share of each family of bases in the evidence of the unknown effect.
+        Share of each family of bases in the evidence of an unknown effect.
     """
 
     fits: Mapping[tuple[int, Names], WeighedFit]
@@ -50,42 +56,46 @@ class Evidences:
     unknown: Mapping[tuple[int, Names, Names], float] = field(default_factory=dict)
     unknown_shares: Mapping[str, float] = field(default_factory=dict)
 
-    def names_more(self, order: int, names: Names, noise: Names) -> bool:
-        """Return whether a combination explains more than an unknown effect beside it."""
+    def named_outweigh_unknown(self, order: int, names: Names, noise: Names) -> bool:
+        """Return whether named effects gain more evidence over the null than an unknown effect adds beside them.
+
+        At one SSF order, under one noise model.
+        """
         if not names or (order, ()) not in self.fits:
             return False
         named = self.fits[order, names].evidence[noise].log_z
         return named - self.fits[order, ()].evidence[noise].log_z > self.unknown[order, names, noise] - named
 
-    def reported_as(self, mean: Names) -> Names:
-        """Return the reported names of a combination: ("unknown",) if it is out of vocabulary, with two exceptions.
+    def reported_names(self, mean: Names) -> Names:
+        """Return the names by which a combination is reported: its own, or ("unknown",) if any is out of vocabulary.
 
-        Its named part is reported if that has over half of its gain; instead of a formula alone, a single name that
-        has nearly all of its gain.
+        There are two exceptions: its named part is reported if that alone has over half of its gain over the null; and
+        instead of a formula alone, the best single named effect if that has nine tenths of its gain.
         """
         named = tuple(name for name in mean if not is_out_of_vocabulary(name))
         if mean == ("unknown",) or named == mean:
             return mean
         share = 0.5
         if not named and mean[0].startswith(PROPOSAL):
-            single = (names for _, names in self.fits if len(names) == 1 and not out_of_vocabulary(names))
-            named, share = max(single, key=self._log_z, default=()), _NEARLY_ALL
-        nothing = self._log_z(())
-        gain = self._log_z(named) - nothing
-        return named if named and gain > share * (self._log_z(mean) - nothing) else ("unknown",)
+            single = (names for _, names in self.fits if len(names) == 1 and not effects_out_of_vocabulary(names))
+            named, share = max(single, key=self._largest_log_z, default=()), _NEARLY_ALL
+        nothing = self._largest_log_z(())
+        gain = self._largest_log_z(named) - nothing
+        return named if named and gain > share * (self._largest_log_z(mean) - nothing) else ("unknown",)
 
-    def one_name_explains_more(self) -> bool:
-        """Return whether one named effect, on mean or noise, has more evidence than any one effect without a name.
+    def one_name_outweighs_unnamed(self) -> bool:
+        """Return whether some named effect, on mean or noise, has more evidence alone than any unnamed effect alone.
 
-        Combinations of names do not count: they were chosen from too many for their evidence alone to decide.
+        Unnamed are unknown effects and formulas. Combinations do not count: they were chosen from too many for their
+        evidence alone to decide.
         """
         plain = self._simplest_noise
         nameless = [v for (_, names, noise), v in self.unknown.items() if not names and noise == plain]
         alone: dict[bool, list[float]] = {True: [], False: nameless}
         for (_, names), fit in self.fits.items():
             for noise, evidence in fit.evidence.items():
-                if len(names) + len(noise) - len(plain) == 1 and in_vocabulary(noise) == noise:
-                    alone[not out_of_vocabulary(names)].append(evidence.log_z)
+                if len(names) + len(noise) - len(plain) == 1 and noise_effects_in_vocabulary(noise) == noise:
+                    alone[not effects_out_of_vocabulary(names)].append(evidence.log_z)
         return max(alone[True], default=-math.inf) > max(alone[False], default=math.inf)
 
     @property
@@ -93,20 +103,23 @@ class Evidences:
         """The noise model with the fewest effects: those that the readings show beyond doubt."""
         return min((noise for fit in self.fits.values() for noise in fit.evidence), key=len, default=())
 
-    def _log_z(self, names: Names) -> float:
-        """Return the largest log evidence of a refitted combination; minus infinity if it was not refitted."""
+    def _largest_log_z(self, names: Names) -> float:
+        """Return a combination's largest log evidence over SSF orders and noise models; minus infinity: no refit."""
         return max((fit.log_z for (_, key), fit in self.fits.items() if key == names), default=-math.inf)
 
-    def moved(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
-        """Shift the log evidence of fits, and of unknown effects beside them, equally under every noise model."""
-        fits = {key: fit.moved(gaps[key]) if key in gaps else fit for key, fit in self.fits.items()}
+    def shifted(self, gaps: Mapping[tuple[int, Names], float]) -> Evidences:
+        """Return them with the log evidence of fits, and of unknown effects beside them, shifted by `gaps` in nats.
+
+        `gaps` is by (SSF order, mean), the same under every noise model.
+        """
+        fits = {key: fit.shifted(gaps[key]) if key in gaps else fit for key, fit in self.fits.items()}
         unknown = {(n, mean, noise): v + gaps.get((n, mean), 0.0) for (n, mean, noise), v in self.unknown.items()}
         return replace(self, fits=fits, unknown=unknown)
 
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Probabilities of (mean, noise) hypotheses, which sum to one, and of each SSF order of the clean mean."""
+    """Probabilities of (mean, noise) hypotheses, which sum to one, and of each SSF order of the null."""
 
     probabilities: Mapping[tuple[Names, Names], float]
     order_probabilities: Mapping[int, float]
@@ -120,16 +133,16 @@ class Posterior:
         return out
 
     def likeliest_noise(self, stated: Names | None = None) -> Names:
-        """Return the most probable noise model, of all or of those that contain the `stated` effects."""
+        """Return the most probable noise model, of all or of those whose effects of the vocabulary are `stated`."""
         marginal: dict[Names, float] = {}
         for (_, noise), p in self.probabilities.items():
-            if stated is None or in_vocabulary(noise) == stated:
+            if stated is None or noise_effects_in_vocabulary(noise) == stated:
                 marginal[noise] = marginal.get(noise, 0.0) + p
         return max(marginal, key=lambda noise: marginal[noise])
 
 
 def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_forms: int) -> Posterior:
-    """Convert evidences to probabilities, summed over SSF orders.
+    """Convert evidences to probabilities of hypotheses, summed over SSF orders.
 
     Parameters
     ----------
@@ -149,7 +162,7 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
     log_p = {key: value + prior.log_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
         # A named effect remains named if a smaller unknown one is left.
-        key = (names if evidences.names_more(n, names, noise) else ("unknown",)), noise
+        key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
         log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names)))
     for (names, noise), value in evidences.screened.items():
         log_p[names, noise] = value + prior.log_mean(names)
@@ -167,10 +180,11 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
 
 
 @dataclass(frozen=True, eq=False)
-class Screening:
-    """Templates for the tests: effects, about one fit, and basis functions of unknown effects.
+class MisfitTemplates:
+    """Templates by which a fit is tested for misfits: of effects, and of the basis functions of unknown effects.
 
-    One fit suffices, since all fits to a recording predict much the same, and a test is valid with any templates.
+    All are built about one fit (`about`): fits to a recording predict much the same, and a test is valid with any
+    templates. `covariates` are those of the basis functions.
     """
 
     templates: TemplateMemory
@@ -190,11 +204,11 @@ class Searched:
     prior
         Prior odds.
     noise_models, certain
-        Noise models by names; and the certain noise effects.
+        Noise models by the names of their effects; noise effects beyond doubt.
     nulls
-        The null by SSF order.
-    screening
-        Templates for the tests.
+        The null by SSF order, without fits.
+    misfit_templates
+        Templates by which a fit is tested.
     refits
         All refits, for another search of the same recording.
     evidences, posterior
@@ -206,40 +220,45 @@ class Searched:
     noise_models: Mapping[Names, NoiseModel]
     certain: Names
     nulls: Mapping[int, Null]
-    screening: Screening
+    misfit_templates: MisfitTemplates
     refits: Refits
     evidences: Evidences
     posterior: Posterior
 
     def with_evidences(self, evidences: Evidences) -> Searched:
-        """Return the search with other evidences and the resulting probabilities."""
+        """Return the result with other evidences, and the probabilities that follow from them."""
         posterior = posterior_of(evidences, self.prior, certain=self.certain, n_forms=len(self.nulls))
         return replace(self, evidences=evidences, posterior=posterior)
 
-    def by_prior_alone(self) -> Searched:
-        """Return the search with prior probabilities, for readings without information."""
+    def with_prior_probabilities(self) -> Searched:
+        """Return the result with prior instead of posterior probabilities, for readings without information."""
         effects = self.prepared.effects
-        on_mean = [name for name in effects if name not in self.prepared.on_noise and not out_of_vocabulary((name,))]
+        on_mean = [
+            name for name in effects if name not in self.prepared.on_noise and not effects_out_of_vocabulary((name,))
+        ]
         probabilities = self.prior.alone(on_mean, self.certain)
         return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
 
-    def best(self, names: Names, noise: Names) -> WeighedFit | None:
-        """Return the refit of these effects with the most evidence under this noise over SSF orders; None: no refit."""
+    def best_refit_of(self, names: Names, noise: Names) -> WeighedFit | None:
+        """Return the refit of these effects at the SSF order of most evidence under a noise model; None: no refit."""
         options = [fit for (_, key), fit in self.evidences.fits.items() if key == names]
         return max(options, key=lambda fit: fit.evidence[noise].log_z, default=None)
 
     def aliased_with(self, names: Names) -> frozenset[Names]:
-        """Return the combinations aliased with this one, at any SSF order; () has none."""
+        """Return the combinations aliased with this one: expected to differ by less than three nats at any SSF order.
+
+        The combination () has none.
+        """
         fits = self.evidences.fits
         return frozenset(
             key
             for (n, key), other in fits.items()
             if names and key and key != names and (n, names) in fits
-            if expected_nats(fits[n, names], other) < ALIASED_NATS
+            if expected_log_bayes_factor(fits[n, names], other) < ALIASED_NATS
         )
 
-    def beside(self, noise: Names) -> WeighedFit | None:
-        """Return the fit beside which an unknown effect is most probable; None if none was considered."""
+    def likeliest_beside_unknown(self, noise: Names) -> WeighedFit | None:
+        """Return the fit beside which an unknown effect is most probable under a noise model; None: not weighed."""
         scores = {
             (n, names): value + self.prior.log_unknown(names)
             for (n, names, own), value in self.evidences.unknown.items()
@@ -247,14 +266,14 @@ class Searched:
         }
         return self.evidences.fits[max(scores, key=lambda key: scores[key])] if scores else None
 
-    def named_beside_unknown(self) -> dict[str, float]:
-        """Return the probability of each named effect, given that there is an unknown effect."""
+    def probabilities_given_unknown(self) -> dict[str, float]:
+        """Return the probability of each effect that stands beside an unknown effect, given that there is one."""
         scores = {
             (names, noise): value
             + self.prior.log_unknown(names)
             + self.prior.log_noise(tuple(n for n in noise if n not in self.certain))
             for (order, names, noise), value in self.evidences.unknown.items()
-            if not self.evidences.names_more(order, names, noise)
+            if not self.evidences.named_outweigh_unknown(order, names, noise)
         }
         top = max(scores.values(), default=0.0)
         weights = {key: math.exp(score - top) for key, score in scores.items()}
@@ -264,15 +283,18 @@ class Searched:
                 out[name] = out.get(name, 0.0) + weight / sum(weights.values())
         return out
 
-    def looks(self, found: Fit) -> list[Bank]:
-        """Return the template banks for testing a fit: of the effects that it lacks, and of unknown effects."""
+    def banks_for_test(self, found: Fit) -> list[Bank]:
+        """Return the two banks by which a fit is tested: of the effects that it lacks, and of unknown effects."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]
         missing = [effect for effect in on_mean if effect.name not in found.model.names]
-        return [self.screening.templates.bank(self.screening.about, missing), self.screening.unknown_bases]
+        return [
+            self.misfit_templates.templates.bank(self.misfit_templates.about, missing),
+            self.misfit_templates.unknown_bases,
+        ]
 
     @property
-    def order(self) -> int:
-        """SSF order of the most probable explanation, named or not, at which the null is tested."""
+    def likeliest_order(self) -> int:
+        """SSF order of the most probable explanation, named or not; the null is tested at this order."""
         by_order: dict[int, float] = {}
         terms = [(n, fit.log_z + self.prior.log_mean(names)) for (n, names), fit in self.evidences.fits.items()]
         for (n, names, _), value in self.evidences.unknown.items():
@@ -283,24 +305,27 @@ class Searched:
 
     @property
     def null(self) -> WeighedFit:
-        """The null at that order."""
-        return self.evidences.fits[self.order, ()]
+        """The fit of the null at the likeliest SSF order."""
+        return self.evidences.fits[self.likeliest_order, ()]
 
     def leading_out_of_vocabulary(self) -> Names:
-        """Return the leading combination out of vocabulary, if it leads among the unknown hypotheses; else ()."""
+        """Return the most probable combination out of vocabulary if it beats an unknown effect of bases; else ()."""
         by_mean = self.posterior.by_mean
-        own = {names: p for names, p in by_mean.items() if out_of_vocabulary(names)}
+        own = {names: p for names, p in by_mean.items() if effects_out_of_vocabulary(names)}
         refitted = {names for _, names in self.evidences.fits}
         leader = max(own, key=lambda names: own[names], default=())
         return leader if leader in refitted and own.get(leader, 0.0) > by_mean.get(("unknown",), 0.0) else ()
 
-    def shares_of_the_unknown(self) -> dict[str, float]:
-        """Return the probabilities of an unknown effect's forms: effects out of vocabulary, and families of bases."""
+    def probabilities_of_unknown_forms(self) -> dict[str, float]:
+        """Return the probability of each form of an unknown effect: effects out of vocabulary, families of bases.
+
+        They sum to one.
+        """
         by_mean = self.posterior.by_mean
         unknown = by_mean.get(("unknown",), 0.0)
         shares = {family: unknown * p for family, p in self.evidences.unknown_shares.items()}
         for names, p in by_mean.items():
-            for name in out_of_vocabulary(names):
+            for name in effects_out_of_vocabulary(names):
                 shares[name] = shares.get(name, 0.0) + p
         total = sum(shares.values()) or 1.0
         return {name: p / total for name, p in shares.items()}

@@ -1,4 +1,4 @@
-"""The state of a search: candidates by SSF order and names, and how another is added."""
+"""The state of a search: candidates by SSF order and names, what screening said of others, and further refits."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.constants import SAME_MODE
-from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.refits import Refits, is_significant
-from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
 from probewise.effects import NamedEffect
 from probewise.errors import NotConvergedError
 from probewise.progress import Progress, silent
@@ -28,7 +28,7 @@ from probewise.progress import Progress, silent
 
 @dataclass(eq=False)
 class SearchState:
-    """The mutable state of a search.
+    """The mutable state of a search. A candidate is a refitted combination of effects at one SSF order.
 
     Parameters
     ----------
@@ -43,23 +43,23 @@ class SearchState:
     refits
         Fits of the recording.
     tried_always
-        Effects that are always refitted alone, whatever their screening score.
+        Effects that are always refitted alone, whatever their score by screening.
     progress
-        Progress function.
-    is_over
-        Function that returns whether a share of this search's budget of refits is spent.
+        Called at every refit.
+    share_is_spent
+        Function of a share: whether that share of this search's budget of refits is spent.
     share
-        Share of it that may be spent by now.
+        Share of the budget that may be spent by now.
     """
 
     effects: Mapping[str, NamedEffect[Any]]
     prior: PriorOdds
-    noises: Noises
+    noises: NoiseModels
     templates: TemplateMemory
     refits: Refits
     tried_always: frozenset[str] = frozenset()
     progress: Progress = silent
-    is_over: Callable[[float], bool] = lambda share: False
+    share_is_spent: Callable[[float], bool] = lambda share: False
     share: float = 1.0
     candidates: dict[tuple[int, Names], WeighedFit] = field(default_factory=dict)
     sensors: dict[int, Null] = field(default_factory=dict)
@@ -79,7 +79,7 @@ class SearchState:
 
     @property
     def nulls(self) -> list[WeighedFit]:
-        """List the candidates without effects, one per SSF order."""
+        """The candidates without effects, one per SSF order."""
         return [c for (_, names), c in self.candidates.items() if not names]
 
     @property
@@ -89,58 +89,66 @@ class SearchState:
 
     @property
     def refitted(self) -> set[Names]:
-        """Refitted combinations, at any order."""
+        """The combinations that were refitted, at any SSF order."""
         return {names for _, names in self.candidates}
 
-    def of(self, names: Names) -> list[WeighedFit]:
+    def candidates_of(self, names: Names) -> list[WeighedFit]:
         """List the candidates of one combination, one per SSF order."""
         return [c for (_, key), c in self.candidates.items() if key == names]
 
-    def odds(self, candidate: WeighedFit) -> float:
-        """Return the sum of a candidate's log evidence and the log prior odds of its effects."""
+    def log_posterior(self, candidate: WeighedFit) -> float:
+        """Return a candidate's unnormalised log posterior: its log evidence plus the log prior of its effects."""
         return candidate.log_z + self.prior.log_mean(candidate.names)
 
-    def banks(self, null: WeighedFit) -> list[Bank]:
-        """Return the templates of all effects about a null: those with a name, and those with a formula alone."""
-        named = [effect for name, effect in self.effects.items() if not out_of_vocabulary((name,))]
-        rest = [effect for name, effect in self.effects.items() if out_of_vocabulary((name,))]
+    def template_banks(self, null: WeighedFit) -> list[Bank]:
+        """Return the template banks of all effects about a null: of those in the vocabulary, and of the others."""
+        named = [effect for name, effect in self.effects.items() if not effects_out_of_vocabulary((name,))]
+        rest = [effect for name, effect in self.effects.items() if effects_out_of_vocabulary((name,))]
         return [self.templates.bank(null.found, effects) for effects in (named, rest) if effects]
 
-    def scores(self, about: WeighedFit, law: NoiseLaw, null: WeighedFit) -> dict[str, FloatArray]:
-        """Return the log Bayes factors of every effect's entries about a fit, by their templates about a null."""
-        of_banks = [self.refits.scores(about.found, law, bank) for bank in self.banks(null)]
+    def log_bayes_factors_by_effect(self, about: WeighedFit, law: NoiseLaw, null: WeighedFit) -> dict[str, FloatArray]:
+        """Return the log Bayes factors of every effect's templates beside a candidate, by name, (n_templates,) each.
+
+        The templates are those about `null`.
+        """
+        of_banks = [
+            self.refits.log_bayes_factors_by_label(about.found, law, bank) for bank in self.template_banks(null)
+        ]
         return {name: own for scores in of_banks for name, own in scores.items()}
 
     def complexity_penalty(self, degrees_of_freedom: int, each: float | None = None) -> float:
-        """Return the penalty in nats of effects with an SSF of fewer degrees of freedom than the null alone needs.
+        """Return the penalty in nats of effects at an SSF with fewer degrees of freedom than the null alone needs.
 
-        It is averaged over the null's orders, so that a small chance lead of one order has little effect.
+        `each` is the penalty per degree of freedom; by default that of the prior. It is averaged over the orders of the
+        null, so that a small chance lead of one order has little effect.
         """
         nulls = self.nulls
         log_z = np.array([c.log_z for c in nulls])
-        spared = np.array([max(c.degrees_of_freedom - degrees_of_freedom, 0) for c in nulls])
+        spared = np.array([max(c.ssf_degrees_of_freedom - degrees_of_freedom, 0) for c in nulls])
         return float(
             logsumexp(log_z) - logsumexp(log_z - (self.prior.complexity_penalty if each is None else each) * spared)
         )
 
     def keep(self, candidate: WeighedFit) -> WeighedFit:
-        """Store a candidate, replacing an earlier one of the same kind."""
+        """Store a candidate in place of an earlier one of the same SSF order and effects, and return it."""
         self.candidates[candidate.n_gaussians, candidate.names] = candidate
         return candidate
 
     def refit(self, parent: WeighedFit, added: str) -> WeighedFit | None:
-        """Refit a candidate with one more effect and keep the best of its kind, or record that it is insignificant.
+        """Refit a candidate with one more effect; store the fit if the effect is significant.
+
+        Otherwise the combination is recorded as undetected. Nothing is refitted once the share of the budget is spent.
 
         Returns
         -------
-        The best candidate of that kind, possibly an earlier one; None if there is none.
+        The best candidate of the resulting combination, possibly an earlier one; None if there is none.
         """
-        against = 0.0 if parent.names else self.complexity_penalty(parent.degrees_of_freedom)
-        if self.is_over(self.share):
-            return max(self.of(tuple(sorted((*parent.names, added)))), key=lambda c: c.log_z, default=None)
+        against = 0.0 if parent.names else self.complexity_penalty(parent.ssf_degrees_of_freedom)
+        if self.share_is_spent(self.share):
+            return max(self.candidates_of(tuple(sorted((*parent.names, added)))), key=lambda c: c.log_z, default=None)
         self.extended.add((parent, added))
         try:
-            candidate, scores = self.refits.extended(parent, self.effects[added], against)
+            candidate, scores = self.refits.refit_with_effect(parent, self.effects[added], against)
         except NotConvergedError:  # its model diverges from every start
             names = tuple(sorted((*parent.names, added)))
             self.about_parts |= {(names, noise): e.log_z - against for noise, e in parent.evidence.items()}
@@ -159,24 +167,30 @@ class SearchState:
         self.undetected.add(names)
         return None
 
-    def refit_without(self, candidate: WeighedFit, left_out: str) -> None:
-        """Refit a combination from its coordinates in a fit with one more effect, if it fits better there.
+    def refit_subset_from(self, candidate: WeighedFit, left_out: str) -> None:
+        """Refit the combination without `left_out` from its coordinates in `candidate`, if it fits better there.
 
-        Where an effect changes what other parameters are (a stiffness that hardens, and a frequency), a fit from where
-        they were without it may stop at a poor local optimum, which one more effect lets it leave.
+        A better fit replaces the candidate of that combination. Where an effect changes what other parameters are (a
+        stiffness that hardens, and a frequency), a fit from where they were without it may stop at a poor local
+        optimum, which one more effect lets it leave.
         """
         model, stay = candidate.found.model.without(left_out)
         start = candidate.found.z[stay]
-        for held in self.of(tuple(name for name in candidate.names if name != left_out)):
+        for held in self.candidates_of(tuple(name for name in candidate.names if name != left_out)):
             alike = held.n_gaussians == candidate.n_gaussians and set(model.effects) == set(held.found.model.effects)
-            if alike and self.refits.is_better_at(model, start, held):
-                again = self.refits.weighed(model, start[None, :], candidate.law).as_share(held.log_share, held.weights)
+            if alike and self.refits.fits_better_at(model, start, held):
+                again = self.refits.fit_and_weigh(model, start[None, :], candidate.law).with_factor_and_weights(
+                    held.log_share, held.weights
+                )
                 if again.log_z > held.log_z + SAME_MODE:
                     self.keep(again)
-                    self.refits.replace(held, again)
+                    self.refits.replace_fit(held, again)
 
-    def reach(self, names: Names) -> None:
-        """Refit a combination, starting from its largest refitted subset."""
+    def refit_stepwise(self, names: Names) -> None:
+        """Refit a combination by adding its effects one by one to its largest refitted subset.
+
+        If one of them is insignificant, the combination is recorded as undetected.
+        """
         parts = [c for (_, part), c in self.candidates.items() if set(part) < set(names)]
         held = max(parts, key=lambda c: (len(c.names), c.log_z))
         for added in [n for n in names if n not in held.names]:
@@ -189,8 +203,8 @@ class SearchState:
                 break
             held = extended
 
-    def screened(self) -> dict[tuple[Names, Names], float]:
-        """Return the log evidence of combinations that were not refitted, by screening.
+    def screened_log_evidences(self) -> dict[tuple[Names, Names], float]:
+        """Return the log evidence of (mean, noise) by screening, for combinations that were not refitted.
 
         Screening about a fit with part of the effects is more accurate than about the null; the latter is corrected for
         refits of its parts.
@@ -200,7 +214,8 @@ class SearchState:
         for (names, noise), value in self.about_null.items():
             parts = [p for p in itertools.combinations(names, len(names) - 1) if p in refitted]
             gains = [
-                max(c.evidence[noise].log_z for c in self.of(part)) - self.about_null.get((part, noise), np.inf)
+                max(c.evidence[noise].log_z for c in self.candidates_of(part))
+                - self.about_null.get((part, noise), np.inf)
                 for part in parts
             ]
             out[names, noise] = value + max(gains, key=abs, default=0.0) if np.all(np.isfinite(gains)) else value
@@ -214,15 +229,15 @@ class SearchState:
     def log_evidence(self, names: Names) -> float:
         """Return a combination's log evidence, the largest over SSF orders and noise models.
 
-        It is that of the refits or, if there are none, that of the screening.
+        It is that of the refits or, if there are none, that by screening; minus infinity if there is neither.
         """
-        screened = (value for (own, _), value in self.screened().items() if own == names)
-        return max([c.log_z for c in self.of(names)] or screened, default=-np.inf)
+        screened = (value for (own, _), value in self.screened_log_evidences().items() if own == names)
+        return max([c.log_z for c in self.candidates_of(names)] or screened, default=-np.inf)
 
 
 def rivals_of(names: Names, among: Iterable[WeighedFit]) -> list[WeighedFit]:
     """List the candidates with which a combination competes.
 
-    These are all candidates if it has an effect outside the vocabulary, otherwise only those without one.
+    These are all candidates if it has an effect out of vocabulary, otherwise only those without one.
     """
-    return [c for c in among if out_of_vocabulary(names) or not out_of_vocabulary(c.names)]
+    return [c for c in among if effects_out_of_vocabulary(names) or not effects_out_of_vocabulary(c.names)]

@@ -1,4 +1,4 @@
-"""Recompute the evidence of the leading hypotheses by nested sampling, which replaces Laplace's where that fails.
+"""The evidence of the leading hypotheses once more, by nested sampling, which replaces Laplace's where that fails.
 
 Model, priors and noise are those of `probewise.diagnosis.evidence.laplace`; only the integral over the parameters
 differs: here over the whole prior, there for one Gaussian mode.
@@ -24,7 +24,7 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import WeighedFit, in_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, noise_effects_in_vocabulary
 from probewise.diagnosis.search.weighed_twice import Weighing
 from probewise.errors import DoubtfulResultWarning
 from probewise.progress import Progress, silent
@@ -51,11 +51,11 @@ Run = Callable[..., nested.NestedResult]
 def weigh_thoroughly(
     searched: Searched, *, rng: np.random.Generator, n_live: int = N_LIVE, progress: Progress = silent
 ) -> tuple[Searched, tuple[Weighing, ...]]:
-    """Compute the evidence of two or three leading hypotheses, and the null, by nested sampling.
+    """Compute the evidence of two or three leading hypotheses, and of the null, by nested sampling.
 
-    If the two methods differ by more than a nat plus the standard error, and no run has warnings, nested sampling takes
-    precedence: the evidences of these hypotheses, and of unknown effects beside them, are shifted, and all
-    probabilities recomputed.
+    If the two methods differ for any by more than a nat plus the standard error, and no run has warnings, nested
+    sampling takes precedence: the evidences of these hypotheses, and of unknown effects beside them, are shifted, and
+    all probabilities recomputed.
     Laplace's error for the null is assumed for every hypothesis that was not recomputed, so shifts are relative to the
     null. Hypotheses pruned by Laplace's evidence are not restored.
 
@@ -80,7 +80,7 @@ def weigh_thoroughly(
     weighings: dict[tuple[int, Names], Weighing] = {}
     leaders = _leading_hypotheses(searched)
     bar = _ProgressBar(
-        progress, len(leaders), _estimated_minutes(leaders, searched, n_live, rng=np.random.default_rng(0))
+        progress, len(leaders), _least_and_most_minutes(leaders, searched, n_live, rng=np.random.default_rng(0))
     )
     for k, ((candidate, noise), own) in enumerate(zip(leaders, rng.spawn(len(leaders)), strict=True)):
         key = candidate.n_gaussians, candidate.names
@@ -92,32 +92,32 @@ def weigh_thoroughly(
         return searched, told
     common = next((w.gap for (_, names), w in weighings.items() if not names), 0.0)
     return searched.with_evidences(
-        searched.evidences.moved({key: w.gap - common for key, w in weighings.items()})
+        searched.evidences.shifted({key: w.gap - common for key, w in weighings.items()})
     ), told
 
 
 def _leading_hypotheses(searched: Searched) -> list[tuple[WeighedFit, Names]]:
-    """List the leading refitted hypotheses on the mean, each under its best noise, and the null.
+    """List the leading refitted hypotheses on the mean, each with its most probable noise model, and the null.
 
-    Each has its SSF order of largest evidence; the null has that of the first.
+    Each is at its SSF order of largest evidence; the null, if it is not among them, at that of the first.
     """
     merged = searched.posterior.by_mean
     out: list[tuple[WeighedFit, Names]] = []
     for mean in sorted(merged, key=lambda names: -merged[names]):
         if len(out) == _MOST or (len(out) >= _LEAST and merged[mean] < _LEAST_PROBABILITY):
             break
-        noise = _noise_of(searched, mean)
-        candidate = searched.best(mean, noise)
+        noise = _likeliest_noise_of(searched, mean)
+        candidate = searched.best_refit_of(mean, noise)
         if candidate is not None:
             out.append((candidate, noise))
-    null = searched.evidences.fits[out[0][0].n_gaussians if out else searched.order, ()]
+    null = searched.evidences.fits[out[0][0].n_gaussians if out else searched.likeliest_order, ()]
     if all(candidate.names for candidate, _ in out):
-        out.append((null, _noise_of(searched, ())))
+        out.append((null, _likeliest_noise_of(searched, ())))
     return out
 
 
-def _noise_of(searched: Searched, mean: Names) -> Names:
-    """Return the noise model under which a hypothesis on the mean is most probable."""
+def _likeliest_noise_of(searched: Searched, mean: Names) -> Names:
+    """Return the noise model with which a hypothesis on the mean is most probable."""
     own = {noise: p for (names, noise), p in searched.posterior.probabilities.items() if names == mean}
     return max(own, key=lambda noise: own[noise])
 
@@ -132,9 +132,9 @@ def _weigh_by_nested_sampling(
     rounds: Callable[[str, nested.RoundSummary], None],
 ) -> Weighing:
     evidence = candidate.evidence[noise]
-    effects = tuple(sorted((*candidate.names, *in_vocabulary(noise))))
+    effects = tuple(sorted((*candidate.names, *noise_effects_in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
-    problem = _problem(candidate, noise, searched)
+    problem = _joint_problem(candidate, noise, searched)
     once = folded(problem, candidate.found.z)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
@@ -151,13 +151,13 @@ def _weigh_by_nested_sampling(
 
         def weigh_near(theta: FloatArray) -> Weighing:
             found = _evidence_near_posterior(theta, once, run, rng)
-            log_z = found.log_z + candidate.log_factor
+            log_z = found.log_z + candidate.log_prior_factor
             return replace(weighing, nested=log_z, error=found.error, doubts=found.warnings)
 
         told = weigh_near(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
             told = max(told, weigh_near(_draw_from_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
-    more = explored.log_z + candidate.log_factor - told.nested
+    more = explored.log_z + candidate.log_prior_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:
         return told
@@ -165,17 +165,17 @@ def _weigh_by_nested_sampling(
     return replace(told, doubts=(*told.doubts, doubt))
 
 
-def _problem(candidate: WeighedFit, noise: Names, searched: Searched) -> JointProblem:
+def _joint_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> JointProblem:
     return JointProblem(candidate.found.model, searched.prepared.recording, candidate.evidence[noise])
 
 
-def _estimated_minutes(
+def _least_and_most_minutes(
     leaders: Sequence[tuple[WeighedFit, Names]], searched: Searched, n_live: int, *, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """Estimate the minutes that the runs take, lower and upper: evaluations times measured seconds each."""
+    """Estimate the least and the most minutes of all runs, from the measured time of an evaluation."""
     seconds = 0.0
     for candidate, noise in leaders:
-        problem = _problem(candidate, noise, searched)
+        problem = _joint_problem(candidate, noise, searched)
         n_params, z = problem.model.n_params, candidate.found.z
         theta = np.clip(z + 1e-3 * rng.standard_normal((_TIMED, len(z))), -FARTHEST, FARTHEST)
         began = time.perf_counter()
@@ -186,7 +186,7 @@ def _estimated_minutes(
 
 
 class _ProgressBar:
-    """One progress bar over the runs of all hypotheses, with the estimated duration in its title."""
+    """A progress bar over the runs of all hypotheses, with the estimated duration in its title."""
 
     def __init__(self, progress: Progress, n: int, minutes: tuple[float, float]) -> None:
         self._progress, self._n, self._runs = progress, n, 0
@@ -195,7 +195,7 @@ class _ProgressBar:
         progress(self._stage, 0, n * _STEPS)
 
     def show_round(self, k: int, label: str, state: nested.RoundSummary) -> None:
-        """Show the progress after one round of a run; `k` numbers the hypothesis, `label` names it."""
+        """Show the progress after one round of a run; `k` is the number of the hypothesis, from 0, `label` its name."""
         depth = -state.log_volume
         if k != self._at or depth < self._depth:  # a new run starts from the whole prior
             self._runs = 1 if k != self._at else self._runs + 1
@@ -216,7 +216,11 @@ def _minutes_in_words(minutes: tuple[float, float]) -> str:
 def _evidence_near_posterior(
     theta: FloatArray, problem: nested.Samplable, run: Run, rng: np.random.Generator
 ) -> _Evidence:
-    """Estimate the evidence by runs from priors near the posterior: near the samples, then near the previous run."""
+    """Estimate the evidence by up to four runs from priors near the posterior, until its error is small.
+
+    The first is near the samples `theta`, each further one near the samples of the last; the result is their weighted
+    mean, or a run refined to a smaller error.
+    """
     runs: list[nested.NestedResult] = []
     while True:
         nearer = nested.repartitioned(problem, theta)
@@ -234,7 +238,7 @@ def _evidence_near_posterior(
 
 
 def _draw_from_laplace(candidate: WeighedFit, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
-    """Draw from Laplace's approximation, (_N_SAMPLES, n_params)."""
+    """Draw coordinates from Laplace's approximation, (_N_SAMPLES, n_params)."""
     found = candidate.found
     root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.information)
     draws = rng.standard_normal((_N_SAMPLES, len(found.z)))

@@ -1,4 +1,4 @@
-"""Twins: two effects with proportional templates, so that the fit of one is reused for the other."""
+"""Twins: pairs of effects with proportional templates, so that the fit of one is reused for the other."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SAME_SLOPES = 1e-3  # of the norm of a slope
 
 
 def are_proportional(first: EffectTemplates, second: EffectTemplates) -> bool:
-    """Return whether corresponding templates of two effects' banks are proportional to each other."""
+    """Return whether all corresponding templates of two effects are proportional; False for one and the same object."""
     if first is second or [a.shape for a in first.settings] != [b.shape for b in second.settings]:
         return False
     if len(first.variants) != len(second.variants):
@@ -28,18 +28,18 @@ def are_proportional(first: EffectTemplates, second: EffectTemplates) -> bool:
 
 
 @dataclass(frozen=True, eq=False)
-class Swap:
-    """The exchange of one effect for its twin, by their names and templates."""
+class TwinSwap:
+    """The exchange of an effect `name` for its `twin`, with the templates of both."""
 
     name: str
     of_first: EffectTemplates
     twin: str
     of_twin: EffectTemplates
 
-    def exchanged(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
-        """Return a candidate with the twin in place of the effect; None if its readings or their slopes change.
+    def candidate_with_twin(self, candidate: WeighedFit, usable: IntArray) -> WeighedFit | None:
+        """Return a candidate with the twin in place of the effect; None if its predictions or their slopes change.
 
-        `usable` are the rows with usable readings, (n_usable,).
+        `usable` are the row numbers of usable readings, (n_usable,).
         """
         found = self._fit_with_twin(candidate.found, usable)
         if found is None:
@@ -61,13 +61,13 @@ class Swap:
             z[amplitudes] *= sign
             slopes[:, amplitudes] *= sign
             predicted, own = (values[usable] for values in model.jacobian(z))
-            if _are_same(predicted, own, replace(found, slopes=slopes)):
+            if _has_same_predictions(predicted, own, replace(found, slopes=slopes)):
                 residuals = found.residuals + found.predicted - predicted
                 return replace(found, model=model, z=z, predicted=predicted, residuals=residuals, slopes=own)
         return None
 
 
-def _are_same(predicted: FloatArray, slopes: FloatArray, found: Fit) -> bool:
+def _has_same_predictions(predicted: FloatArray, slopes: FloatArray, found: Fit) -> bool:
     if not np.abs(predicted - found.predicted).max() <= _SAME_READINGS * found.sd:
         return False
     apart, norms = np.linalg.norm(slopes - found.slopes, axis=0), np.linalg.norm(found.slopes, axis=0)

@@ -1,4 +1,4 @@
-"""Unknown effects beside refitted candidates: their evidence, and pruning in favour of named effects."""
+"""Unknown effects beside refitted candidates: their evidence, and their removal in favour of named effects."""
 
 from __future__ import annotations
 
@@ -16,58 +16,58 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.residuals.outlying import score_clustering, tail_probability
+from probewise.diagnosis.residuals.outlying import clustering_log_bayes_factors, outlier_probabilities
 from probewise.diagnosis.search.constants import ALIASED_NATS
-from probewise.diagnosis.search.noises import Noises
-from probewise.diagnosis.search.weighed_fit import WeighedFit, out_of_vocabulary
+from probewise.diagnosis.search.noises import NoiseModels
+from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
 
 
 @dataclass(eq=False)
-class Unknown:
-    """Evidence of basis functions beside each candidate, under each of its noise models.
+class UnknownEffects:
+    """Evidence of an unknown effect, by basis functions, beside candidates, under each of their leading noise models.
 
     Parameters
     ----------
     scores
-        Function that scores a bank about a fit, by label.
+        Function of a fit, a noise distribution and a bank: log Bayes factors of its templates, by label.
     bases
-        Templates of the basis functions.
+        Bank of the basis functions.
     covariates
         Covariates in which outlying readings may cluster.
     noises
         The noise models.
     complexity_penalty
-        Penalty in nats, by the degrees of freedom of the SSF.
-    n_choices
-        Log of the ratio of the number of combinations of this many names to that of single names.
+        Function of the degrees of freedom of an SSF: penalty in nats of an unknown effect beside the null.
+    log_n_choices
+        Function of names: log of the number of combinations of as many names, over the number of single names.
     """
 
     scores: Callable[[Fit, NoiseLaw, Bank], Mapping[str, FloatArray]]
     bases: Bank
     covariates: tuple[Covariate, ...]
-    noises: Noises
+    noises: NoiseModels
     complexity_penalty: Callable[[int], float]
     log_z: dict[tuple[int, Names, Names], float] = field(default_factory=dict)
     """Log evidence by (order, mean, noise)."""
     shares: dict[str, float] = field(default_factory=dict)
     """Share of each family of bases, beside the null with the largest evidence of an unknown effect."""
-    n_choices: Callable[[Names], float] = lambda names: 0.0
+    log_n_choices: Callable[[Names], float] = lambda names: 0.0
 
     def weigh(self, candidates: Iterable[WeighedFit]) -> None:
-        """Compute its evidence beside each candidate."""
+        """Compute and store the log evidence of an unknown effect beside each candidate."""
         best = -np.inf
         for candidate in candidates:
-            for noise, evidence in candidate.steering():
+            for noise, evidence in candidate.leading_noises():
                 scores = self.scores(candidate.found, evidence.law, self.bases)
                 by_family = {family: log_mean(own) for family, own in scores.items()}
                 if evidence.law.share > 0:
-                    far_out = tail_probability(candidate.found.residuals, evidence.law)
-                    by_family |= score_clustering(far_out, self.covariates)
+                    far_out = outlier_probabilities(candidate.found.residuals, evidence.law)
+                    by_family |= clustering_log_bayes_factors(far_out, self.covariates)
                 if not by_family:
                     continue
                 value = evidence.log_z + log_mean(np.array(list(by_family.values())))
                 if not candidate.names:
-                    value -= self.complexity_penalty(candidate.degrees_of_freedom)
+                    value -= self.complexity_penalty(candidate.ssf_degrees_of_freedom)
                 self.log_z[candidate.n_gaussians, candidate.names, noise] = value
                 if value > best and not candidate.names:
                     best = value
@@ -81,35 +81,40 @@ class Unknown:
         imitate named effects. Two names are chosen from many more combinations than one, so they must explain
         correspondingly more.
         """
-        named = [c for c in candidates if not out_of_vocabulary(c.names)]
+        named = [c for c in candidates if not effects_out_of_vocabulary(c.names)]
         for known in {c.names for c in named if len(c.names) <= 1}:
             rivals = [c for c in named if set(c.names) > set(known) and len(c.names) <= 2]
             if any(key[1] == known for key in self.log_z) and self._is_superfluous(known, rivals, candidates):
                 self.log_z = {key: value for key, value in self.log_z.items() if key[1] != known}
 
     def _is_superfluous(self, known: Names, rivals: Collection[WeighedFit], candidates: Collection[WeighedFit]) -> bool:
-        """Return whether a candidate makes an unknown effect beside `known` superfluous.
+        """Return whether one of the rivals makes an unknown effect beside `known` superfluous.
 
-        Its evidence is then at most ALIASED_NATS lower, and an unknown effect beside it adds less than that.
+        That is, its evidence is at most ALIASED_NATS lower, and an unknown effect beside it adds less than that.
         """
-        most = max((self._log_evidence_over_noises(c) for c in candidates if c.names == known), default=-np.inf)
-        believed = {c: self._log_evidence_with_prior(c, len(known)) for c in rivals}
+        most = max((self._log_evidence_with_unknown(c) for c in candidates if c.names == known), default=-np.inf)
+        believed = {c: self._log_evidence_less_choices(c, len(known)) for c in rivals}
         for candidate in sorted(believed, key=lambda c: -believed[c]):
             if believed[candidate] < most - ALIASED_NATS:
                 return False
-            if self._log_evidence_over_noises(candidate) == -np.inf:
+            if self._log_evidence_with_unknown(candidate) == -np.inf:
                 self.weigh([candidate])
-            if self._log_evidence_over_noises(candidate) - self._log_evidence_without_unknown(candidate) < ALIASED_NATS:
+            if (
+                self._log_evidence_with_unknown(candidate) - self._log_evidence_without_unknown(candidate)
+                < ALIASED_NATS
+            ):
                 return True
         return False
 
-    def _log_evidence_with_prior(self, candidate: WeighedFit, n_known: int) -> float:
+    def _log_evidence_less_choices(self, candidate: WeighedFit, n_known: int) -> float:
         several = len(candidate.names) - n_known > 1
-        return self._log_evidence_without_unknown(candidate) - (self.n_choices(candidate.names) if several else 0.0)
+        return self._log_evidence_without_unknown(candidate) - (self.log_n_choices(candidate.names) if several else 0.0)
 
     def _log_evidence_without_unknown(self, candidate: WeighedFit) -> float:
-        return self.noises.over_all({noise: evidence.log_z for noise, evidence in candidate.evidence.items()})
+        return self.noises.average_log_evidence(
+            {noise: evidence.log_z for noise, evidence in candidate.evidence.items()}
+        )
 
-    def _log_evidence_over_noises(self, candidate: WeighedFit) -> float:
+    def _log_evidence_with_unknown(self, candidate: WeighedFit) -> float:
         own = candidate.n_gaussians, candidate.names
-        return self.noises.over_all({key[2]: value for key, value in self.log_z.items() if key[:2] == own})
+        return self.noises.average_log_evidence({key[2]: value for key, value in self.log_z.items() if key[:2] == own})

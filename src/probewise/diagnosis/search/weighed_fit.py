@@ -1,4 +1,4 @@
-"""A refitted combination of effects with its evidence."""
+"""A refitted combination of effects with its evidence: a candidate of the search."""
 
 from __future__ import annotations
 
@@ -29,43 +29,43 @@ class WeighedFit:
 
     @property
     def names(self) -> Names:
-        """Its effects on the mean, sorted."""
+        """Names of its effects on the mean, sorted."""
         return tuple(sorted(self.found.model.names))
 
     @classmethod
     def of(cls, found: Fit, law: NoiseLaw, plain: Mapping[Names, NoiseEvidence], log_detectable: float) -> WeighedFit:
-        """Build from a fit and the evidence of its parameters, without factors for discrete choices."""
+        """Build from a fit and its `plain` evidence: of its parameters alone, without prior factors."""
         return cls(found, law, {}, 0.0, log_detectable, {}).with_evidence(plain)
 
     @property
-    def log_factor(self) -> float:
-        """Log of the factor on the evidence of its parameters."""
+    def log_prior_factor(self) -> float:
+        """Log of the prior factor by which its evidence differs from that of its parameters alone."""
         return self.log_share + self.log_detectable
 
     def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
-        """Return it with other evidences of its parameters under each noise model."""
-        return replace(self, evidence=plain).moved(self.log_factor)
+        """Return it with other evidences: `plain` is that of its parameters alone, by noise model."""
+        return replace(self, evidence=plain).shifted(self.log_prior_factor)
 
-    def as_share(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
-        """Return it with the factor and the weights for all variants of its effects."""
-        return replace(self.moved(log_share - self.log_share), log_share=log_share, weights=weights)
+    def with_factor_and_weights(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:
+        """Return it with another log prior factor of its effects' variants, and the variants' weights, by effect."""
+        return replace(self.shifted(log_share - self.log_share), log_share=log_share, weights=weights)
 
-    def moved(self, by: float) -> WeighedFit:
-        """Return it with its log evidence shifted equally under every noise model."""
+    def shifted(self, by: float) -> WeighedFit:
+        """Return it with its log evidence shifted by these nats under every noise model."""
         return replace(self, evidence={noise: replace(e, log_z=e.log_z + by) for noise, e in self.evidence.items()})
 
     @property
     def n_gaussians(self) -> int:
-        """Its SSF order."""
+        """Its SSF order, the number of Gaussians."""
         return self.found.model.sensor.n_gaussians
 
     @property
-    def sd(self) -> float:
+    def whitened_sd(self) -> float:
         """Sd of a whitened reading, including rounding but not a tail."""
         return self.found.sd * self.law.widening
 
     @property
-    def degrees_of_freedom(self) -> int:
+    def ssf_degrees_of_freedom(self) -> int:
         """Effective degrees of freedom of its SSF, counted in Gaussians."""
         return self.found.model.sensor.degrees_of_freedom
 
@@ -74,8 +74,8 @@ class WeighedFit:
         """Log evidence under the best noise model."""
         return max(e.log_z for e in self.evidence.values())
 
-    def steering(self) -> Iterator[tuple[Names, NoiseEvidence]]:
-        """List the noise models that are not far behind the best, and the simplest one.
+    def leading_noises(self) -> Iterator[tuple[Names, NoiseEvidence]]:
+        """Iterate over names and evidence of the noise models within three nats of the best, and of the simplest one.
 
         A missing effect on the mean can look like any noise effect, and be detectable under white noise only.
         """
@@ -83,20 +83,20 @@ class WeighedFit:
         return ((k, e) for k, e in self.evidence.items() if k == plain or e.log_z >= best - STEERING)
 
 
-def expected_nats(first: WeighedFit, second: WeighedFit) -> float:
-    """Return the expected log Bayes factor between two refitted models if the first is true.
+def expected_log_bayes_factor(first: WeighedFit, second: WeighedFit) -> float:
+    """Return the log Bayes factor expected between two candidates if the first is true, in nats.
 
-    It is half the squared distance between their predictions, in noise sds of the first.
+    It is half the squared distance between their predictions, whitened, in noise sds of the first.
     """
     apart = first.law((first.found.residuals - second.found.residuals)[:, None])
-    return 0.5 * float(np.sum(apart**2)) / first.sd**2
+    return 0.5 * float(np.sum(apart**2)) / first.whitened_sd**2
 
 
-def in_vocabulary(noise: Names) -> Names:
-    """Return the effects of a noise model that are in the vocabulary."""
+def noise_effects_in_vocabulary(noise: Names) -> Names:
+    """Return those effects of a noise model that are in the vocabulary, without nuisances."""
     return tuple(name for name in noise if name not in NUISANCES)
 
 
-def out_of_vocabulary(mean: Names) -> Names:
-    """Select the effects on the mean that are outside the vocabulary."""
+def effects_out_of_vocabulary(mean: Names) -> Names:
+    """Return those effects on the mean that are out of vocabulary."""
     return tuple(name for name in mean if is_out_of_vocabulary(name))

@@ -12,8 +12,8 @@ A_NAT = 1.0
 class Weighing:
     """Log evidence of one hypothesis by both methods, with the same model, priors and noise.
 
-    `effects` on the mean and on the noise, sorted; `n_gaussians` of the SSF; `error` of the nested runs, one
-    standard error; `doubts` are the warnings of those runs.
+    `effects` on the mean and on the noise, sorted; `n_gaussians` of the SSF; `laplace` and `nested`: the log evidences
+    in nats; `error`: standard error of `nested`; `doubts`: warnings of the nested runs.
     """
 
     effects: tuple[str, ...]
@@ -25,7 +25,7 @@ class Weighing:
 
     @property
     def label(self) -> str:
-        """Label of the hypothesis."""
+        """Its effects joined by "+", or "clean"."""
         return "+".join(self.effects) or "clean"
 
     @property
@@ -39,8 +39,8 @@ class Weighing:
         return abs(self.gap) <= A_NAT + self.error
 
 
-def with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
-    """Add to a sentence whether nested sampling agrees, the differences in nats, and its first warning."""
+def sentence_with_agreement(reason: str, weighings: Sequence[Weighing]) -> str:
+    """Return a reason extended by whether nested sampling agrees, by how many nats not, and its first warning."""
     if not weighings:
         return reason
     apart = ", ".join(f"{w.label} by {w.gap:+.1f} nats".replace("-", "−") for w in weighings if not w.agree)

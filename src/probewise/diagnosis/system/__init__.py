@@ -1,1 +1,1 @@
-"""A user's simulator over a table, as an `Apparatus`: forms, covariates, held-out runs, words."""
+"""Fit, diagnosis and audit of a user's simulator over a table of rows."""

@@ -1,4 +1,4 @@
-"""A user's simulator as an `Apparatus`."""
+"""A user's simulator over a table as an `Apparatus`: effects, covariates, held-out runs, words."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
-from probewise.diagnosis.system.commands import RunCommand, as_alternatives, in_sequence, run_commands
+from probewise.diagnosis.system.commands import RunCommand, as_alternatives, in_sequence, possible_run_commands
 from probewise.effects import (
     CorrelatedNoise,
     DriftingNoise,
@@ -60,12 +60,12 @@ _TWICE = 0.1  # of one wave, two: machines and climates that have a cycle often 
 
 @dataclass(frozen=True, eq=False)
 class SimulatorApparatus:
-    """A system with a first fit, which sets the scales of the forms.
+    """The `Apparatus` of a simulator over a table; a first fit sets the scales of its effects.
 
     Parameters
     ----------
     about
-        The fit, and the sd of a reading.
+        The system, its table, the first fit, and the sd of a reading.
     stop
         The undeclared stop of the meter, if the readings show one.
     """
@@ -75,7 +75,7 @@ class SimulatorApparatus:
 
     @property
     def system(self) -> System:
-        """The system."""
+        """The simulator over the runs of the table."""
         return self.about.system
 
     @property
@@ -99,7 +99,7 @@ class SimulatorApparatus:
         )
 
     def effects(self, recording: Recording, null: Null | None) -> dict[str, NamedEffect[Any]]:
-        """Return every form that could be detectable in this table, and the noise effects."""
+        """Return by name every effect that could be detectable in this table: on the mean, and on the noise."""
         extent = Extent.of(recording)
         on_noise = [effect for kind in ON_NOISE if (effect := kind.for_extent(extent)) is not None]
         forms = cast(dict[str, NamedEffect[Any]], forms_of(self.about))
@@ -107,29 +107,32 @@ class SimulatorApparatus:
         return forms | {effect.name: effect for effect in on_noise} | stops
 
     def proposals(self) -> dict[str, NamedEffect[Any]]:
-        """Return short formulas of columns and states."""
+        """Return by name the formulas to propose: short expressions of columns and states."""
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in proposals(self.about)})
 
     def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
-        """Return the names of the extra effects of the user's file."""
+        """Return the names of those of these effects that the user's simulator file adds."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
     def spent_refit_budget(self) -> float:
-        """Return the share of the budget of calls of `simulate`, or of integration steps, that is spent."""
+        """Return the share of the budget of calls of `simulate`, or of integration steps, that is spent.
+
+        0 if `simulate` takes all samples at once.
+        """
         caller = self.system.caller
         if caller is None:
             return self.system.tally.n_steps / STEPS_OF_A_SEARCH
         return 0.0 if caller.broadcasts else caller.n_calls / CALLS_OF_A_SEARCH
 
     def refit_budget_is_spent(self, share: float = 1.0) -> bool:
-        """Return whether this share of that budget is spent, and record that it was."""
+        """Return whether this share of that budget is spent; if so, record that the search was cut short."""
         over = self.spent_refit_budget() >= share
         tally = self.system.caller or self.system.tally
         tally.cut_short |= over
         return over
 
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
-        """Divide the prior odds among these effects."""
+        """Return the prior odds of these effects, of an unknown effect, and of none."""
         return replace(
             PriorOdds.over(effects),
             by_size=_BY_SIZE,
@@ -139,11 +142,14 @@ class SimulatorApparatus:
         )
 
     def null_forms(self, recording: Recording) -> Any:
-        """Raise an error: the only null is the simulator."""
+        """Raise NotImplementedError: the only null is the simulator."""
         raise NotImplementedError("a simulator is its own null")
 
     def covariates(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
-        """Return the covariates that vary: time, columns, level, states, change since the previous row, and runs."""
+        """Return the covariates that vary, and the predicted change since the previous row, (n_usable,).
+
+        Covariates are time or row, level, columns, states, that change, and the run.
+        """
         table = cast(RunTable, recording.plan)
         usable = np.flatnonzero(recording.usable)
         by_row = self.covariates_by_row(found.model.predict(found.z[None, :])[0])
@@ -158,12 +164,12 @@ class SimulatorApparatus:
         return out, pooled["previous"]
 
     def covariates_by_row(self, predicted: FloatArray) -> dict[str, FloatArray]:
-        """Return every covariate at each row, (n_points,), for these predictions; that of runs is last."""
+        """Return every covariate by name at each row, (n_points,), for predictions (n_points,); the run is last."""
         table, own = self.about.table, self.system.simulator
         out = {"time" if table.has_varying_time else "row": table.time_s, "level": predicted}
         out |= {name: v for name, v in table.covariates.items() if name not in (own.reading, own.noise.sd)}
         out |= {f"state:{name}": v for name, v in self.about.states.items()}
-        out["previous"] = _change_within_runs(predicted, table)
+        out["previous"] = _differences_within_runs(predicted, table)
         out["run"] = table.scan.astype(np.float64)
         return out
 
@@ -175,7 +181,10 @@ class SimulatorApparatus:
         plan: Plan,
         known: Sequence[Covariate],
     ) -> Covariate | None:
-        """Return the first of an effect's covariates that varies; None if none varies, or nothing changes."""
+        """Return the first of an effect's covariates that is known; None if none is, or nothing changes.
+
+        The values of `level` are those predicted `without` the effect.
+        """
         pooled = {c.name: c for c in known}
         name = next((name for name in effect.covariates if name in pooled), None)
         if name is None or not np.any(change):
@@ -183,11 +192,11 @@ class SimulatorApparatus:
         return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
 
     def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
-        """Return no columns: a simulator has no fine structure."""
+        """Return no columns, (n_usable, 0): a simulator has no fine structure."""
         return np.zeros((len(usable), 0))
 
     def held_out_parts(self, recording: Recording) -> Parts:
-        """Return runs as parts or, for a single run, blocks of successive rows."""
+        """Return the runs as parts to hold out in turn or, for a single run, five blocks of successive rows."""
         table, usable = cast(RunTable, recording.plan), recording.usable
         run = table.scan[usable]
         if np.sum(np.bincount(run) >= LEAST_ROWS) > 1:
@@ -199,16 +208,16 @@ class SimulatorApparatus:
     def commands(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> list[RunCommand]:
-        """List runs that could be recorded; the other arguments are not used."""
+        """List the runs that could be recorded after the table `plan`; the other arguments are not used."""
         own = self.system.simulator
-        return run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
+        return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
     as_alternatives = staticmethod(as_alternatives)
     in_sequence = staticmethod(in_sequence)
 
 
-def _change_within_runs(values: FloatArray, table: RunTable) -> FloatArray:
-    """Return the change since the previous row of the run, 0 at its first, (n_points,)."""
+def _differences_within_runs(values: FloatArray, table: RunTable) -> FloatArray:
+    """Return the change since the previous row of the run, 0 at its first row, (n_points,) -> (n_points,)."""
     out = np.zeros(len(table))
     for rows in table.rows_by_scan():
         out[rows[1:]] = np.diff(values[rows])

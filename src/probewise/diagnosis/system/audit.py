@@ -1,4 +1,4 @@
-"""Audit a table before any reading: which effects it cannot detect or tell apart, for a user's simulator."""
+"""Audit of a table before any reading: which effects on a user's simulator it can detect and tell apart."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _MOST_ROWS = 1200  # rows used; of a longer table every second, third, ...
 
 
 def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> PlanAudit:
-    """Determine for each effect whether a table can detect it and tell it from the others.
+    """Determine for each effect whether readings in the rows of a table can detect it and tell it from the others.
 
     The simulator is evaluated at the middle of its prior. If the readings there are constant, as those of a pendulum at
     rest, another point of the prior is taken, and `assumed` says so. The column of readings is not used.
@@ -44,9 +44,9 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
         If the table lacks a column that the simulator reads, or the readings are constant everywhere in the prior.
     """
     table = table_for(simulator, table)
-    own = cast(RunTable, as_recording(simulator, _without_readings(simulator, table)).plan)
+    own = cast(RunTable, as_recording(simulator, _without_reading_column(simulator, table)).plan)
     system = System.of(simulator, own)
-    z, predicted, where = _typical_point(system, own)
+    z, predicted, where = _point_where_readings_vary(system, own)
     sd, noise = _noise_sd_and_source(simulator, own, predicted)
     system = system.with_converged_step(own, system.theta(z[None, :]), tolerance=_STANDS_STILL * sd)
     about = ReferenceFit(system, own.with_columns({simulator.reading: predicted}), z, sd)
@@ -65,18 +65,22 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     laid = PlanTemplates.of_built(expected, cast(Plan, own), built, most=_SETTINGS)
     laid = replace(laid, slopes=laid.slopes[::stride], columns=laid.columns[::stride])
     found, cosines = audits_and_cosines(laid, cast(Any, names), simulator.unit)
-    effects = tuple(_with_rows(effect, reasons) for effect in found)
+    effects = tuple(_with_rows_needed(effect, reasons) for effect in found)
     assumed = f"{simulator.source or 'the simulator'} at {where}, noise {sd:.3g} {simulator.unit} ({noise})"
     words = SimulatorApparatus(about).words
     return PlanAudit(cast(Plan, own), assumed, effects, cosines, (), effects, words, _alias_classes(effects))
 
 
-def _without_readings(simulator: Simulator, table: RunTable) -> RunTable:
+def _without_reading_column(simulator: Simulator, table: RunTable) -> RunTable:
     return replace(table, columns={name: v for name, v in table.columns.items() if name != simulator.reading})
 
 
-def _typical_point(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
-    """Return a point of the prior at which readings vary, its middle if possible; the readings there; its name."""
+def _point_where_readings_vary(system: System, table: RunTable) -> tuple[FloatArray, FloatArray, str]:
+    """Return a point of the prior at which readings vary, its middle if possible.
+
+    Coordinates, (n_params,); the predicted readings, (n_points,); the point in words. Raises ParameterError if there is
+    none.
+    """
     for k, z in enumerate(system.starts):
         predicted = system.chain(table, ()).predict(system.theta(z[None, :]), table)[0]
         if np.isfinite(predicted).all() and np.ptp(predicted) > 1e-9 * max(float(np.abs(predicted).max()), 1e-300):
@@ -101,7 +105,7 @@ def _noise_sd_and_source(simulator: Simulator, table: RunTable, predicted: Float
 
 
 def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
-    """Return, for every effect of the vocabulary, the reason to give if it cannot act in this table."""
+    """Return, for every effect of the vocabulary, the reason to give if it is absent from this table's effects."""
     own, table = about.system.simulator, about.table
     nothing = "it leaves no trace here"
     timeless = "no time was recorded" if not table.has_varying_time else nothing
@@ -129,15 +133,18 @@ def _reasons_for_absence(about: ReferenceFit) -> dict[str, str]:
     return out
 
 
-def _with_rows(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
-    """Add the number of rows like these that give lambda 8 to an effect of one noise sd rms."""
+def _with_rows_needed(effect: EffectAudit, reasons: dict[str, str]) -> EffectAudit:
+    """Return an audit with the number of rows like these that give lambda 8 to an effect of one noise sd rms.
+
+    An invisible effect gets the reason for that instead.
+    """
     if effect.detectability == "invisible":
         return replace(effect, reason=effect.reason if effect.share > 0 else reasons.get(effect.name, effect.reason))
     return replace(effect, rows=math.ceil((LAMBDA / effect.share) ** 2))
 
 
 def _alias_classes(effects: Sequence[EffectAudit]) -> tuple[tuple[str, ...], ...]:
-    """Group aliased effects, directly or through others in the class."""
+    """Return groups of names of aliased effects, directly or through others of the group, sorted."""
     group = {effect.name: {effect.name} for effect in effects}
     for effect in effects:
         for name, _ in effect.alike:

@@ -1,4 +1,4 @@
-"""Runs to record next: a run repeated, reversed, slower, or with its controls moved otherwise."""
+"""Runs that could be recorded next: a run repeated, reversed, slower, or with its controls moved otherwise."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _RUN = "run"
 
 @dataclass(frozen=True, eq=False)
 class RunCommand:
-    """One run that could be recorded: its kind, a description, its rows, and its duration."""
+    """One run that could be recorded: kind, description, rows without readings (`table`), and duration in minutes."""
 
     kind: str
     description: str
@@ -34,12 +34,14 @@ class RunCommand:
 
     @property
     def plan(self) -> Plan:
-        """The rows."""
+        """The rows, as a plan."""
         return cast(Plan, self.table)
 
 
-def run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[RunCommand]:
-    """List runs that could be recorded: every recorded run again, and with its controls moved otherwise.
+def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str], time_unit: str) -> list[RunCommand]:
+    """List the runs that could be recorded: recorded runs again, and with their controls moved otherwise.
+
+    At most four recorded runs are taken, those that differ in their controls.
 
     Parameters
     ----------
@@ -55,11 +57,11 @@ def run_commands(table: RunTable, reading: str, controls: Sequence[str], time_un
     out: list[RunCommand] = []
     settable = [name for name in controls if name in table.covariates]
     ends = {name: _least_and_greatest(table.covariates[name]) for name in settable}
-    for rows in _distinct_runs(table, settable):
+    for rows in _rows_of_distinct_runs(table, settable):
         name = table.scan_names[int(table.scan[rows[0]])]
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
         of = f"run {name}" if table.run is not None else "the rows"
-        for kind, words, columns, slower in _changed_runs(table, kept, ends, of):
+        for kind, words, columns, slower in _changes_of_run(table, kept, ends, of):
             made = _planned_run(table, kept, columns, reading, f"{name} {kind}", name, slower)
             out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
     return out
@@ -69,7 +71,7 @@ Change = tuple[str, str, Mapping[str, FloatArray], float]
 """Kind, words, the columns that are set, and how many times as long the run takes."""
 
 
-def _changed_runs(
+def _changes_of_run(
     table: RunTable, rows: IntArray, ends: Mapping[str, tuple[float, float]], of: str
 ) -> Iterator[Change]:
     own = {name: table.covariates[name][rows] for name in ends}
@@ -113,22 +115,25 @@ def _planned_run(
     like: str,
     slower: float,
 ) -> RunTable:
-    """Return rows as a new run, with its controls set and without readings."""
+    """Return rows of a table as a new run after it: without readings, with `columns` set, and named `name`.
+
+    It takes `slower` times as long as the rows did, and resembles the run `like`.
+    """
     taken = table.take(rows)
     changed: dict[str, Any] = {**columns}
     if reading in table.columns:
         changed[reading] = np.full(len(rows), np.nan)
     if table.time is not None:
         time = table.time_s[rows]
-        begin = time[0] if table.time_begins_anew else _next_start(table)
+        begin = time[0] if table.time_begins_anew else _next_start_time(table)
         changed[table.time] = begin + slower * (time - time[0])
     run = table.run or unused_name(_RUN, table.columns)
     changed[run] = np.full(len(rows), name)
     return replace(taken, columns={**taken.columns, **changed}, run=run, like={name: table.like.get(like, like)})
 
 
-def _next_start(table: RunTable) -> float:
-    """Return the start of a run after a table: after the usual gap between runs, or ten rows if there is one run."""
+def _next_start_time(table: RunTable) -> float:
+    """Return the time at which a run after a table starts: after the median gap between runs, else after ten rows."""
     by_run = [table.time_s[rows] for rows in table.rows_by_scan()]
     between = [later[0] - earlier[-1] for earlier, later in itertools.pairwise(by_run)]
     gaps = np.concatenate([np.diff(time) for time in by_run])
@@ -138,26 +143,26 @@ def _next_start(table: RunTable) -> float:
 
 
 def as_alternatives(commands: Sequence[RunCommand], after: Plan) -> Plan:
-    """Concatenate alternative runs, each as if it came next, to predict all of them at once."""
+    """Concatenate alternative runs, each timed as if it came next, to predict all of them at once."""
     first, *more = (command.table for command in commands)
     return cast(Plan, append_tables(first, more))
 
 
 def in_sequence(commands: Sequence[RunCommand], after: Plan) -> Plan:
-    """Concatenate runs into a sequence: unless time restarts with each run, each begins after the one before."""
+    """Concatenate runs to be recorded in sequence: each begins after the last, unless time restarts with each run."""
     recorded = cast(RunTable, after)
     out: list[RunTable] = []
     for command in commands:
         table = command.table
         if table.time is not None and not recorded.time_begins_anew and out:
-            later = float(out[-1].time_s[-1]) + _next_start(recorded) - float(recorded.time_s.max())
+            later = float(out[-1].time_s[-1]) + _next_start_time(recorded) - float(recorded.time_s.max())
             table = table.with_columns({table.time: table.time_s - table.time_s[0] + later})
         out.append(table)
     return cast(Plan, append_tables(out[0], out[1:]))
 
 
-def _distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
-    """Return the row numbers of the first runs that differ in their controls."""
+def _rows_of_distinct_runs(table: RunTable, controls: Sequence[str]) -> list[IntArray]:
+    """Return the row numbers of the first four runs that differ in their controls, (n_rows,) each."""
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in table.rows_by_scan():
         if len(rows) >= _LEAST_ROWS:

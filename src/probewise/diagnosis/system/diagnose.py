@@ -1,4 +1,4 @@
-"""Diagnose a user's simulator against a table: fit it, scale the effects to the fit, run the diagnosis engine."""
+"""Diagnosis of a user's simulator against a table: fit it, scale the effects to the fit, run the engine."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def diagnose_system(
     source, notes
         Name of the table, and notes on it for the report.
     thorough
-        Computes the evidence of the leading hypotheses a second time: `weigh_thoroughly`, by nested sampling.
+        Function that computes the evidence of the leading hypotheses a second time, such as `weigh_thoroughly`.
     rng
         Source of randomness.
     progress
@@ -73,25 +73,26 @@ def diagnose_system(
     require_rng(rng)
     require_progress(progress)
 
-    def diagnosed(simulator: Simulator) -> Diagnosis:
+    def fit_and_diagnose(simulator: Simulator) -> Diagnosis:
         prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress)
-        told = _with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
+        told = _progress_with_call_count(progress, cast(SimulatorApparatus, prepared.apparatus).system)
         return diagnose_prepared(prepared, thorough=thorough, progress=told, rng=rng)
 
-    diagnosis = diagnosed(simulator)
-    step = _step_of_the_repair(diagnosis)
+    diagnosis = fit_and_diagnose(simulator)
+    step = _finer_step_for_repair(diagnosis)
     if step is None:
         return diagnosis
     assert simulator.law is not None
     progress(f"once more, with integration steps of {step:.3g} {simulator.time_unit}, which the repaired law needs")
-    return diagnosed(replace(simulator, law=replace(simulator.law, max_step_s=step)))
+    return fit_and_diagnose(replace(simulator, law=replace(simulator.law, max_step_s=step)))
 
 
-def _step_of_the_repair(diagnosis: Diagnosis) -> float | None:
-    """Return the integration step that the repaired law needs, or the finest within reach; None if it was used already.
+def _finer_step_for_repair(diagnosis: Diagnosis) -> float | None:
+    """Return the finer integration step that the repaired law needs, or the finest within reach.
 
-    The step was chosen for the residuals of the law without effects. The repair may leave residuals so small that the
-    integration error would dominate them.
+    None if the step used was fine enough, or the simulator has no law, or the repair no effects. The step was chosen
+    for the residuals of the law without effects. The repair may leave residuals so small that the integration error
+    would dominate them.
     """
     system = cast(SimulatorApparatus, diagnosis.apparatus).system
     model, table = diagnosis.repaired, cast(RunTable, diagnosis.recording.plan)
@@ -114,31 +115,31 @@ def prepare_system(
     source: str = "",
     notes: Sequence[str] = (),
     progress: Progress = silent,
-    bound: bool = True,
+    with_effects: bool = True,
 ) -> Prepared:
-    """Fit the simulator, and build the effects at the scales of the fit; none unless `bound`."""
+    """Fit the simulator, and build what the engine needs; effects are scaled to the fit, none unless `with_effects`."""
     recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
-    recording = without_lost_rows(system, recording)
-    recording, stop = without_stop(simulator, table, recording)
-    told = _with_call_count(progress, system)
+    recording = without_unpredictable_readings(system, recording)
+    recording, stop = without_readings_at_stop(simulator, table, recording)
+    told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
     system, found, sd = fit_system(system, recording)
     misfit = float(np.sqrt(np.mean(found.residuals**2))) / sd
     apparatus = SimulatorApparatus(ReferenceFit(system, table, found.z, sd, misfit=misfit), stop)
     begun = replace(system, first=found.z)
     told("building the effects")
-    effects = apparatus.effects(recording, begun) if bound else {}
+    effects = apparatus.effects(recording, begun) if with_effects else {}
     return Prepared(recording, effects, begun, apparatus, recording)
 
 
-def _with_call_count(progress: Progress, system: System) -> Progress:
-    """Let the progress show the number of calls of `simulate`, if the system has this function."""
+def _progress_with_call_count(progress: Progress, system: System) -> Progress:
+    """Return a progress that also shows the number of calls of `simulate`, if the system has this function."""
     return progress if system.caller is None else ProgressWithCallCount(progress, system.caller)
 
 
-def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
-    """Leave out, with a note, readings of rows whose missing columns make a prediction impossible.
+def without_unpredictable_readings(system: System, recording: RunRecording) -> RunRecording:
+    """Leave out, with a note, the readings of rows in which a missing column makes a prediction impossible.
 
     Raises
     ------
@@ -166,10 +167,15 @@ def without_lost_rows(system: System, recording: RunRecording) -> RunRecording:
     return replace(recording, readings=np.where(lost, np.nan, recording.readings), notes=(*recording.notes, note))
 
 
-def without_stop(
+def without_readings_at_stop(
     simulator: Simulator, table: RunTable, recording: RunRecording
 ) -> tuple[RunRecording, MeterStop | None]:
-    """Leave out, with a note, readings at an undeclared stop of the meter; return the rest, and the stop if any."""
+    """Leave out, with a note, readings at an undeclared stop of the meter.
+
+    Returns
+    -------
+    The recording without them, and the stop; None if there is none.
+    """
     found = find_meter_stop(as_recording(simulator, table), simulator.reading)
     if found is None:
         return recording, None
@@ -181,7 +187,10 @@ def without_stop(
 
 
 def notes_on_calls(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return notes: calls of `simulate` that failed, and parameters that it does not accept as arrays."""
+    """Return notes on a simulator's calls: a search cut short, calls that failed, parameters not taken as arrays.
+
+    () for the diagnosis of a light sensor.
+    """
     apparatus = diagnosis.apparatus
     if not isinstance(apparatus, SimulatorApparatus):
         return ()
@@ -213,12 +222,14 @@ def _notes_on_integration(tally: IntegrationTally) -> Iterator[str]:
 
 
 def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
-    """Return the predicted column as readings; the fit uses at most 2,400 of them, the simulator every row.
+    """Return a table with its predicted column as readings, of which about 2,400 are used, in stretches of six.
+
+    The simulator still predicts every row.
 
     Raises
     ------
     ParameterError
-        If the column is missing, or contains no number.
+        If the column is missing or contains no number, or if time falls within a run.
     """
     if simulator.reading not in table.columns:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
@@ -249,7 +260,7 @@ def _require_rising_time(table: RunTable) -> None:
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:
-    """Fit a system to readings, with an integration step at which predictions no longer change.
+    """Fit a system to readings, at an integration step at which predictions no longer change.
 
     Returns
     -------
@@ -258,7 +269,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     """
     table = cast(RunTable, recording.plan)
     law = white_of(recording)
-    found = _from_best_start(system, recording, law)
+    found = _fit_from_best_starts(system, recording, law)
     sd = _noise_sd_of(system.simulator, table, recording, found)
     for _ in range(4):
         finer = system.with_converged_step(table, system.theta(found.z[None, :]), tolerance=_STANDS_STILL * sd)
@@ -270,21 +281,23 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     return system, found, sd
 
 
-def _from_best_start(system: System, recording: Recording, law: NoiseLaw) -> Fit:
-    """Take a few steps from every start, then continue from the best."""
+def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -> Fit:
+    """Fit a few steps from every start, then to convergence from the best and from `_starts_from_partial_runs`."""
     model = Model(system, (), recording.plan)
-    tried = sorted(fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_finite_objective)[
-        :_BEST_STARTS
-    ]
-    longer = _fits_of_lengthened_runs(model, recording)
+    tried = sorted(
+        fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_objective_or_infinity
+    )[:_BEST_STARTS]
+    longer = _starts_from_partial_runs(model, recording)
     if not longer and all(found.settled for found in tried):
         return tried[0]
-    return min(fits(model, recording, [*(found.z for found in tried), *longer], law), key=_finite_objective)
+    return min(fits(model, recording, [*(found.z for found in tried), *longer], law), key=_objective_or_infinity)
 
 
-def _fits_of_lengthened_runs(model: Model, recording: Recording) -> list[FloatArray]:
-    """Fit the beginning of every run, then more of it: coordinates (n_params,) of the lowest fits.
+def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatArray]:
+    """Return starts of a fit, (n_params,) each: the best fits to the beginning of every run.
 
+    That is up to half of the longest run's duration, from fits up to a quarter of it. There are none without a time, or
+    if a prediction is costly.
     For an oscillating system the objective has a local minimum for every period by which a run can be wrong; over the
     first quarter of a run there are few.
     """
@@ -298,12 +311,12 @@ def _fits_of_lengthened_runs(model: Model, recording: Recording) -> list[FloatAr
         part = recording.with_readings(np.where(begun, recording.readings, np.nan))
         if part.usable.sum() < system.least_readings:
             return []
-        found = sorted(fits(model, part, starts, white_of(part), max_steps=_STEPS_TRIED), key=_finite_objective)
+        found = sorted(fits(model, part, starts, white_of(part), max_steps=_STEPS_TRIED), key=_objective_or_infinity)
         starts = [each.z for each in found[:_BEST_STARTS]]
     return starts
 
 
-def _finite_objective(found: Fit) -> float:
+def _objective_or_infinity(found: Fit) -> float:
     return found.objective if np.isfinite(found.objective) else np.inf
 
 

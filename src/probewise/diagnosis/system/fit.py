@@ -1,4 +1,4 @@
-"""Fit a user's simulator to a table: posterior and evidence, without a diagnosis."""
+"""Fit of a user's simulator to a table: posterior and evidence, without a diagnosis."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
-from probewise.diagnosis.search.noises import Noises
+from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls
 from probewise.diagnosis.search.refits import Refits
 from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.system.fitted import bound_about, fitted_system
+from probewise.diagnosis.system.fitted import fitted_system_from_samples, recorded_if_needed
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
@@ -42,7 +42,7 @@ _MOST_PARAMETERS = 24  # beyond them it would take more
 
 @dataclass(frozen=True)
 class Evidence:
-    """Log evidence (nats) and its error, 0 if unknown; its method, and the reason if that is not nested sampling."""
+    """Log evidence in nats and its standard error, 0 if unknown; the method, and why it is not nested sampling."""
 
     log_z: float
     error: float
@@ -52,7 +52,7 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class SystemFit(ShowsItself):
-    """A simulator fitted to a table.
+    """A simulator fitted to a table: posterior, evidence and predictions.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class SystemFit(ShowsItself):
     evidence
         Log evidence.
     predicted, sd
-        Mean and sd of every row's posterior prediction, (n_points,).
+        Mean and sd of every row's posterior predictive distribution, (n_points,); the sd includes the noise.
     """
 
     recording: Recording
@@ -74,12 +74,12 @@ class SystemFit(ShowsItself):
 
     @property
     def residuals(self) -> FloatArray:
-        """Recorded minus predicted, (n_points,), NaN where there is no usable reading."""
+        """Reading minus prediction, (n_points,), NaN where there is no usable reading."""
         return np.where(self.recording.usable, self.recording.readings - self.predicted, np.nan)
 
     @property
     def rms(self) -> float:
-        """Root of the mean square of the residuals."""
+        """Root mean square of the residuals."""
         return float(np.sqrt(np.nanmean(self.residuals**2)))
 
     def summary(self) -> str:
@@ -136,38 +136,40 @@ def fit_simulator(
     table = table_for(simulator, table)
     require_rng(rng)
     require_progress(progress)
-    prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, bound=False)
+    prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, with_effects=False)
     if prepared.too_little:
         found = (
             f"{len(prepared.usable)} usable readings" if len(prepared.usable) < prepared.least_readings else "all equal"
         )
         raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
-    null, noise = _null_evidence(prepared)
+    null, noise = _weighed_null(prepared)
     samples = sample_model(null.found, noise, prepared.recording, weights={}, rng=rng)
     evidence = Evidence(
-        noise.log_z + null.log_factor, 0.0, "the Laplace approximation", _reason_against_sampling(prepared)
+        noise.log_z + null.log_prior_factor, 0.0, "the Laplace approximation", _reason_against_sampling(prepared)
     )
     if not evidence.reason:
-        samples, evidence = _by_nested_sampling(prepared, null, noise, samples, evidence, rng=rng, progress=progress)
+        samples, evidence = _nested_samples_and_evidence(
+            prepared, null, noise, samples, evidence, rng=rng, progress=progress
+        )
     recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
     predicted = samples.chain.predict(samples.theta, recording.plan)
     sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2) * recording.relative_sd**2)
-    known = bound_about(cast(SimulatorApparatus, prepared.apparatus).about, samples)
-    fitted = fitted_system(system, samples, recording, predicted.mean(axis=0), known=known)
+    known = recorded_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)
+    fitted = fitted_system_from_samples(system, samples, recording, predicted.mean(axis=0), known=known)
     return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
 
 
-def _null_evidence(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
-    """Compute the evidence of the simulator alone, with white noise."""
+def _weighed_null(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
+    """Fit the simulator without effects under white noise; return the fit and its evidence."""
     prior = PriorOdds.over({})
-    noises, templates = Noises(prepared.recording, {}, prior), TemplateMemory(prepared.usable)
+    noises, templates = NoiseModels(prepared.recording, {}, prior), TemplateMemory(prepared.usable)
     state = SearchState({}, prior, noises, templates, Refits(prepared.null, noises, templates), frozenset())
     fit_nulls(state, prepared, max_order=1)
     return state.null, state.null.evidence[()]
 
 
 def _reason_against_sampling(prepared: Prepared) -> str:
-    """Return why nested sampling would take too long; "" if it would not."""
+    """Return the reason why nested sampling would take too long; "" if it would not."""
     system = cast(SimulatorApparatus, prepared.apparatus).system
     if system.n_params > _MOST_PARAMETERS:
         return f"nested sampling of {system.n_params} parameters would take too many calls"
@@ -183,7 +185,7 @@ def _most_calls(prepared: Prepared) -> int:
     return _MOST_NUMBERS // (each * len(prepared.recording))
 
 
-def _by_nested_sampling(
+def _nested_samples_and_evidence(
     prepared: Prepared,
     null: WeighedFit,
     noise: NoiseEvidence,
@@ -193,7 +195,7 @@ def _by_nested_sampling(
     rng: np.random.Generator,
     progress: Progress,
 ) -> tuple[ModelSamples, Evidence]:
-    """Compute evidence and samples by nested sampling; keep those given if the run does not end in time.
+    """Compute samples and evidence by nested sampling; return those given if the run ends with a warning.
 
     With a law, which must be integrated, nested sampling starts from a prior near the given samples, which takes far
     fewer calls.
@@ -220,22 +222,22 @@ def _by_nested_sampling(
     sigma = law.scale(law(residuals.T))
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, N_SAMPLES))
     theta = cast(Any, null.found.model.sensor).theta(z)
-    evidence = Evidence(found.log_z + null.log_factor, found.log_z_error, method)
+    evidence = Evidence(found.log_z + null.log_prior_factor, found.log_z_error, method)
     return replace(samples, theta=theta, noise_sd=noise_sd), evidence
 
 
 def _sampling_progress(progress: Progress) -> Callable[[nested.RoundSummary], None]:
-    def tell(state: nested.RoundSummary) -> None:
+    def report_round(state: nested.RoundSummary) -> None:
         to_come = state.log_ratio_remaining
         progress(
             "nested sampling", note=f"{state.n_dead} points, ln Z {state.log_z:.1f}, at most {to_come:+.1f} to come"
         )
 
-    return tell
+    return report_round
 
 
 def fit_json(fit: SystemFit) -> dict[str, Any]:
-    """Convert a fit to the content of fit.json, format "fit/1": strict JSON."""
+    """Convert a fit to the content of fit.json, format "fit/1"."""
     require_kind("fit", fit, SystemFit, "a SystemFit, as fit_simulator returns it")
     own, interval = fit.fitted, fit.fitted.interval()
     median, sd = np.median(own.samples, axis=0).tolist(), own.samples.std(axis=0).tolist()

@@ -1,4 +1,4 @@
-"""The models of a diagnosis for their files: the simulator, posterior samples, and effects."""
+"""The models of a diagnosed simulator as they are written to files: simulator, posterior samples, effects."""
 
 from __future__ import annotations
 
@@ -44,20 +44,23 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
     if not isinstance(apparatus, SimulatorApparatus):
         raise ParameterError("diagnosis", diagnosis, f"{allowed}; a light sensor's is {which}.fitted_sensor(...)")
     before = diagnosis.repair.before.readings
-    return fitted_system(
-        apparatus.system, model, diagnosis.recording, before, known=bound_about(apparatus.about, model)
+    return fitted_system_from_samples(
+        apparatus.system, model, diagnosis.recording, before, known=recorded_if_needed(apparatus.about, model)
     )
 
 
-def bound_about(about: ReferenceFit, model: ModelSamples) -> Recorded | None:
-    """Return what a model needs of the recording: the fit that set its effects' scales, and declared noise sds."""
+def recorded_if_needed(about: ReferenceFit, model: ModelSamples) -> Recorded | None:
+    """Return the recorded table with the first fit's predictions if a model's file needs them, else None.
+
+    It does if the model has effects, whose scales that fit set, or if a column holds the noise sds.
+    """
     return extract_recorded(about) if model.effects or isinstance(about.system.simulator.noise.sd, str) else None
 
 
-def fitted_system(
+def fitted_system_from_samples(
     system: System, model: ModelSamples, recording: Recording, predicted: FloatArray, *, known: Recorded | None = None
 ) -> FittedSystem:
-    """Return posterior samples of a system as the content of its file.
+    """Return posterior samples of a system with effects as a FittedSystem, which can be written to a file.
 
     Parameters
     ----------
@@ -68,7 +71,7 @@ def fitted_system(
     predicted
         Prediction for every row, (n_points,).
     known
-        The fit that set the effects' scales, if there are effects.
+        From `recorded_if_needed`.
     """
     level = predicted[recording.usable]
     return FittedSystem(

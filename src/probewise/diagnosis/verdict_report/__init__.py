@@ -1,1 +1,1 @@
-"""The `Diagnosis` value, the verdict in one sentence, and diagnosis.json."""
+"""The result of a diagnosis (`Diagnosis`), the verdict in one sentence, and diagnosis.json."""

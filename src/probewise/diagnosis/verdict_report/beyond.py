@@ -1,4 +1,4 @@
-"""Findings beyond the verdict: residuals after the repair, and a formula for an unknown effect."""
+"""Findings beyond the verdict: a significant misfit after the repair, and a formula for an unknown effect."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import numpy as np
 from probewise.diagnosis.judgement.judged import Judged
 from probewise.diagnosis.repair.best import Best
 from probewise.diagnosis.repair.samples import ModelSamples
-from probewise.diagnosis.residuals.locate import ALARM, places
+from probewise.diagnosis.residuals.locate import ALARM, significant_places
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.verdict_report.findings import ParameterFound, parameters_of
+from probewise.diagnosis.verdict_report.findings import ParameterFound, parameters_found
 from probewise.diagnosis.verdict_report.words import p_in_words
 from probewise.effects import is_out_of_vocabulary
 
@@ -20,10 +20,10 @@ _N_DRAWS = 199
 
 @dataclass(frozen=True)
 class Remainder:
-    """The residual after all named effects.
+    """A significant misfit that remains after all named effects.
 
-    `share_of_gain` is its share of the total gain in log evidence; `where` the covariate in which it is most
-    significant, or None.
+    `p_value`: of the global test of the repaired model; `share_of_gain`: the misfit's share of the total gain in log
+    evidence over the null; `where`: the covariate in which it is most significant, or None.
     """
 
     p_value: float
@@ -34,9 +34,10 @@ class Remainder:
 
 @dataclass(frozen=True)
 class Formula:
-    """A formula proposed for an unknown effect: its side, its target, and what it gains over the null.
+    """A formula proposed for an unknown effect, and what it gains over the null.
 
-    The gain is in log evidence (nats), and `heldout_log_density_per_reading` in nats per held-out reading.
+    The `expression` is added to the reading (`side` "reading") or to the rate of the state `target` ("rate").
+    `log_evidence` is the gain in nats, `heldout_log_density_per_reading` that in nats per held-out reading.
     """
 
     expression: str
@@ -48,7 +49,7 @@ class Formula:
 
 
 def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.random.Generator) -> Remainder | None:
-    """Describe the residual after the repair; None if nothing is named, or no misfit is significant."""
+    """Return the misfit that remains after the repair; None if nothing is named, or no misfit is significant."""
     p_value, names = best.improvement.p_value_after, best.fit.names
     if judged.verdict not in ("named", "cannot_tell") or not names or p_value >= ALARM:
         return None
@@ -57,9 +58,11 @@ def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.rand
     log_z = best.fit.evidence[best.noise].log_z
     more = 0.0 if value is None else max(value - log_z, 0.0)
     named = max(log_z - searched.evidences.fits[own, ()].evidence[best.noise].log_z, 0.0)
-    prepared, covariates = searched.prepared, searched.screening.covariates
+    prepared, covariates = searched.prepared, searched.misfit_templates.covariates
     draws = best.problem.draws(_N_DRAWS, rng=rng)
-    found = places(best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws)
+    found = significant_places(
+        best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws
+    )
     where = found[0].covariate if found else None
     shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate(where)}"
     share = more / (named + more) if named + more > 0 else 0.0
@@ -76,7 +79,7 @@ def formula_of(searched: Searched, judged: Judged, best: Best, samples: ModelSam
         expression = getattr(effect, "expression", "")
         if expression and is_out_of_vocabulary(effect.name):
             _, side, target, _ = effect.name.split(":", 3)
-            parameters = parameters_of(effect, samples.columns(effect.name), unit)
+            parameters = parameters_found(effect, samples.effect_samples(effect.name), unit)
             gain = best.improvement
             return Formula(
                 expression, side, target, parameters, gain.log_evidence, gain.heldout_log_density_per_reading

@@ -1,4 +1,4 @@
-"""The `Diagnosis` value: verdict, probabilities, places, repair, next measurement."""
+"""The result of a diagnosis: verdict, probabilities, places, repair, next measurement."""
 
 from __future__ import annotations
 
@@ -39,14 +39,17 @@ _MOVED = {
     "predicted_after": "repair.after.readings",
     "corrected": "repair.by_rows",
     "is_repaired": "repair.changes_predictions",
-    "left_open": "repair.left_open",
+    "left_open": "repair.combination_shares",
 }
 """Attributes of version 0.1, and their replacements."""
 
 
 @dataclass(frozen=True)
 class VerdictReport:
-    """The verdict in words and numbers: reason, effects, noise, evidences by both methods."""
+    """The verdict in words and numbers: reason, effects, noise, evidences by both methods, and what is beyond.
+
+    `remainder` and `formula` are None if there is none.
+    """
 
     reason: str
     effects: tuple[EffectFound, ...]
@@ -58,7 +61,7 @@ class VerdictReport:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis(ShowsItself):
-    """The content of diagnosis.json, and the arrays for its figures.
+    """The result of a diagnosis: the content of diagnosis.json, and the arrays for its figures.
 
     Attributes
     ----------
@@ -69,13 +72,13 @@ class Diagnosis(ShowsItself):
     repair
         The calibrated and the repaired model, and the gain.
     where
-        Places of significant residuals, strongest first.
+        Places of the repair's effects, largest first, then of other significant residuals.
     next_measurement
-        The next measurement; None if none would be informative.
+        The next measurement to make; None if none would be informative.
     report
         The verdict in words, and the numbers of effects and noise.
     apparatus
-        The apparatus that took the readings.
+        What took the readings: a light sensor, or a user's simulator over a table.
     """
 
     recording: Recording
@@ -98,7 +101,7 @@ class Diagnosis(ShowsItself):
 
     @property
     def p_value(self) -> float:
-        """p-value of the global test of the mean."""
+        """p-value of the global test of the calibrated model: small if an effect on the mean is missing."""
         return self.judged.p_value
 
     @property
@@ -113,28 +116,31 @@ class Diagnosis(ShowsItself):
 
     @property
     def effects(self) -> tuple[EffectFound, ...]:
-        """Relevant effects, most probable first."""
+        """The effects of probability above 0.001, most probable first."""
         return self.report.effects
 
     @property
     def improvement(self) -> Improvement:
-        """Gain of the repaired model."""
+        """Gain of the repaired model over the calibrated one."""
         return self.repair.improvement
 
     @property
     def null(self) -> ModelSamples:
-        """The calibrated model."""
+        """Posterior samples of the calibrated model, without effects."""
         return self.repair.null
 
     @property
     def repaired(self) -> ModelSamples:
-        """The repaired model."""
+        """Posterior samples of the repaired model."""
         return self.repair.model
 
     @property
-    def carried(self) -> tuple[tuple[str, float, str], ...]:
-        """Effects in the repaired model that no named hypothesis has: name, share of the samples, sentence."""
-        return self.repair.carried_beside({effect.name for effect in self.effects})
+    def unstated_effects(self) -> tuple[tuple[str, float, str], ...]:
+        """Effects in the repaired model that are not among `effects`: name, share of the samples, sentence."""
+        return self.repair.unstated_effects({effect.name for effect in self.effects})
+
+    carried = unstated_effects
+    """The old name of `unstated_effects`."""
 
     if not TYPE_CHECKING:
 
@@ -147,7 +153,7 @@ class Diagnosis(ShowsItself):
 
     def summary(self) -> str:
         """Describe the diagnosis in plain text."""
-        lines = [f"{self.verdict}: {self.reason}", _p_value_said(self.p_value), "probability  explanation"]
+        lines = [f"{self.verdict}: {self.reason}", _p_value_in_words(self.p_value), "probability  explanation"]
         lines += [f"  {h.probability:9.3f}  {h.label}" for h in self.hypotheses[:5] if h.probability > 1e-3]
         # The reason is not repeated.
         lines += [
@@ -168,17 +174,20 @@ class Diagnosis(ShowsItself):
         if self.repair.by_rows:
             model = self.apparatus.words.model
             lines.append(f"the unknown effect is corrected in these readings only: {model} does not contain it")
-        lines += [f"in {share:.0%} of the repaired model's samples: {sentence}" for _, share, sentence in self.carried]
-        if self.repair.left_open:
+        lines += [
+            f"in {share:.0%} of the repaired model's samples: {sentence}"
+            for _, share, sentence in self.unstated_effects
+        ]
+        if self.repair.combination_shares:
             shares = ", ".join(
-                f"{' with '.join(n) or 'no effect'} in {p:.0%}" for n, p in self.repair.left_open.items()
+                f"{' with '.join(n) or 'no effect'} in {p:.0%}" for n, p in self.repair.combination_shares.items()
             )
             lines.append(f"samples of the repaired model: {shares}")
         return "\n".join(lines)
 
 
-def _p_value_said(p_value: float) -> str:
-    """Write the p-value with its meaning."""
+def _p_value_in_words(p_value: float) -> str:
+    """Write a p-value with its meaning."""
     return f"{p_in_words(p_value)} (probability of readings at least this odd if nothing is missing from the mean)"
 
 

@@ -1,4 +1,4 @@
-"""diagnosis.json: strict JSON with the documented keys, and its schema."""
+"""The content of diagnosis.json, and its schema."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ def diagnosis_schema() -> dict[str, Any]:
 
 
 def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
-    """Convert a diagnosis to the content of diagnosis.json: finite numbers, texts, lists; relative file names.
+    """Convert a diagnosis to the content of diagnosis.json, as strict JSON allows.
 
-    The figures of places (`where`) and the next plan are named here, and written by the report and the command line.
+    The figures of places (`where`) and the next plan are given by file name, and written by the report and the command
+    line.
     """
     require_diagnosis(diagnosis)
     gain, plan = diagnosis.improvement, diagnosis.next_measurement
@@ -45,7 +46,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "probability": e.probability,
                 "size_lambda": e.size_lambda,
                 "sentence": e.sentence,
-                "parameters": [_parameter(p) for p in e.parameters],
+                "parameters": [_parameter_json(p) for p in e.parameters],
             }
             for e in diagnosis.effects
         ],
@@ -62,7 +63,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 "from": place.start,
                 "to": place.end,
                 "p_value": place.p_value,
-                "witness": place.witness,
+                "witness": place.figure_name,
             }
             for place in diagnosis.where
         ],
@@ -81,7 +82,7 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
         "noise": {
             "model": diagnosis.report.noise.model,
             "p_value": diagnosis.report.noise.p_value,
-            "parameters": [_parameter(p) for p in diagnosis.report.noise.parameters],
+            "parameters": [_parameter_json(p) for p in diagnosis.report.noise.parameters],
         },
         "next_measurement": None
         if plan is None
@@ -96,14 +97,14 @@ def diagnosis_json(diagnosis: Diagnosis) -> dict[str, Any]:
     if remainder is not None:
         document["remainder"] = asdict(remainder)
     if formula is not None:
-        document["formula"] = asdict(formula) | {"parameters": [_parameter(p) for p in formula.parameters]}
+        document["formula"] = asdict(formula) | {"parameters": [_parameter_json(p) for p in formula.parameters]}
     return document | (
         {"thorough": [_weighing_json(w) for w in diagnosis.report.weighings]} if diagnosis.report.weighings else {}
     )
 
 
 def _public_names(effects: Iterable[str]) -> list[str]:
-    """Return the public names of effects; one that occurs twice is listed twice."""
+    """Return the public names of effects, sorted; an effect that occurs twice is listed twice."""
     return sorted(map(public_name, effects))
 
 
@@ -119,7 +120,7 @@ def _weighing_json(twice: Weighing) -> dict[str, Any]:
     }
 
 
-def _parameter(found: ParameterFound) -> dict[str, Any]:
+def _parameter_json(found: ParameterFound) -> dict[str, Any]:
     return {
         "name": found.name,
         "unit": found.unit,

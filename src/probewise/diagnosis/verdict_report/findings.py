@@ -1,4 +1,4 @@
-"""The findings on each effect: probability, size, parameters, and a sentence."""
+"""The findings on each effect (probability, size, parameters, sentence), and on the noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from probewise.diagnosis.noise.law import noise_statistics, steps_within_scans
 from probewise.diagnosis.repair.best import Best
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
-from probewise.diagnosis.search.weighed_fit import WeighedFit, in_vocabulary, out_of_vocabulary
+from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
 from probewise.diagnosis.verdict_report.words import unit_in_words
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.recordings.plan import Plan
@@ -30,7 +30,7 @@ _N_DRAWS = 999
 
 @dataclass(frozen=True)
 class ParameterFound:
-    """One parameter: posterior mean, sd and central 95 % interval."""
+    """One parameter of an effect or of the noise: posterior mean, sd and central 95 % interval, in `unit`."""
 
     name: str
     unit: str
@@ -41,7 +41,7 @@ class ParameterFound:
 
 @dataclass(frozen=True)
 class EffectFound:
-    """One effect: probability, size lambda, sentence, parameters, and the scans to which it is bound."""
+    """One effect: probability, size (lambda), sentence, parameters, and the scans to which it is bound."""
 
     name: str
     probability: float
@@ -53,7 +53,7 @@ class EffectFound:
 
 @dataclass(frozen=True)
 class NoiseFound:
-    """The noise model, the p-value of its test, and its parameters."""
+    """The noise `model` ("white", or effects joined by "+"), the p-value of its test, and its parameters."""
 
     model: str
     p_value: float
@@ -68,7 +68,7 @@ def effects_found(
     *,
     rng: np.random.Generator,
 ) -> tuple[EffectFound, ...]:
-    """Return probability, size, parameters and sentence of every relevant effect of the vocabulary.
+    """Return the findings on every effect of the vocabulary with a probability above 0.001, most probable first.
 
     Parameters
     ----------
@@ -77,67 +77,69 @@ def effects_found(
     hypotheses
         All hypotheses with their probabilities.
     best, samples
-        The repair and its posterior samples, which give the numbers of its effects; those of other effects are from the
-        most probable fit that contains them.
+        The repair and its posterior samples, which give size and parameters of its effects; those of other effects are
+        from the most probable fit that contains them.
     rng
         Source of randomness.
     """
     prepared = searched.prepared
     out, plan = [], prepared.recording.plan
     unknown = sum(h.probability for h in hypotheses if h.effects == ("unknown",))
-    beside = searched.named_beside_unknown() if unknown >= _IS_UNKNOWN else {}
+    beside = searched.probabilities_given_unknown() if unknown >= _IS_UNKNOWN else {}
     unit = plan.instrumentation.unit
     for name, effect in prepared.effects.items():
         p = sum(h.probability for h in hypotheses if name in h.effects)
         if beside.get(name, 0.0) >= _STANDS_BESIDE:
             p += unknown * beside[name]
-        if p <= _LEAST_PROBABILITY or not in_vocabulary((name,)) or out_of_vocabulary((name,)):
+        if p <= _LEAST_PROBABILITY or not noise_effects_in_vocabulary((name,)) or effects_out_of_vocabulary((name,)):
             continue
-        holder, noise = (best.fit, best.noise) if name in samples.effects else _candidate_with(searched, name)
+        holder, noise = (best.fit, best.noise) if name in samples.effects else _likeliest_candidate_with(searched, name)
         if holder is None:
-            effect, values, size = _bounds_of_insignificant(searched, effect, rng=rng)
+            effect, values, size = _samples_of_insignificant(searched, effect, rng=rng)
         else:
             effect = next((e for e in holder.found.model.effects if e.name == name), effect)
             own = samples
             if name not in samples.effects:
                 evidence, weights = holder.evidence[noise], holder.weights
                 own = sample_model(holder.found, evidence, prepared.recording, weights=weights, rng=rng, annealed=False)
-            values, size = own.columns(name), _lambda_of(searched, holder, name, noise)
+            values, size = own.effect_samples(name), _lambda_of(searched, holder, name, noise)
         out.append(
             EffectFound(
                 name,
                 min(p, 1.0),
                 size,
                 effect.sentence(values.mean(axis=0), values.std(axis=0)),
-                (*parameters_of(effect, values, unit), *_scan_numbers(effect, plan)),
+                (*parameters_found(effect, values, unit), *_scan_numbers_found(effect, plan)),
                 effect.scans,
             )
         )
     return tuple(sorted(out, key=lambda e: -e.probability))
 
 
-def _candidate_with(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
-    """Return the most probable refitted candidate that contains an effect."""
+def _likeliest_candidate_with(searched: Searched, name: str) -> tuple[WeighedFit | None, Names]:
+    """Return the most probable refitted candidate that contains an effect, and its noise model; None, () if none."""
     ranked = sorted(searched.posterior.probabilities.items(), key=lambda item: -item[1])
     for (mean, noise), p in ranked:
         if p > 0 and name in (*mean, *noise):
-            candidate = searched.best(mean, noise)
+            candidate = searched.best_refit_of(mean, noise)
             if candidate is not None:
                 return candidate, noise
     return None, ()
 
 
-def _bounds_of_insignificant(
+def _samples_of_insignificant(
     searched: Searched, effect: NamedEffect[Any], *, rng: np.random.Generator
 ) -> tuple[NamedEffect[Any], FloatArray, float]:
-    """Return bounds of an insignificant effect: amplitudes by the linearised null, other parameters from the prior.
+    """Draw parameters of an effect that no refit contains: amplitudes by the linearised null, others from the prior.
 
-    The middle one of its variants is used.
+    Returns
+    -------
+    The middle one of its variants, the samples, (N_SAMPLES, n_params), and its lambda at the best amplitudes.
     """
-    null, screening = searched.null, searched.screening
+    null, misfit_templates = searched.null, searched.misfit_templates
     best = max(null.evidence.values(), key=lambda e: e.log_z)
     problem = Linearised.of(null.found, best.law)
-    templates = screening.templates.of(screening.about, effect.with_fewer_variants())
+    templates = misfit_templates.templates.of(misfit_templates.about, effect.with_fewer_variants())
     middle = len(templates.columns) // 2
     effect = templates.variant(middle)
     values = effect.prior.from_unit_cube(rng.random((N_SAMPLES, len(effect.prior.names))))
@@ -158,7 +160,11 @@ def _bounds_of_insignificant(
 
 
 def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) -> float:
-    """Return lambda: the residual norm on noise-free readings after a full refit without the effect."""
+    """Return an effect's lambda: the residual norm, in noise sds, of a refit without it to noise-free readings.
+
+    Of an effect on the noise it is the size of an effect on the mean with equal evidence; of rounding, or of a noise
+    effect that also changes the mean, the norm of the change, in noise sds.
+    """
     law = holder.evidence[noise].law
     found, prepared = holder.found, searched.prepared
     effect = prepared.effects[name]
@@ -182,7 +188,10 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
 
 
 def noise_found(searched: Searched, best: Best, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
-    """Test the repaired model's residuals for autocorrelation, heavy tails and level-dependent spread."""
+    """Describe the noise of the repaired model, and test its residuals for what the noise model lacks.
+
+    That is autocorrelation, heavy tails, or a spread that depends on the level.
+    """
     prepared, after = searched.prepared, best.problem
     steps = steps_within_scans(prepared.recording)
     own = after.residual[: after.n_points, None]
@@ -192,28 +201,31 @@ def noise_found(searched: Searched, best: Best, samples: ModelSamples, *, rng: n
     worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)
     p_value = (1 + int(np.sum(worst[1:] >= worst[0]))) / (1 + _N_DRAWS)
     unit = prepared.recording.plan.instrumentation.unit
-    parameters = [_parameter("sd", unit, samples.noise_sd)]
-    for name in in_vocabulary(best.noise):
-        parameters += parameters_of(prepared.effects[name], samples.columns(name), unit)
+    parameters = [_parameter_found("sd", unit, samples.noise_sd)]
+    for name in noise_effects_in_vocabulary(best.noise):
+        parameters += parameters_found(prepared.effects[name], samples.effect_samples(name), unit)
     return NoiseFound("+".join(best.noise) or "white", p_value, tuple(parameters))
 
 
-def parameters_of(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
-    """Describe samples of an effect's parameters, (n_samples, n_params); `unit` is that of a reading."""
+def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) -> tuple[ParameterFound, ...]:
+    """Summarise samples of an effect's parameters, (n_samples, n_params), fixed ones left out.
+
+    `unit` is that of a reading.
+    """
     fixed = getattr(effect, "fixed", ())
     return tuple(
-        _parameter(name, unit_in_words(own, unit), values[:, k])
+        _parameter_found(name, unit_in_words(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
         if name not in fixed
     )
 
 
-def _scan_numbers(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
-    """Return the numbers, from 0, of the scans to which an effect is restricted; its sentence names them."""
+def _scan_numbers_found(effect: NamedEffect[Any], plan: Plan) -> tuple[ParameterFound, ...]:
+    """Return a parameter `scans`: the numbers, from 0, of the scans to which an effect is bound; () if it is not."""
     numbers = np.flatnonzero([name in effect.scans for name in plan.scan_names]).astype(np.float64)
-    return (_parameter("scans", "scan", numbers),) if numbers.size else ()
+    return (_parameter_found("scans", "scan", numbers),) if numbers.size else ()
 
 
-def _parameter(name: str, unit: str, values: FloatArray) -> ParameterFound:
+def _parameter_found(name: str, unit: str, values: FloatArray) -> ParameterFound:
     low, high = np.quantile(values, [0.025, 0.975])
     return ParameterFound(name, unit, float(values.mean()), float(values.std()), (float(low), float(high)))

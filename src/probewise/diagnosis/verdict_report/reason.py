@@ -20,16 +20,16 @@ _WORTH_NAMING = 0.01  # least probability of a third rival
 
 @dataclass(frozen=True)
 class Grounds:
-    """The facts for the sentence, in addition to the verdict.
+    """The facts for the sentence that gives the reason, in addition to the verdict.
 
     Parameters
     ----------
     words
-        Words for the apparatus.
+        The apparatus' words.
     n_readings, least_readings
         Usable readings, and the fewest for a verdict.
     form
-        Description of the SSF of a clean sensor, "" if there is none.
+        Description of the calibrated SSF, "" if there is none.
     sentences
         Sentence on each effect, by name.
     like
@@ -39,11 +39,11 @@ class Grounds:
     beside
         Named effects beside the unknown one.
     shows_in
-        Covariates in which residuals are significant, strongest first.
+        Names of covariates in which residuals are significant, strongest first.
     p_value_after
-        p-value of the test of the repaired model.
+        p-value of the global test of the repaired model.
     settles
-        The readings to take next, in words.
+        The readings that would separate the hypotheses, in words; None if there are none.
     """
 
     words: Words
@@ -60,22 +60,28 @@ class Grounds:
 
 
 def reason_of(judged: Judged, grounds: Grounds) -> str:
-    """Return the verdict and its reason in one sentence."""
+    """Return the sentence that states the verdict and its reason."""
     if judged.too_little:
-        return _too_little(grounds)
+        return _too_little_sentence(grounds)
     if judged.withdrawn:
-        return _withdrawn(judged, grounds)
-    say = {"clean": _clean, "unknown": _unknown, "cannot_tell": _cannot_tell, "noise": _noise, "named": _named}
+        return _withdrawn_sentence(judged, grounds)
+    say = {
+        "clean": _clean_sentence,
+        "unknown": _unknown_sentence,
+        "cannot_tell": _cannot_tell_sentence,
+        "noise": _noise_sentence,
+        "named": _named_sentence,
+    }
     return say[judged.verdict](judged, grounds)
 
 
-def _withdrawn(judged: Judged, grounds: Grounds) -> str:
+def _withdrawn_sentence(judged: Judged, grounds: Grounds) -> str:
     leader, p = judged.hypotheses[0].label, p_in_words(judged.p_value)
     worse = f"predicts held-out readings far worse than {grounds.words.null} without it"
     return f"Something is missing ({p}); {leader} fits these readings best, but {worse}."
 
 
-def _too_little(grounds: Grounds) -> str:
+def _too_little_sentence(grounds: Grounds) -> str:
     n = grounds.n_readings
     if n >= grounds.least_readings:
         return f"All {n} usable readings are equal: there is no signal to diagnose; {grounds.words.find_signal}."
@@ -83,14 +89,14 @@ def _too_little(grounds: Grounds) -> str:
     return f"{has} too few for a diagnosis; {grounds.least_readings} or more are needed."
 
 
-def _clean(judged: Judged, grounds: Grounds) -> str:
+def _clean_sentence(judged: Judged, grounds: Grounds) -> str:
     form = f", {grounds.form}," if grounds.form else ""
     rare = ", which is rare; nothing that was tried explains them better" if judged.p_value < ALARM else ""
     p = p_in_words(judged.p_value)
     return f"The model{form} explains all {grounds.n_readings} readings to within their noise ({p}{rare})."
 
 
-def _unknown(judged: Judged, grounds: Grounds) -> str:
+def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
     p = p_in_words(judged.p_value)
     if grounds.like:
         like = "; ".join(grounds.like)
@@ -107,7 +113,7 @@ def _unknown(judged: Judged, grounds: Grounds) -> str:
     return f"{what} is missing ({p}) that no named effect explains{place}."
 
 
-def _cannot_tell(judged: Judged, grounds: Grounds) -> str:
+def _cannot_tell_sentence(judged: Judged, grounds: Grounds) -> str:
     rivals = [h for k, h in enumerate(judged.hypotheses[:3]) if k < 2 or h.probability >= _WORTH_NAMING]
     *others, last = (f"{h.label} ({h.probability:.2f})" for h in rivals)
     rivals_said = f"{', '.join(others)} and {last}" if others else last
@@ -115,21 +121,23 @@ def _cannot_tell(judged: Judged, grounds: Grounds) -> str:
     return f"These {grounds.n_readings} readings cannot tell apart {rivals_said}{cure}."
 
 
-def _noise(judged: Judged, grounds: Grounds) -> str:
-    return f"{_effect_sentences(judged, grounds)}; nothing is missing from the mean ({p_in_words(judged.p_value)})."
+def _noise_sentence(judged: Judged, grounds: Grounds) -> str:
+    return (
+        f"{_joined_effect_sentences(judged, grounds)}; nothing is missing from the mean ({p_in_words(judged.p_value)})."
+    )
 
 
-def _named(judged: Judged, grounds: Grounds) -> str:
+def _named_sentence(judged: Judged, grounds: Grounds) -> str:
     after = grounds.p_value_after
     more = f" Something more is missing: the repaired model has {p_in_words(after)}." if after < ALARM else ""
-    return f"{_effect_sentences(judged, grounds)} ({p_in_words(judged.p_value)}).{more}"
+    return f"{_joined_effect_sentences(judged, grounds)} ({p_in_words(judged.p_value)}).{more}"
 
 
-def _effect_sentences(judged: Judged, grounds: Grounds) -> str:
+def _joined_effect_sentences(judged: Judged, grounds: Grounds) -> str:
     said = "; ".join(grounds.sentences[name] for name in judged.combination if name in grounds.sentences)
-    return said if _is_of_a_person(said.split()[0], judged.combination) else f"{said[0].upper()}{said[1:]}"
+    return said if _is_users_own_name(said.split()[0], judged.combination) else f"{said[0].upper()}{said[1:]}"
 
 
-def _is_of_a_person(word: str, names: Iterable[str]) -> bool:
-    """Return whether a word is a user's own name, which is not changed."""
+def _is_users_own_name(word: str, names: Iterable[str]) -> bool:
+    """Return whether a word is a user's own, with an underscore or in an effect's name, and so not capitalised."""
     return "_" in word or any(word in name.split(":")[1:] for name in names)

@@ -181,17 +181,17 @@ def _search_for_shapes(
     k = null.sensor.n_params
     chain = null.chain(recording.plan, (), n_nodes=FAST_NODES)
 
-    def misfit(own: FloatArray) -> FloatArray:
+    def sums_of_squares(own: FloatArray) -> FloatArray:
         z = np.concatenate([np.zeros((len(own), k)), own], axis=1)
         predicted = chain.predict(null.theta(z), recording.plan)[:, usable]
         return np.asarray(np.sum((recording.readings[usable] - predicted) ** 2, axis=1))
 
     own = rng.standard_normal((_N_DRAWS, null.n_params - k))
-    values = misfit(own)
+    values = sums_of_squares(own)
     for shrink in 0.5 ** np.arange(_N_ROUNDS):
         elite = np.argsort(values)[:_N_ELITE]
         near = own[elite[rng.integers(_N_ELITE, size=_N_DRAWS)]]
         near = np.clip(near + 0.5 * shrink * rng.standard_normal(near.shape), -FARTHEST, FARTHEST)
-        own, values = np.concatenate([own[elite], near]), np.concatenate([values[elite], misfit(near)])
+        own, values = np.concatenate([own[elite], near]), np.concatenate([values[elite], sums_of_squares(near)])
     best = np.argsort(values)[:4]
     return float(values[best[0]]), np.concatenate([np.zeros((4, k)), own[best]], axis=1)

@@ -80,6 +80,6 @@ def test_two_names_do_not_speak_for_one_effect_without():
 )
 def test_a_name_speaks_for_bases_that_explain_no_more_and_find_nothing_beside_it(name, beside, speaks):
     unknown = UnknownEffects(None, None, (), NOISES, lambda worth: 0.0, {(1, (), ()): 0.0, (1, NAME, ()): beside})
-    unknown.prune([Held((), -50.0), Held(NAME, name)])
+    unknown.drop_superfluous([Held((), -50.0), Held(NAME, name)])
     assert ((1, (), ()) not in unknown.log_z) == speaks
     assert (1, NAME, ()) in unknown.log_z

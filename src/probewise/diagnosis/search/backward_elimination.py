@@ -24,7 +24,7 @@ def eliminate_backward(state: SearchState) -> None:
     for k, (names, left_out) in enumerate(dropped):
         state.progress("leaving effects out in turn", k, len(dropped))
         others = tuple(name for name in names if name != left_out)
-        if others not in state.refitted | state.undetected:
+        if others not in state.refitted_combinations | state.undetected:
             state.refit_stepwise(others)
         for candidate in state.candidates_of(names):
             state.refit_subset_from(candidate, left_out)

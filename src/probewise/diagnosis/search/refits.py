@@ -276,11 +276,11 @@ def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
 
 
 def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
-    def misfit(fitted: Fit) -> float:
+    def minus_log_likelihood(fitted: Fit) -> float:
         whitened = law(fitted.residuals)[:, None]
         return float(law.minus_log_likelihood(whitened, law.scale(whitened))[0])
 
-    return 2 * (misfit(beyond) - misfit(found)) > 3.0
+    return 2 * (minus_log_likelihood(beyond) - minus_log_likelihood(found)) > 3.0
 
 
 def _variants_to_refit(templates: EffectTemplates, weights: FloatArray) -> list[int]:

@@ -124,7 +124,7 @@ def search(
     progress("weighing what has no name")
     refitted = [c for c in state.candidates.values() if c.names]
     unknown.weigh(sorted(refitted, key=lambda c: -c.log_z)[:WITH_UNKNOWN])
-    unknown.prune(state.candidates.values())
+    unknown.drop_superfluous(state.candidates.values())
     return Searched(
         prepared,
         prior,
@@ -156,7 +156,7 @@ def _refit_favoured_by_screening(state: SearchState, posterior: Callable[[], Pos
     for k in range(MOST_REFITTED_LATE):
         progress("refitting what screening believes in", k, MOST_REFITTED_LATE)
         by_mean = posterior().by_mean
-        settled = {(), ("unknown",)} | state.undetected | state.refitted
+        settled = {(), ("unknown",)} | state.undetected | state.refitted_combinations
         names = max((key for key in by_mean if key not in settled), key=lambda key: by_mean[key], default=())
         if by_mean.get(names, 0.0) <= REFITTED_LATE or not names:
             return

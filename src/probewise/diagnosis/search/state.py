@@ -88,7 +88,7 @@ class SearchState:
         return max(self.nulls, key=lambda c: c.log_z)
 
     @property
-    def refitted(self) -> set[Names]:
+    def refitted_combinations(self) -> set[Names]:
         """The combinations that were refitted, at any SSF order."""
         return {names for _, names in self.candidates}
 
@@ -209,7 +209,7 @@ class SearchState:
         Screening about a fit with part of the effects is more accurate than about the null; the latter is corrected for
         refits of its parts.
         """
-        refitted = self.refitted
+        refitted = self.refitted_combinations
         out = {}
         for (names, noise), value in self.about_null.items():
             parts = [p for p in itertools.combinations(names, len(names) - 1) if p in refitted]

@@ -74,7 +74,7 @@ class UnknownEffects:
                     total = logsumexp(list(by_family.values()))
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
-    def prune(self, candidates: Collection[WeighedFit]) -> None:
+    def drop_superfluous(self, candidates: Collection[WeighedFit]) -> None:
         """Drop an unknown effect, alone or beside named ones, if one or two more named effects explain as much.
 
         No unknown effect may then be significant beside them. A basis of many columns, such as one value per scan, can

@@ -28,7 +28,7 @@ from probewise.diagnosis.search.state import SearchState
 from probewise.diagnosis.search.weighed_fit import WeighedFit
 from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.diagnosis.system.diagnose import prepare_system
-from probewise.diagnosis.system.fitted import fitted_system_from_samples, recorded_if_needed
+from probewise.diagnosis.system.fitted import fitted_system_from_samples, recorded_table_if_needed
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings.plan import Recording
@@ -154,7 +154,7 @@ def fit_simulator(
     recording, system = prepared.recording, cast(SimulatorApparatus, prepared.apparatus).system
     predicted = samples.chain.predict(samples.theta, recording.plan)
     sd = np.sqrt(predicted.var(axis=0) + np.mean(samples.noise_sd**2) * recording.relative_sd**2)
-    known = recorded_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)
+    known = recorded_table_if_needed(cast(SimulatorApparatus, prepared.apparatus).about, samples)
     fitted = fitted_system_from_samples(system, samples, recording, predicted.mean(axis=0), known=known)
     return SystemFit(recording, fitted, evidence, predicted.mean(axis=0), sd)
 

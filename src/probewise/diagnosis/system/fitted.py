@@ -45,11 +45,11 @@ def _fitted_system_of(diagnosis: Diagnosis, which: str) -> FittedSystem:
         raise ParameterError("diagnosis", diagnosis, f"{allowed}; a light sensor's is {which}.fitted_sensor(...)")
     before = diagnosis.repair.before.readings
     return fitted_system_from_samples(
-        apparatus.system, model, diagnosis.recording, before, known=recorded_if_needed(apparatus.about, model)
+        apparatus.system, model, diagnosis.recording, before, known=recorded_table_if_needed(apparatus.about, model)
     )
 
 
-def recorded_if_needed(about: ReferenceFit, model: ModelSamples) -> Recorded | None:
+def recorded_table_if_needed(about: ReferenceFit, model: ModelSamples) -> Recorded | None:
     """Return the recorded table with the first fit's predictions if a model's file needs them, else None.
 
     It does if the model has effects, whose scales that fit set, or if a column holds the noise sds.
@@ -71,7 +71,7 @@ def fitted_system_from_samples(
     predicted
         Prediction for every row, (n_points,).
     known
-        From `recorded_if_needed`.
+        From `recorded_table_if_needed`.
     """
     level = predicted[recording.usable]
     return FittedSystem(

@@ -36,14 +36,14 @@ def test_the_csv_leaves_out_what_is_not_there(results):
 
 
 def test_the_page_stands_alone_and_tells_of_failures(results):
-    page = report.write_page(results, score(results), command="probewise challenge")
+    page = report.page_html(results, score(results), command="probewise challenge")
     assert "no &lt;plan&gt;" in page
     assert page.count("data:image/png;base64,") == 2
     assert "http://" not in page
 
 
 def test_nothing_but_failures_still_makes_a_page(results):
-    assert "Cases that failed" in report.write_page(results[-1:], score(results[-1:]), command="probewise challenge")
+    assert "Cases that failed" in report.page_html(results[-1:], score(results[-1:]), command="probewise challenge")
 
 
 def test_the_matrix_writes_every_count(results):

@@ -66,7 +66,7 @@ def frames(run):
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in run.readings]
     outline = outlines(run.experiment.shape.region(TRUTH))[0]
     return [
-        exploration.frame(step, run.experiment, places[: step.number], levels=(10.0, 60.0), truth_mm=outline)
+        exploration.robot_view_png(step, run.experiment, places[: step.number], levels=(10.0, 60.0), truth_mm=outline)
         for step in run.steps
     ]
 
@@ -103,16 +103,16 @@ def test_the_next_place_is_green_in_every_frame_but_the_last_of_the_moving_pictu
 
 @pytest.mark.slow
 def test_the_page_of_a_search_names_no_colour_that_is_not_there(run, frames):
-    page = exploration.write_page(run, frames, seed=4, model="ssf")
+    page = exploration.page_html(run, frames, seed=4, model="ssf")
     assert named_but_not_there(page) == []
     for step, frame in zip(run.steps, frames, strict=True):
-        assert named_but_not_there(exploration.live_page(step, frame)) == []
-    assert "green" in exploration.live_page(run.steps[0], frames[0])
-    assert "green" not in exploration.live_page(run.last, frames[-1])
+        assert named_but_not_there(exploration.live_page_html(step, frame)) == []
+    assert "green" in exploration.live_page_html(run.steps[0], frames[0])
+    assert "green" not in exploration.live_page_html(run.last, frames[-1])
 
 
 def test_the_page_of_a_search_gives_the_shape_with_its_errors_and_what_it_cost(run, frames):
-    page = exploration.write_page(run, frames, seed=4, model="ssf", truth={"x_mm": 600.0, "y_mm": 260.0})
+    page = exploration.page_html(run, frames, seed=4, model="ssf", truth={"x_mm": 600.0, "y_mm": 260.0})
     text = re.sub("<[^>]+>", " ", page)
     found = found_shape(run)
     for parameter in found.parameters:
@@ -179,8 +179,8 @@ def test_the_page_of_a_calibration_names_what_is_there_and_prints_no_error_of_ze
     sensor = hand_made_sensor()
     found = SimpleNamespace(sensor=sensor, orders=sensor.orders, fields={1: sensor.field, 2: sensor.field})
     prediction = predict(sensor, recording.plan, recording.readings)
-    drawn = calibration_report.figures(found, recording, prediction)
-    page = calibration_report.write_page(found, recording, prediction, drawn, seed=0)
+    drawn = calibration_report.encoded_figures(found, recording, prediction)
+    page = calibration_report.page_html(found, recording, prediction, drawn, seed=0)
     assert named_but_not_there(page) == []
     text = re.sub("<[^>]+>", " ", page)
     assert not re.search(r"± 0\.?0*(?![\d.])", text)

@@ -19,7 +19,7 @@ from probewise.report.demo import HEADER, comparison_lines
 from probewise.report.paper_view import fine_entropy_map, paper_view, window_mm
 from probewise.report.plots import PAGE_IN
 from probewise.report.robot_search import RobotSearch
-from probewise.report.slides import side_by_side
+from probewise.report.slides import join_side_by_side
 from probewise.scene import Circle, HypothesisScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture
 from probewise.world import Blob, World, gaussian_spot
@@ -77,7 +77,7 @@ def picture(width, shade):
 
 
 def test_the_run_that_ended_first_stays_at_its_last_picture():
-    slides = side_by_side([picture(20, 0), picture(20, 100)], [picture(30, 200)])
+    slides = join_side_by_side([picture(20, 0), picture(20, 100)], [picture(30, 200)])
     opened = [Image.open(io.BytesIO(slide)).convert("RGB") for slide in slides]
     assert [image.size for image in opened] == [(50, 10)] * 2
     assert [(image.getpixel((0, 0))[0], image.getpixel((49, 9))[0]) for image in opened] == [(0, 200), (100, 200)]
@@ -89,7 +89,7 @@ def test_a_colour_that_few_pixels_have_survives_in_a_slide():
     tones[100:107, 50:57] = (0, 224, 138)
     out = io.BytesIO()
     Image.fromarray(tones).save(out, "PNG")
-    (slide,) = side_by_side([out.getvalue()], [picture(5, 0)])
+    (slide,) = join_side_by_side([out.getvalue()], [picture(5, 0)])
     shown = Image.open(io.BytesIO(slide)).convert("RGB").getpixel((53, 103))
     np.testing.assert_allclose(shown, (0, 224, 138), atol=16)
 
@@ -131,7 +131,7 @@ def test_the_robot_that_doubts_is_shown_beside_the_one_that_trusts(found):
     outline = np.array([600.0, 260.0]) + 90.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     truth = {"x_mm": 600.0, "y_mm": 260.0, "radius_mm": 90.0}
     searches = [RobotSearch(name, found, truth, outline, (10.0, 60.0)) for name in ("trusting", "doubting")]
-    drawn = doubt.figures(searches)
+    drawn = doubt.encoded_figures(searches)
     assert list(drawn) == ["doubt.png", "belief.png"]
     assert Image.open(io.BytesIO(drawn["doubt.png"])).width <= 110 * (PAGE_IN + 0.3)  # wider ones are shrunk on a page
     said = "".join(doubt.section(searches, drawn).body)

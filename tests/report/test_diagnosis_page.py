@@ -11,9 +11,9 @@ from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
 from probewise.report import covariate_view
 from probewise.report import diagnosis as page
-from probewise.report.covariate import axis_label, category_names, covariate_values
+from probewise.report.covariate import axis_label, category_name_by_value, covariate_values_by_place
 from probewise.report.covariate_view import is_along_line
-from probewise.report.diagnosis_figures import scan_changed_most
+from probewise.report.diagnosis_figures import rows_of_scan_changed_most
 from probewise.report.plots import gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
 from probewise.report.words import typeset
@@ -36,10 +36,10 @@ def saturated():
 
 @pytest.mark.slow
 def test_the_page_says_what_is_missing_and_what_to_do(saturated):
-    drawn = page.figures(saturated)
+    drawn = page.encoded_figures(saturated)
     assert {place.figure_name for place in saturated.where} <= set(drawn)
     audit = audit_recorded(saturated)
-    html = page.write_page(saturated, drawn, source="some.csv", seed=1, audit=audit)
+    html = page.page_html(saturated, drawn, source="some.csv", seed=1, audit=audit)
     screen, rest = html.split("<h2>", 1)
     assert "saturate" in screen
     assert "Hardly: with nothing missing" in screen
@@ -53,19 +53,19 @@ def test_the_page_says_what_is_missing_and_what_to_do(saturated):
 
 @pytest.mark.slow
 def test_every_place_has_its_covariate_row_by_row(saturated):
-    by_witness = covariate_values(saturated)
+    by_witness = covariate_values_by_place(saturated)
     assert set(by_witness) == {place.figure_name for place in saturated.where}
     for place in saturated.where:
         values = by_witness[place.figure_name]
         rows = np.isfinite(values)
         assert rows.any()
-        if place.start is not None and category_names(saturated, place) is None:
+        if place.start is not None and category_name_by_value(saturated, place) is None:
             assert values[rows].min() <= place.start <= place.end <= values[rows].max()
 
 
 @pytest.mark.slow
 def test_every_figure_is_svg_that_a_browser_can_read(saturated):
-    for name, image in page.figures(saturated).items():
+    for name, image in page.encoded_figures(saturated).items():
         assert name.endswith(".svg")
         root = ElementTree.fromstring(image)
         assert root.tag.endswith("svg")
@@ -79,7 +79,7 @@ def test_a_scan_is_shown_along_its_way_with_each_reading(saturated):
     scan, by_row = plan.scan_names[0], plan.scan[usable].astype(float)
     changed = {"covariate": "scan", "scan": scan, "start": None, "end": None, "values": by_row}
     place = dataclasses.replace(saturated.where[0], **changed, without_effect=False)
-    drawn = page.figures(dataclasses.replace(saturated, where=(place,)))
+    drawn = page.encoded_figures(dataclasses.replace(saturated, where=(place,)))
     shown = drawn[place.figure_name].decode()
     assert shown.count("<!-- one reading -->") == 2
     assert f"(mm), scan {scan}" in shown
@@ -93,7 +93,7 @@ def test_scans_that_an_effect_is_bound_to_are_named(saturated):
     )
     report = dataclasses.replace(saturated.report, effects=(effect,))
     found = dataclasses.replace(saturated, report=report)
-    html = page.write_page(found, page.figures(found), source="some.csv", seed=1)
+    html = page.page_html(found, page.encoded_figures(found), source="some.csv", seed=1)
     assert "edge_90_out, edge_90_back" in html
     assert "5.5" not in html.split("<summary>")[0].split("95 % interval")[1]
 
@@ -182,8 +182,8 @@ def test_of_many_scans_the_least_and_the_largest_gains_are_drawn():
 def test_a_repair_that_does_not_predict_is_said_not_to(saturated):
     worse = dataclasses.replace(saturated.improvement, heldout_log_density_per_reading=-1.0, heldout_sd=0.1)
     found = dataclasses.replace(saturated, repair=dataclasses.replace(saturated.repair, improvement=worse))
-    drawn = {**page.figures(saturated), "gain.svg": b"<svg"}
-    assert "Worse than before" in page.write_page(found, drawn, source="some.csv", seed=1)
+    drawn = {**page.encoded_figures(saturated), "gain.svg": b"<svg"}
+    assert "Worse than before" in page.page_html(found, drawn, source="some.csv", seed=1)
 
 
 def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_one_place_change_more():
@@ -192,10 +192,10 @@ def test_before_and_after_shows_a_scan_along_a_line_though_four_patterns_under_o
     change = np.zeros(len(plan))
     for rows, name in scans_of(plan):
         change[rows] = {"quadrants": 9.0, "edge_90_out": 0.5}.get(name, 0.1)
-    chosen = scan_changed_most(plan, change)
+    chosen = rows_of_scan_changed_most(plan, change)
     assert plan.scan_names[plan.scan[chosen[0]]] == "edge_90_out"
     alone = plan.take(next(rows for rows, name in scans_of(plan) if name == "quadrants"))
-    assert len(scan_changed_most(alone, np.ones(4))) == 4
+    assert len(rows_of_scan_changed_most(alone, np.ones(4))) == 4
     assert not is_along_line(plan, np.arange(1))
 
 
@@ -218,11 +218,13 @@ def test_places_come_as_the_headline_names_them_then_as_they_are_seen(monkeypatc
     judged = SimpleNamespace(unknown_shares={"place, smooth": 0.9})
     found = SimpleNamespace(verdict="unknown", judged=judged, where=(*where, dataclasses.replace(where[2], scan="s")))
     monkeypatch.setattr(
-        covariate_view, "covariate_values", lambda d: {place.figure_name: np.arange(3.0) for place in d.where}
+        covariate_view, "covariate_values_by_place", lambda d: {place.figure_name: np.arange(3.0) for place in d.where}
     )
     monkeypatch.setattr(covariate_view, "_views_of_place", lambda d, place, at: [place])
-    chance = SimpleNamespace(means=lambda d, view, after: SimpleNamespace(largest_in_sds=sizes[view.covariate]))
-    ordered = covariate_view.places_in_order(found, chance)
+    chance = SimpleNamespace(
+        mean_residuals=lambda d, view, after: SimpleNamespace(largest_mean_in_sds=sizes[view.covariate])
+    )
+    ordered = covariate_view.ranked_places_with_visibility(found, chance)
     assert [(place.covariate, seen) for place, seen in ordered] == [("place", True), ("time", True), ("slope", False)]
 
 

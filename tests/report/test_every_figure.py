@@ -137,9 +137,9 @@ def test_every_plot_function_is_here():
     others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "field_legend", "grid_of_axes", "png", "stack_of_axes", "svg"}
     of_a_diagnosis = {  # laid out by `svg`, and drawn by the tests of its pages
         "before_and_after",
-        "correlation_of_neighbours",
+        "residual_autocorrelation",
         "gain_by_scan",
-        "lattice_of_readings",
+        "readings_modulo_step",
         "lost_readings",
         "mean_residuals_along",
         "scan_with_residuals",

@@ -12,7 +12,7 @@ from probewise.errors import ParameterError
 from probewise.nested import NestedResult, merge, run
 from probewise.priors import Empty, Product, Uniform
 from probewise.report import plots
-from probewise.report.plots.nested import _label, _smoothed_density, _spread_ranks
+from probewise.report.plots.nested import _centres_and_smoothed_density, _new_points_per_bar, _parameter_label
 
 
 class Bell:
@@ -137,17 +137,17 @@ def test_a_parameter_that_does_not_vary_is_drawn_too(result):
 
 
 def test_names_become_labels_with_units():
-    assert _label("x_mm") == "x (mm)"
-    assert _label("semi_major_mm") == "semi major (mm)"
-    assert _label("gain_drift.tau_s") == "gain drift tau (s)"
-    assert _label("a_1") == "$a_{1}$"
-    assert _label("I_max") == r"$I_\mathrm{max}$"
-    assert _label("saturation.level") == "saturation level"
+    assert _parameter_label("x_mm") == "x (mm)"
+    assert _parameter_label("semi_major_mm") == "semi major (mm)"
+    assert _parameter_label("gain_drift.tau_s") == "gain drift tau (s)"
+    assert _parameter_label("a_1") == "$a_{1}$"
+    assert _parameter_label("I_max") == r"$I_\mathrm{max}$"
+    assert _parameter_label("saturation.level") == "saturation level"
 
 
 def test_a_flat_posterior_stays_flat_up_to_the_priors_edge():
     values = (np.arange(8000) + 0.5) / 8000
-    _, density = _smoothed_density(values, np.full(8000, 1 / 8000), (0.0, 1.0), 8000.0)
+    _, density = _centres_and_smoothed_density(values, np.full(8000, 1 / 8000), (0.0, 1.0), 8000.0)
     assert density == pytest.approx(np.full(80, 1 / 80))
 
 
@@ -170,8 +170,8 @@ def test_insertion_ranks_are_counted_against_a_band_of_all_bars(result):
 def test_ranks_are_spread_over_their_share_of_the_axis():
     """One of three ranks in two bars: the first rank in the first bar, the middle one half in each."""
     edges = np.array([0.0, 0.5, 1.0])
-    assert _spread_ranks(np.array([0]), np.array([2]), edges) == pytest.approx([1.0, 0.0])
-    assert _spread_ranks(np.array([1]), np.array([2]), edges) == pytest.approx([0.5, 0.5])
+    assert _new_points_per_bar(np.array([0]), np.array([2]), edges) == pytest.approx([1.0, 0.0])
+    assert _new_points_per_bar(np.array([1]), np.array([2]), edges) == pytest.approx([0.5, 0.5])
 
 
 def test_ranks_outside_the_band_are_marked_and_none_are_said(result):

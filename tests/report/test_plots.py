@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 
 from probewise.recordings import Recording, paper_plan, read_recording, shipped
 from probewise.report import plots
-from probewise.report.plots.readings import split_into_tracks
+from probewise.report.plots.readings import tracks_and_single_rows
 from probewise.sensor import SSFField
 
 
@@ -21,7 +21,7 @@ def blob():
 
 
 def test_the_papers_plan_has_four_lines_and_four_readings_alone():
-    found, alone = split_into_tracks(paper_plan())
+    found, alone = tracks_and_single_rows(paper_plan())
     assert [len(t.rows) for t in found] == [101] * 4
     assert [t.label for t in found] == ["0°", "90°", "180°", "270°"]
     assert len(alone) == 4

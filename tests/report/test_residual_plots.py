@@ -27,11 +27,11 @@ def drawn():
         ),
         "clouds": plots.residuals_against_covariates([("time (s)", X)], [("as calibrated", noise)], unit="V"),
         "gain": plots.gain_by_scan([("edge_0", 0.5), ("edge_90", -0.1)], 0.2, 0.05),
-        "neighbours": plots.correlation_of_neighbours(noise, scan, rho=0.3),
+        "neighbours": plots.residual_autocorrelation(noise, scan, rho=0.3),
         "spread": plots.spread_by_level(X, noise, unit="V", model_sd=np.ones(200)),
         "tails": plots.tails(noise, 1.0),
         "lost": plots.lost_readings(X, noise, X > 9.0, unit="V"),
-        "lattice": plots.lattice_of_readings(np.round(noise, 1), 0.1, unit="V"),
+        "lattice": plots.readings_modulo_step(np.round(noise, 1), 0.1, unit="V"),
     }
 
 
@@ -103,7 +103,7 @@ def test_neighbours_of_ar_1_noise_are_correlated_by_rho():
     noise = rng.standard_normal(4000)
     for k in range(1, 4000):
         noise[k] += rho * noise[k - 1]
-    ax = plots.correlation_of_neighbours(noise, np.zeros(4000, dtype=int))
+    ax = plots.residual_autocorrelation(noise, np.zeros(4000, dtype=int))
     (found,) = (line for line in ax.lines if line.get_label() == "residuals")
     # The standard error is about 1 / sqrt(4000).
     np.testing.assert_allclose(found.get_ydata()[:2], [rho, rho**2], atol=0.08)

@@ -40,7 +40,7 @@ def study():
 
 
 def test_the_page_is_whole_and_says_what_the_first_row_needs(study):
-    page = report.write_page(study, command="probewise study")
+    page = report.page_html(study, command="probewise study")
     needed = study.table()[REFERENCE].mean.value
     assert f"{needed:.1f}" in page.split("<figure>")[0]
     assert all(row.name in page for row in ROWS)
@@ -60,7 +60,7 @@ def test_the_csv_holds_every_number_and_its_bounds(study):
 def test_the_bound_stands_beside_what_was_measured(study):
     """Bits over capacity, of the rows whose robot knows its sensor."""
     least = least_readings(experiment_of(REFERENCE), rng=np.random.default_rng(0))
-    shown = str(report.table_of_bounds(study))
+    shown = str(report.lower_bound_table(study))
     assert f"{least.readings_of_search:.1f} = " in shown
     assert f"{least.readings_of_refinement:.1f} = " in shown
     assert ROWS[1].name not in shown
@@ -93,10 +93,10 @@ def test_what_rows_need_is_drawn_with_its_bounds(study):
 @pytest.mark.slow
 def test_a_page_of_one_row_has_no_empty_table_and_none_wider_than_a_page(study):
     one = Study({ROWS[1]: study.trials[ROWS[1]]}, 40)
-    page = report.write_page(one, command="probewise study --model naive")
+    page = report.page_html(one, command="probewise study --model naive")
     assert "<tbody></tbody>" not in page
     assert max(head.count("<th ") for head in page.split("<thead>")[1:]) <= 7
-    assert report.table_of_bounds(one) is None
+    assert report.lower_bound_table(one) is None
 
 
 def concealed_runs():
@@ -118,7 +118,7 @@ def test_the_page_of_concealed_faults_counts_runs_that_are_sure_and_wrong():
     assert concealed.summary_sentence(rows).startswith(
         "Sure and wrong: 3 of 6 runs where the robot trusts its sensor, 0 of 6 runs where it doubts it"
     )
-    page = concealed.write_page(rows, command="probewise study --concealed")
+    page = concealed.page_html(rows, command="probewise study --concealed")
     assert "backlash (play) of the arm, 6" in page
     assert "0.00 | 1.00" in page
 

@@ -12,7 +12,7 @@ from probewise.errors import ParameterError
 
 
 def animated_gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float = 3.0) -> bytes:
-    """Join PNGs into a GIF that loops for ever.
+    """Join PNGs into an animated GIF that loops for ever, and return its bytes.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def animated_gif(frames: Sequence[bytes], *, frame_s: float = 0.8, last_s: float
 
 
 def _common_palette(sheets: Sequence[Image.Image]) -> Image.Image:
-    """Choose 256 colours for all frames together: with a palette for each, a colour would change between frames.
+    """Return a palette image of 256 colours for all frames: with one palette each, a colour would change between them.
 
     They cover all colours, not the most frequent, so that the small square at the next place keeps its colour.
     """

@@ -29,19 +29,19 @@ def summary_sentence(audit: PlanAudit) -> str:
     return f"{said} {count(audit.extra_readings, 'more reading')} make {cured} more fine."
 
 
-def figures(audit: PlanAudit) -> dict[str, bytes]:
-    """Draw the figure of an audit: PNG by file name."""
-    return {"audit.png": png(picture(audit))}
+def encoded_figures(audit: PlanAudit) -> dict[str, bytes]:
+    """Draw the figure of an audit; return its PNG by file name."""
+    return {"audit.png": png(detectability_figure(audit))}
 
 
-def picture(audit: PlanAudit) -> AxesGrid:
-    """Draw the detectability of every effect, and which effects are aliased."""
+def detectability_figure(audit: PlanAudit) -> AxesGrid:
+    """Draw the detectability of every effect, and which effects are aliased; return the two axes, (1, 2)."""
     names, detectability = [e.name for e in audit.effects], [e.detectability for e in audit.effects]
     return audit_matrix(names, detectability, audit.cosines, alias=ALIAS)
 
 
-def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
-    """Write the whole page."""
+def page_html(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> str:
+    """Return the page's HTML; `drawn` is from `encoded_figures`, `source` names the plan."""
     shown = figure(
         drawn["audit.png"],
         "Fine: these readings detect the effect and tell it from every other. Aliased: they detect it, but another "
@@ -55,9 +55,9 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
         "nats.",
     )
     sections = [
-        Section("Effects that cannot be told apart", _alias_classes(audit))
+        Section("Effects that cannot be told apart", _alias_class_elements(audit))
         if audit.classes is not None
-        else Section(_CURED_BY, _advice(audit)),
+        else Section(_CURED_BY, _extra_readings_elements(audit)),
         Section("Every effect", (audit_table(audit.effects, audit.words.null),)),
         Section(
             "What was assumed",
@@ -82,7 +82,7 @@ def write_page(audit: PlanAudit, drawn: Mapping[str, bytes], *, source: str) -> 
     )
 
 
-def _alias_classes(audit: PlanAudit) -> tuple[Markup, ...]:
+def _alias_class_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     if not audit.classes:
         return (paragraph("These rows can tell all effects apart that they can detect."),)
     opening = "Classes of aliased effects, directly or through others in the class:"
@@ -90,7 +90,7 @@ def _alias_classes(audit: PlanAudit) -> tuple[Markup, ...]:
     return (paragraph(opening), table(("class", "effects"), rows))
 
 
-def _advice(audit: PlanAudit) -> tuple[Markup, ...]:
+def _extra_readings_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     plan = audit.cure_plan
     if plan is None:
         if all(effect.detectability == "fine" for effect in audit.effects):

@@ -34,8 +34,8 @@ _SIZES = {
 def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Markup:
     """Build the table of all effects: detectability, aliases, and the size at which each is detectable.
 
-    `of` names the model whose own parameters absorb part of an effect. Where it was computed, a column gives the number
-    of rows like these that detect an effect which changes the readings by one noise sd (rms).
+    `of` names the model whose own parameters absorb part of an effect. A further column, if computed, gives the number
+    of rows like these that are needed to detect an effect which changes the readings by one noise sd (rms).
     """
     counted = any(effect.rows is not None for effect in effects)
     rank = ("invisible", "aliased", "fine")
@@ -66,7 +66,7 @@ def audit_table(effects: Sequence[EffectAudit], of: str = "the sensor") -> Marku
 
 
 def _detectable_size_in_words(parameter: str, unit: str, amount: float | None) -> str:
-    """Write an effect's size, with its parameter's name where the unit alone is not clear."""
+    """Write the value of a parameter at which an effect is detectable; with its name if the unit does not tell."""
     name = _SIZES.get(parameter, "" if parameter == unit else parameter.removesuffix(f"_{unit}").replace("_", " "))
     value = "at no size" if amount is None else f"{amount:.2g} {_unit_in_words(unit)}"
     return f"{name} {value}".strip()

@@ -23,7 +23,7 @@ from probewise.report.plots import (
 from probewise.report.words import (
     count,
     number,
-    signed,
+    number_unsigned_zero,
     typeset,
     unit_name,
     value_and_interval,
@@ -33,7 +33,7 @@ from probewise.report.words import (
 
 
 def summary_sentence(sensor: FittedSensor) -> str:
-    """Say in one sentence what the calibration found."""
+    """Summarise in one sentence: number of Gaussians, lead in ln Z, the SSF's centre and sds, and the noise."""
     n = sensor.n_gaussians
     said = f"The evidence favours {count(n, 'Gaussian')}"
     others = sorted((o for o in sensor.orders if o.n_gaussians != n), key=lambda o: -o.log_z)
@@ -44,7 +44,8 @@ def summary_sentence(sensor: FittedSensor) -> str:
         said += f", ahead of {others[0].n_gaussians} by {with_error(lead, error)} in ln Z"
     center_x, center_y, widths = ssf_centre_and_sds(sensor)
     return (
-        f"{said}: centred at ({signed(center_x, 1)}, {signed(center_y, 1)}) mm on the sensor, "
+        f"{said}: centred at ({number_unsigned_zero(center_x, 1)}, {number_unsigned_zero(center_y, 1)}) mm "
+        "on the sensor, "
         f"{number(widths[0], 1)} by {number(widths[1], 1)} mm (sd), "
         f"noise {number(float(sensor.noise_sd.mean()), 2)} {unit_name(sensor.instrumentation.unit)} per reading."
     )
@@ -57,19 +58,19 @@ def ssf_centre_and_sds(sensor: FittedSensor) -> tuple[float, float, tuple[float,
     return float(u), float(v), (float(long), float(short))
 
 
-def figures(calibration: Calibration, recording: Recording, prediction: Prediction) -> dict[str, bytes]:
-    """Draw the figures of a calibration: PNG by file name."""
+def encoded_figures(calibration: Calibration, recording: Recording, prediction: Prediction) -> dict[str, bytes]:
+    """Draw the figures of a calibration; return their PNGs by file name."""
     return {
         "readings.png": png(readings_by_orientation(recording)),
         "predicted.png": png(predicted_against_recorded(recording, prediction.mean, prediction.sd)),
         "residuals.png": png(calibration_check(recording, prediction.mean, prediction.sd)),
         "ssf.png": png(spatial_sensitivity(calibration.sensor.field)),
-        "ssf_by_order.png": png(ssf_of_each_order(calibration)),
+        "ssf_by_order.png": png(draw_ssf_of_each_order(calibration)),
     }
 
 
-def ssf_of_each_order(calibration: Calibration) -> AxesGrid:
-    """Draw the mean SSF of each number of Gaussians, with its evidence."""
+def draw_ssf_of_each_order(calibration: Calibration) -> AxesGrid:
+    """Draw the mean SSF of each number of Gaussians, with its evidence; return the axes."""
     return ssf_by_order(
         calibration.fields,
         {o.n_gaussians: o.log_z for o in calibration.orders},
@@ -80,7 +81,7 @@ def ssf_of_each_order(calibration: Calibration) -> AxesGrid:
 def sections(
     sensor: FittedSensor, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
 ) -> list[Section]:
-    """Build the sections below the headline."""
+    """Build the page's sections below the first screen; `drawn` is from `encoded_figures`."""
     ok = recording.usable
     z = (recording.readings[ok] - prediction.mean[ok]) / prediction.sd[ok]
     return [
@@ -126,7 +127,10 @@ def sections(
             (
                 table(
                     ("parameter", "unit", "prior", "why"),
-                    ((p.parameter, _unit(p.unit), typeset(p.distribution), typeset(p.reason)) for p in sensor.priors),
+                    (
+                        (p.parameter, _unit_in_words(p.unit), typeset(p.distribution), typeset(p.reason))
+                        for p in sensor.priors
+                    ),
                 ),
             ),
         ),
@@ -147,7 +151,7 @@ def sections(
 
 
 def evidence_table(sensor: FittedSensor) -> Markup:
-    """Build the paper's table: evidence and parameters by number of Gaussians."""
+    """Build the paper's table: log evidence and number of parameters, by number of Gaussians."""
     best = max((o.log_z for o in sensor.orders), default=0.0)
     return table(
         ("Gaussians", "ln Z", "below the best", "parameters (with I_min, I_max)"),
@@ -165,11 +169,11 @@ def evidence_table(sensor: FittedSensor) -> Markup:
 
 
 def parameter_table(sensor: FittedSensor) -> Markup:
-    """Build the table of posterior medians and 95 % intervals, which are robust to single outlying samples."""
+    """Build the table of the model's parameters: posterior medians and 95 % intervals."""
     median, ends = sensor.median(), sensor.interval()
     return table(
         ("parameter", "unit", "median", "95 % interval"),
-        ((n, _unit(sensor.unit(n)), *value_and_interval(median[n], *ends[n])) for n in sensor.names),
+        ((n, _unit_in_words(sensor.unit(n)), *value_and_interval(median[n], *ends[n])) for n in sensor.names),
         caption="Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of "
         "[[A, C], [C, B]].",
     )
@@ -179,20 +183,23 @@ def ssf_table(sensor: FittedSensor) -> Markup:
     """Build the table of the SSF's centre, widths and angle: medians and 95 % intervals."""
     return table(
         ("SSF", "unit", "median", "95 % interval"),
-        ((without_unit(q.name), _unit(q.unit), *value_and_interval(q.median, *q.interval95)) for q in sensor.ssf()),
+        (
+            (without_unit(q.name), _unit_in_words(q.unit), *value_and_interval(q.median, *q.interval95))
+            for q in sensor.ssf()
+        ),
         caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "
         "and of the angle of the long axis from the x' axis, anticlockwise.",
     )
 
 
-def _unit(unit: str) -> str:
+def _unit_in_words(unit: str) -> str:
     return {"mm^-2": "mm⁻²", "1": ""}.get(unit, unit_name(unit))
 
 
-def write_page(
+def page_html(
     calibration: Calibration, recording: Recording, prediction: Prediction, drawn: Mapping[str, bytes], *, seed: int
 ) -> str:
-    """Write the whole page."""
+    """Return the page's HTML; `drawn` is from `encoded_figures`."""
     return page(
         f"Calibration of {PurePath(calibration.sensor.source).name or 'a sensor'}",
         answer=summary_sentence(calibration.sensor),

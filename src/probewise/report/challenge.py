@@ -22,7 +22,7 @@ _DECISIONS = {"met": "met", "missed": "missed", "open": "cannot decide", None: "
 
 
 def summary_sentence(rows: Sequence[Row], n_cases: int) -> str:
-    """Summarise in one sentence how many targets are met."""
+    """Summarise in one sentence how many targets are met, missed and undecided."""
     n = {kind: sum(row.decision == kind for row in rows) for kind in ("met", "missed", "open")}
     return (
         f"{count(n_cases, 'case')} of concealed physics: {count(n['met'], 'target')} met, {n['missed']} missed, "
@@ -30,8 +30,8 @@ def summary_sentence(rows: Sequence[Row], n_cases: int) -> str:
     )
 
 
-def table_of_rows(rows: Sequence[Row]) -> Markup:
-    """Build the table of targets."""
+def target_table(rows: Sequence[Row]) -> Markup:
+    """Build the table of all quantities: what was found, its 95 % interval, the target, and whether it is met."""
     header = ("what", "found", "95 % interval", "of", "target", "decision")
     return table(
         header,
@@ -50,26 +50,26 @@ def table_of_rows(rows: Sequence[Row]) -> Markup:
 
 
 def _keep_indentation(name: str) -> str:
-    """Keep the indentation of a sub-row as an em space: HTML drops plain spaces."""
+    """Write a row's name: an em space for indentation, since HTML drops plain spaces, and spaces for underscores."""
     own = name.lstrip()
     return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")
 
 
 def table_csv(rows: Sequence[Row]) -> str:
-    """Write the table as CSV; missing values are empty."""
+    """Return the table as the text of a CSV file; missing values are empty."""
     cells = []
     for row in rows:
         numbers, bounds = (row.found.value, row.found.low, row.found.high), (row.least, row.most)
         cells.append(
-            [row.name.strip(), *map(_to_csv, numbers), row.found.n, *map(_to_csv, bounds), _DECISIONS[row.decision]]
+            [row.name.strip(), *map(_csv_cell, numbers), row.found.n, *map(_csv_cell, bounds), _DECISIONS[row.decision]]
         )
     return csv_text_of_rows(["what", "found", "low", "high", "n", "target_least", "target_most", "decision"], cells)
 
 
-def write_page(results: Results, rows: Sequence[Row], *, command: str, systems: bool = False) -> str:
-    """Write the whole page from results and table `rows`; `systems`: the cases are simulators, not sensors."""
+def page_html(results: Results, rows: Sequence[Row], *, command: str, systems: bool = False) -> str:
+    """Return the page's HTML from the cases' results and their table; `systems`: cases are simulators, not sensors."""
     done = [r for r in results if "failed" not in r]
-    sections = [Section("The table", (table_of_rows(rows), _legend()))]
+    sections = [Section("The table", (target_table(rows), _table_legend()))]
     if done:
         drawn = figure(
             png(confusion_matrix(*confusion_counts(done, label=name_without_target if systems else str))),
@@ -145,7 +145,7 @@ def _case_cells(number: int, result: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _legend() -> Markup:
+def _table_legend() -> Markup:
     return paragraph(
         "A target is met or missed only where the whole 95 % interval lies on one side of it; otherwise it is "
         "undecided. "
@@ -171,6 +171,6 @@ def _target_text(row: Row) -> str:
     return f"at least {row.least:g}" if math.isinf(row.most) else f"{row.least:g} to {row.most:g}"
 
 
-def _to_csv(value: float) -> str:
+def _csv_cell(value: float) -> str:
     """Write a number as a cell of a CSV file; one that is not finite is empty."""
     return f"{value:.6g}" if math.isfinite(value) else ""

@@ -13,28 +13,30 @@ from probewise.study import ConcealedRow
 
 def summary_sentence(rows: Sequence[ConcealedRow]) -> str:
     """Summarise in one sentence how many runs ended sure and wrong, with full trust in the sensor and with less."""
-    wrong = {doubts: _wrong_count([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)}
+    wrong = {
+        doubts: _sure_and_wrong_text([row for row in rows if (row.trust < 1) == doubts]) for doubts in (True, False)
+    }
     return (
         f"Sure and wrong: {wrong[False]} where the robot trusts its sensor, {wrong[True]} where it doubts it, "
         "on the same circles with the same noise."
     )
 
 
-def write_page(rows: Sequence[ConcealedRow], *, command: str) -> str:
-    """Write the whole page; `command` is what made it."""
+def page_html(rows: Sequence[ConcealedRow], *, command: str) -> str:
+    """Return the page's HTML; `command` is the command line that made it."""
     drawn = figure(
         png(doubt_against_trust(rows)),
         "Each row conceals one effect from an otherwise exact sensor model; bars are 95 % intervals. Sure and wrong: "
         "the robot has ended its search with a length off by more than 12 mm. Dashed: what the intervals promise.",
     )
     sections = [
-        Section("The table", (_comparison_table(rows), _legend())),
+        Section("The table", (_comparison_table(rows), _table_legend())),
         Section("How it was made", (definition_list([("command", command)]),)),
     ]
     return page("A robot with a concealed fault", answer=summary_sentence(rows), key_figure=drawn, sections=sections)
 
 
-def _wrong_count(rows: Sequence[ConcealedRow]) -> str:
+def _sure_and_wrong_text(rows: Sequence[ConcealedRow]) -> str:
     """Write how many of all runs ended sure and wrong, as in "3 of 40 runs"."""
     n_wrong = sum(round(row.sure_and_wrong.value * row.runs) for row in rows)
     return f"{n_wrong} of {count(sum(row.runs for row in rows), 'run')}"
@@ -75,7 +77,7 @@ def _comparison_table(rows: Sequence[ConcealedRow]) -> Markup:
     )
 
 
-def _legend() -> Markup:
+def _table_legend() -> Markup:
     return paragraph(
         "Before the bar: the robot doubts its sensor; after it: it trusts it. Noticed: something left out is the most "
         "probable, or the readings do not fit. In the credible set: what is concealed is among the fewest explanations "

@@ -1,4 +1,4 @@
-"""Covariates of a diagnosis: their labels, units and values, one per reading."""
+"""Covariates of a diagnosis: their names in words, units, and values, one per reading."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ WORDS = {
 
 
 def covariate_words(name: str) -> str:
-    """Name a covariate in words."""
+    """Return a covariate's name in words, without its unit: "battery" for battery_mv."""
     stem, _, suffix = name.rpartition("_")
     return WORDS.get(name, (stem if stem and suffix in SUFFIXES else name).replace("_", " "))
 
 
 def family_words(family: str) -> str:
-    """Name a family of free-form terms: a covariate, over all scans or within each, and the form of the dependence."""
+    """Return the name in words of a family of free-form terms: covariate, "scan by scan" if within scans, and form."""
     name, _, how = family.partition(", ")
     stem = name.removesuffix(" within scans")
     said = covariate_words(stem) + (", scan by scan" if stem != name else "")
@@ -52,18 +52,19 @@ def covariate_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]
 
 
 def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:
-    """Return an axis label: the covariate and its unit."""
+    """Return an axis label: the covariate, the scan if one is given, and the unit."""
     said, unit = covariate_words_and_unit(diagnosis, name)
     run = diagnosis.apparatus.words.run
     said += f", {run} {scan}" if scan is not None and name != run else ""
     return said + (f" ({unit_name(unit)})" if unit else "")
 
 
-def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
-    """Return the covariate of each place in `diagnosis.where`, (n_points,), by the name of the place's figure.
+def covariate_values_by_place(diagnosis: Diagnosis) -> dict[str, FloatArray]:
+    """Return for each place in `diagnosis.where` the values of its covariate, (n_points,), by the name of its figure.
 
-    Rows that a place does not cover are NaN. The values are those by which the diagnosis found the place. If they
-    were recomputed from another estimate of the sensor, a slope near an interval's end could fall on its other side.
+    A value is NaN in rows that the place does not cover. The values are those by which the diagnosis found the place.
+    If they were recomputed from another estimate of the sensor, a slope near an interval's end could fall on its other
+    side.
     """
     usable, out = np.flatnonzero(diagnosis.recording.usable), {}
     for place in diagnosis.where:
@@ -73,8 +74,8 @@ def covariate_values(diagnosis: Diagnosis) -> dict[str, FloatArray]:
     return out
 
 
-def category_names(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
-    """Return the names of a categorical covariate's values (scans, directions, orientations), else None."""
+def category_name_by_value(diagnosis: Diagnosis, place: Place) -> dict[float, str] | None:
+    """Return the name of each value of a categorical covariate (scan, direction, up to 24 orientations), else None."""
     match place.covariate:
         case "scan" | "run":
             return {float(k): name for k, name in enumerate(diagnosis.recording.plan.scan_names)}

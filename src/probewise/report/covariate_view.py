@@ -11,7 +11,12 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import ALARM, Diagnosis, Place
 from probewise.effects import UNNAMED, public_name
 from probewise.recordings import Plan
-from probewise.report.covariate import axis_label, category_names, covariate_values, covariate_words_and_unit
+from probewise.report.covariate import (
+    axis_label,
+    category_name_by_value,
+    covariate_values_by_place,
+    covariate_words_and_unit,
+)
 from probewise.report.residual_means import ResidualMeans, mean_residuals
 from probewise.report.words import unit_name
 from probewise.systems import RunTable
@@ -39,8 +44,8 @@ class CovariateView:
     place: Place | None = None
 
     @property
-    def shown_names(self) -> list[str] | None:
-        """Names in the order in which they are drawn."""
+    def category_names_on_axis(self) -> list[str] | None:
+        """Names of a categorical covariate's values in the order of the axis; None for other covariates."""
         return None if self.names is None else [self.names[v] for v in _distinct_values(self.at)]
 
 
@@ -57,8 +62,8 @@ class ResidualNoise:
     absorbed: FloatArray | None
 
     @classmethod
-    def of(cls, diagnosis: Diagnosis) -> ResidualNoise:
-        """Build from the noise model of a diagnosis."""
+    def of_diagnosis(cls, diagnosis: Diagnosis) -> ResidualNoise:
+        """Take the sds, the correlation and the posterior predictions from a diagnosis."""
         found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
         sd = np.full(len(diagnosis.recording), float(diagnosis.repaired.noise_sd.mean()))
         if "ratio" in found:
@@ -69,8 +74,8 @@ class ResidualNoise:
         theta = null.theta[:: max(1, len(null.theta) // _N_SAMPLES)]
         return cls(sd, found.get("rho", 0.0), null.chain.predict(theta, diagnosis.recording.plan))
 
-    def means(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
-        """Average the residuals of a diagnosis along a covariate."""
+    def mean_residuals(self, diagnosis: Diagnosis, view: CovariateView, *, after: bool) -> ResidualMeans:
+        """Average residuals in bins of a covariate; with `after`, also those of the repaired model."""
         return mean_residuals(
             view.at,
             diagnosis.repair.before.residuals,
@@ -89,34 +94,37 @@ def choose_first_view(diagnosis: Diagnosis, chance: ResidualNoise) -> CovariateV
 
     If there is none, the candidate with the largest mean in sds; without candidates, the predicted reading.
 
-    Candidates in order: a named wave, folded at its period; the places; for an unknown effect, its most likely
-    covariate; last, the change that the repair makes.
+    Candidates in order: a named wave, folded at its period; the places, those whose covariate an unknown effect most
+    probably depends on first; last, the change that the repair makes.
     """
-    values = covariate_values(diagnosis)
+    values = covariate_values_by_place(diagnosis)
     alarming = [place for place in diagnosis.where if diagnosis.verdict != "clean" or place.p_value < ALARM]
-    places = sorted(alarming, key=lambda place: -_probability_of_dependence(diagnosis, place))
+    places = sorted(alarming, key=lambda place: -_probability_unknown_depends_on(diagnosis, place))
     found = _views_at_period(diagnosis)
     for place in places:
         found += _views_of_place(diagnosis, place, values[place.figure_name])
     if diagnosis.repair.changes_predictions and diagnosis.verdict != "clean":
-        found.append(_view_by_change(diagnosis))
+        found.append(_view_along_repair_change(diagnosis))
     if not found:
         return CovariateView(np.array(diagnosis.repair.before.readings), axis_label(diagnosis, "level"))
-    sizes = [chance.means(diagnosis, view, after=False).largest_in_sds for view in found]
+    sizes = [chance.mean_residuals(diagnosis, view, after=False).largest_mean_in_sds for view in found]
     return next((w for w, size in zip(found, sizes, strict=True) if size >= _SEEN), found[int(np.argmax(sizes))])
 
 
-def places_in_order(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
+def ranked_places_with_visibility(diagnosis: Diagnosis, chance: ResidualNoise) -> list[tuple[Place, bool]]:
     """Order the places for the report, each with whether a mean leaves the band of chance.
 
-    First the covariate of the unknown effect, which the headline names; then visible places; then the others.
+    First the covariate of the unknown effect, which the headline names; then visible places; then the others. Of places
+    that are the same interval, one is kept.
     """
-    values, seen = covariate_values(diagnosis), {}
+    values, seen = covariate_values_by_place(diagnosis), {}
     for place in diagnosis.where:
         views = _views_of_place(diagnosis, place, values[place.figure_name])
-        seen[place.figure_name] = any(chance.means(diagnosis, w, after=False).largest_in_sds >= _SEEN for w in views)
+        seen[place.figure_name] = any(
+            chance.mean_residuals(diagnosis, w, after=False).largest_mean_in_sds >= _SEEN for w in views
+        )
     ordered = sorted(
-        diagnosis.where, key=lambda p: (-_probability_of_dependence(diagnosis, p), not seen[p.figure_name])
+        diagnosis.where, key=lambda p: (-_probability_unknown_depends_on(diagnosis, p), not seen[p.figure_name])
     )
     shown: list[Place] = []
     for place in ordered:  # with one scan, a place in all scans and one in that scan are the same
@@ -133,7 +141,7 @@ def _is_same_interval(values: Mapping[str, FloatArray], place: Place, other: Pla
 
 
 def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
-    """List the views of a place: along its scan's path, if it has one; then along its covariate `at`, (n_points,)."""
+    """List the views of a place: along the scan's path, if it is a scan; then along its covariate `at`, (n_points,)."""
     by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]
@@ -141,17 +149,17 @@ def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[
 
 
 def view_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> CovariateView:
-    """Build the view of a place along its covariate, (n_points,)."""
+    """Build the view of a place along its covariate, whose values are `at`, (n_points,)."""
     unit = diagnosis.recording.plan.instrumentation.unit
     label = axis_label(diagnosis, place.covariate, place.scan)
     if place.without_effect:
         label = f"reading to be expected without it ({unit_name(unit)})"
-    names = category_names(diagnosis, place)
+    names = category_name_by_value(diagnosis, place)
     return CovariateView(at, label, names, _shaded_interval(place, at, names), place)
 
 
 def view_along_scan(diagnosis: Diagnosis, scan: str, place: Place | None = None) -> CovariateView:
-    """Build the view of one scan along its path.
+    """Build the view of one scan along X or Y; along time where it is no line; of one run along its time or rows.
 
     It shows residuals that change sign within the scan, whose mean over the scan is zero.
     """
@@ -182,7 +190,7 @@ def is_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
     return bool(across <= _ASTRAY * widest)
 
 
-def _probability_of_dependence(diagnosis: Diagnosis, place: Place) -> float:
+def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float:
     """Return the probability that the unknown effect depends on a place's covariate; 0 where the effect is named."""
     shares = diagnosis.judged.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
@@ -192,14 +200,14 @@ def _probability_of_dependence(diagnosis: Diagnosis, place: Place) -> float:
 
 
 def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
-    """Fold time, or X, at the period of a named wave."""
+    """List views in which time, X, or a table's column is folded at the period of a named wave."""
     plan, out = diagnosis.recording.plan, []
     for effect in diagnosis.effects:
         found = {p.name: p.mean for p in effect.parameters}
         if effect.name not in diagnosis.combination:
             continue
         if isinstance(plan, RunTable):
-            out += _waves_of_table(diagnosis, plan, effect.name, found)
+            out += _covariates_to_fold(diagnosis, plan, effect.name, found)
             continue
         if found.get("alias_hz", 0.0) > 0:
             out.append((plan.time_s, 1 / found["alias_hz"], "time", "s"))
@@ -214,10 +222,10 @@ def _views_at_period(diagnosis: Diagnosis) -> list[CovariateView]:
     ]
 
 
-def _waves_of_table(
+def _covariates_to_fold(
     diagnosis: Diagnosis, table: RunTable, effect: str, found: Mapping[str, float]
 ) -> list[tuple[FloatArray, float, str, str]]:
-    """Return what to fold for an effect on a table: values (n_points,), period, name and unit; an empty list if none.
+    """List the covariates to fold for an effect on a table: values (n_points,), period, name and unit.
 
     A wave in time folds the time; a column's periodic error folds that column.
     """
@@ -227,7 +235,7 @@ def _waves_of_table(
     return [(table.covariates[column], found["period"], column, "")] if found.get("period", 0.0) > 0 else []
 
 
-def _view_by_change(diagnosis: Diagnosis) -> CovariateView:
+def _view_along_repair_change(diagnosis: Diagnosis) -> CovariateView:
     unit = unit_name(diagnosis.recording.plan.instrumentation.unit)
     return CovariateView(
         diagnosis.repair.after.readings - diagnosis.repair.before.readings, f"change that the repair makes ({unit})"

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from probewise._arrays import FloatArray
 from probewise.arm import Geometry
 from probewise.calibration import Calibration
 from probewise.diagnosis import Diagnosis
@@ -42,7 +41,7 @@ from probewise.report.plots import (
     sensor_orientations,
 )
 from probewise.report.robot_search import RobotSearch
-from probewise.report.slides import side_by_side
+from probewise.report.slides import join_side_by_side
 from probewise.report.words import count, number, typeset
 
 FIRST = 3  # as in the paper's figure
@@ -77,14 +76,14 @@ def equal_readings_text(searches: Sequence[RobotSearch]) -> str:
     """Compare in a sentence both robots' widest posterior sds after as many readings as the SSF robot needed."""
     naive, ssf = searches
     n = len(ssf.run.steps)
-    widest = naive.run.steps[naive.step_at(n) - 1].largest_sd_mm
+    widest = naive.run.steps[naive.step_number_after(n) - 1].largest_sd_mm
     return (
         f"After {count(n, 'reading')} each, the naive robot knows the circle to {number(widest, 1)} mm, the other "
         f"to {number(ssf.run.last.largest_sd_mm, 1)} mm (widest posterior sd)."
     )
 
 
-def main_findings(
+def main_findings_by_key(
     started_alike: Sequence[RobotSearch],
     diagnosis: Diagnosis,
     doubt: Sequence[RobotSearch],
@@ -92,7 +91,7 @@ def main_findings(
     concealed: str,
     seed: int,
 ) -> dict[str, str | int]:
-    """Return the page's main findings, for other pages to quote."""
+    """Return the page's main findings by key: seed, sentences, verdict and effects, for other pages to quote."""
     return {
         "seed": seed,
         "search": summary_sentence(started_alike),
@@ -107,12 +106,12 @@ def main_findings(
 
 
 def comparison_rows(searches: Sequence[RobotSearch]) -> list[tuple[str, ...]]:
-    """Return the comparison's rows: readings, information and errors, one row per search."""
+    """Return the comparison's cells, in the order of `HEADER`, one row per search."""
     return [
         (
             s.model,
             str(len(s.run.steps)),
-            str(s.first_white),
+            str(s.readings_until_first_white),
             number(s.run.last.bits, 1),
             number(s.run.bits_per_reading, 2),
             number(s.run.paper_bits_per_reading, 2),
@@ -137,7 +136,7 @@ def comparison_table(searches: Sequence[RobotSearch], caption: str = "") -> Mark
     )
 
 
-def figures(
+def encoded_figures(
     calibration: Calibration,
     recording: Recording,
     *,
@@ -146,7 +145,7 @@ def figures(
     started_alike: Sequence[RobotSearch],
     geometry: Geometry,
 ) -> dict[str, bytes]:
-    """Draw all figures but the diagnosis's: PNG by file name.
+    """Draw all figures but the diagnosis's; return their PNGs by file name.
 
     Parameters
     ----------
@@ -159,14 +158,14 @@ def figures(
     geometry
         Of the arm.
     """
-    drawn = calibration_report.figures(calibration, recording, prediction)
+    drawn = calibration_report.encoded_figures(calibration, recording, prediction)
     hidden = started_alike[0].truth_mm
-    drawn["arm.png"] = png(arm_and_sensor(geometry, _edge_point(hidden), outline_mm=hidden))
+    drawn["arm.png"] = png(arm_and_sensor(geometry, (float(hidden[0, 0]), float(hidden[0, 1])), outline_mm=hidden))
     drawn["orientations.png"] = png(sensor_orientations(recording))
     drawn["quadrants.png"] = png(quadrant_patterns(recording))
     n_first = [k for k in range(1, FIRST + 1) if all(k < len(s.run.steps) for s in started_alike)]
-    drawn["first_three.png"] = png(_draw_views(started_alike, n_first))
-    drawn["equal_readings.png"] = png(_draw_views(started_alike, [len(started_alike[-1].run.steps)]))
+    drawn["first_three.png"] = png(_draw_paper_views(started_alike, n_first))
+    drawn["equal_readings.png"] = png(_draw_paper_views(started_alike, [len(started_alike[-1].run.steps)]))
     names = [f"{s.model} model" for s in searches]
     axes = grid_of_axes(1, 2, size_in=(10.0, 3.6))
     posterior_widths(
@@ -182,8 +181,8 @@ def figures(
     return drawn
 
 
-def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw the diagnosis figures of the page: PNG by file name."""
+def encoded_diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
+    """Draw the figures of the page's section on the diagnosis; return their PNGs by file name."""
     likely = [h for h in diagnosis.hypotheses if h.probability > _LIKELY]
     labels = [h.label.replace("+", " + ") for h in likely]
     recording, before, after = diagnosis.recording, diagnosis.repair.before.readings, diagnosis.repair.after.readings
@@ -199,21 +198,15 @@ def diagnosis_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
     return drawn
 
 
-def _edge_point(outline_mm: FloatArray) -> tuple[float, float]:
-    """Choose a point of an outline at which to draw the arm."""
-    x_mm, y_mm = outline_mm[0]
-    return float(x_mm), float(y_mm)
-
-
-def _draw_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
-    """Draw the paper's view after each of these numbers of readings, one column per search."""
+def _draw_paper_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> AxesGrid:
+    """Draw the paper's view after each of these numbers of readings, one row each, one column per search."""
     window = window_mm([s.run for s in searches], numbers[0])
     across, up = window[1] - window[0], window[3] - window[2]
     size = (5.0 * len(searches), (1.2 + 3.9 * up / across) * len(numbers))
     axes = grid_of_axes(len(numbers), len(searches), size_in=size)
     for row, n in zip(axes, numbers, strict=True):
         for ax, search in zip(row, searches, strict=True):
-            k = search.step_at(n)
+            k = search.step_number_after(n)
             step = search.run.steps[k - 1]
             title = f"{search.model} model, {count(k, 'reading')}: known to {number(step.largest_sd_mm, 1)} mm"
             paper_view(
@@ -222,7 +215,7 @@ def _draw_views(searches: Sequence[RobotSearch], numbers: Sequence[int]) -> Axes
     return axes
 
 
-def write_page(
+def page_html(
     calibration: Calibration,
     recording: Recording,
     *,
@@ -237,12 +230,12 @@ def write_page(
     seed: int,
     seconds: float,
 ) -> str:
-    """Write the whole page.
+    """Return the page's HTML.
 
     Parameters
     ----------
     calibration, recording, prediction, searches, started_alike
-        See `figures`.
+        See `encoded_figures`.
     frames
         PNG of each step of each search.
     diagnosis
@@ -250,11 +243,11 @@ def write_page(
     doubt
         The search of the robot that trusts its sensor model, and of the one that doubts it.
     drawn
-        From `figures`, `diagnosis_figures` and `report.doubt.figures`.
+        From `encoded_figures`, `encoded_diagnosis_figures` and `report.doubt.encoded_figures`.
     concealed
-        Effect that the simulated world concealed in the second recording.
+        Name of the effect that the simulated world concealed in the second recording.
     seed, seconds
-        Of this run.
+        Seed and duration of this run.
     """
     sections = [
         _sensor_section(calibration, recording, prediction, drawn, seed),
@@ -358,8 +351,8 @@ def _search_section(
     n_slides = max(len(s.run.steps) for s in searches)
     texts = [
         "; ".join(
-            f"{s.model} model, {count(k := s.step_at(n), 'reading')}: {number(s.run.steps[k - 1].largest_sd_mm, 1)} mm"
-            + (" (ended)" if n > len(s.run.steps) else "")
+            f"{s.model} model, {count(k := s.step_number_after(n), 'reading')}: "
+            f"{number(s.run.steps[k - 1].largest_sd_mm, 1)} mm" + (" (ended)" if n > len(s.run.steps) else "")
             for s in searches
         )
         for n in range(1, n_slides + 1)
@@ -369,13 +362,13 @@ def _search_section(
         (
             paragraph(
                 f"From an empty field, finding the circle at all takes luck, whatever the model: the naive robot met "
-                f"it at "
-                f"reading {naive.first_white} of {len(naive.run.steps)}, the SSF robot at reading {ssf.first_white} of "
-                f"{len(ssf.run.steps)}. These robots choose by the default rule: the expected information of a reading "
-                f"or, near the end, the probability that it ends the run. The colour bar names the one shown."
+                f"it at reading {naive.readings_until_first_white} of {len(naive.run.steps)}, the SSF robot at "
+                f"reading {ssf.readings_until_first_white} of {len(ssf.run.steps)}. These robots choose by "
+                f"the default rule: the expected information of a reading or, near the end, the probability that it "
+                f"ends the run. The colour bar names the one shown."
             ),
             slideshow(
-                list(zip(side_by_side(*frames), texts, strict=True)),
+                list(zip(join_side_by_side(*frames), texts, strict=True)),
                 "Each step of both searches; the length below the picture is the widest posterior sd.",
             ),
             figure(

@@ -24,13 +24,13 @@ from probewise.diagnosis.system.apparatus import SimulatorApparatus
 from probewise.effects.vocabulary import value_with_sd
 from probewise.report.audit_table import audit_table
 from probewise.report.covariate import covariate_words_and_unit, family_words
-from probewise.report.covariate_view import ResidualNoise, places_in_order
-from probewise.report.diagnosis_figures import figures, first_figure_content
+from probewise.report.covariate_view import ResidualNoise, ranked_places_with_visibility
+from probewise.report.diagnosis_figures import encoded_figures, first_figure_content
 from probewise.report.effect_words import (
     EFFECTS_IN_WORDS,
+    effect_has_words,
     effect_in_words,
     hypothesis_in_words,
-    is_in_words,
     join_names,
 )
 from probewise.report.headline import headline
@@ -38,7 +38,7 @@ from probewise.report.html import Markup, Section, definition_list, element, fig
 from probewise.report.terms import explain_new_terms, with_explanations
 from probewise.report.words import count, number, probability, typeset, unit_name
 
-__all__ = ["figures", "sections", "summary_sentence", "write_page"]
+__all__ = ["encoded_figures", "page_html", "sections", "summary_sentence"]
 
 _MOST_ALIASES = 8
 _MOST_PLACES = 3
@@ -63,13 +63,13 @@ def summary_sentence(diagnosis: Diagnosis) -> str:
 
 
 def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
-    """Build the sections below the first screen."""
+    """Build the page's sections below the first screen; `drawn` is from `encoded_figures`."""
     return [
         Section("What it could be", _explanation_elements(diagnosis)),
-        Section("Where it shows", _place_figures(diagnosis, drawn)),
+        Section("Where it shows", _place_elements(diagnosis, drawn)),
         Section(
             "Before and after the repair" if diagnosis.repair.changes_predictions else "The model",
-            _before_and_after_figures(diagnosis, drawn),
+            _before_and_after_elements(diagnosis, drawn),
         ),
         Section("Does the repaired model predict held-out readings?", _gain_elements(diagnosis, drawn)),
         Section("Aliased effects, and what would separate them", _alias_elements(diagnosis)),
@@ -77,10 +77,10 @@ def sections(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> list[Section]:
     ]
 
 
-def write_page(
+def page_html(
     diagnosis: Diagnosis, drawn: Mapping[str, bytes], *, source: str, seed: int, audit: PlanAudit | None = None
 ) -> str:
-    """Write the whole page; `audit`, if given, is the audit of the recording's plan."""
+    """Return the page's HTML; `drawn` is from `encoded_figures`, `audit` the audit of the recording's plan, if any."""
     run = Section(
         "This run",
         (
@@ -95,9 +95,11 @@ def write_page(
             *(paragraph(f"Note: {note}.") for note in (*diagnosis.recording.notes, *notes_on_calls(diagnosis))),
         ),
     )
-    design = () if audit is None else (Section("What these readings could have shown", _design_elements(audit)),)
+    design = () if audit is None else (Section("What these readings could have shown", _audit_elements(audit)),)
     known: set[str] = set()
-    first = fragment(figure(drawn["first.svg"], _first_caption(diagnosis)), definition_list(_facts(diagnosis)))
+    first = fragment(
+        figure(drawn["first.svg"], _first_figure_caption(diagnosis)), definition_list(_questions_and_answers(diagnosis))
+    )
     return page(
         f"Diagnosis of {source}: {diagnosis.verdict.replace('_', ' ')}",
         answer=summary_sentence(diagnosis),
@@ -106,7 +108,7 @@ def write_page(
     )
 
 
-def _first_caption(diagnosis: Diagnosis) -> str:
+def _first_figure_caption(diagnosis: Diagnosis) -> str:
     shown = first_figure_content(diagnosis)
     bars = "Below: the possible explanations with their probabilities."
     if shown == "readings":
@@ -114,14 +116,14 @@ def _first_caption(diagnosis: Diagnosis) -> str:
     if isinstance(shown, str):
         return f"{_NOISE_CAPTIONS.get(shown, _NOISE_CAPTIONS['signal_dependent_noise'])} {bars}"
     after = ", blue squares the repaired model" if diagnosis.repair.changes_predictions else ""
-    where = f" {_place_words(diagnosis, shown.place)}" if shown.place else ""
+    where = f" {_place_caption(diagnosis, shown.place)}" if shown.place else ""
     circles = f"Orange circles: the model as calibrated{after}."
     band = "By chance alone, 95 % of the means would lie in the grey band."
     return f"Residuals, averaged in bins. {circles} {band}{where} {bars}"
 
 
-def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Answer in plain words: what to do next, what was found, whether it is real, whether the repair helps."""
+def _questions_and_answers(diagnosis: Diagnosis) -> list[tuple[str, str]]:
+    """List a reader's questions, each with its answer in words: what to measure next, what was found, ..."""
     gain, unit = diagnosis.improvement, unit_name(diagnosis.recording.plan.instrumentation.unit)
     facts = [
         ("What to measure next", _next_readings_in_words(diagnosis)),
@@ -132,10 +134,10 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     if diagnosis.report.remainder is not None:
         facts.append(("Beside that", _as_sentence(diagnosis.report.remainder.sentence)))
     if not diagnosis.judged.too_little:
-        facts.append(("Could it be chance?", _chance_in_words(diagnosis)))
+        facts.append(("Could it be chance?", _could_be_chance_in_words(diagnosis)))
     if gain.heldout_by_scan and diagnosis.repair.changes_predictions:
         facts.append(
-            ("Does the repair predict?", _prediction_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd))
+            ("Does the repair predict?", _heldout_gain_in_words(gain.heldout_log_density_per_reading, gain.heldout_sd))
         )
     if diagnosis.repair.changes_predictions:
         left = f"rms {gain.rms_before:.3g} {unit} before the repair, {gain.rms_after:.3g} {unit} after"
@@ -146,14 +148,14 @@ def _facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         facts.append(
             (
                 "In the repaired model",
-                _shares_in_words(diagnosis.repair.combination_shares, diagnosis.apparatus.words.model),
+                _sample_shares_in_words(diagnosis.repair.combination_shares, diagnosis.apparatus.words.model),
             )
         )
     return facts
 
 
 def _simulator_facts(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Name the user's simulator, if there is one, and how often it was called."""
+    """List, with their terms, the user's simulator and its number of calls; empty for the light sensor."""
     if not isinstance(diagnosis.apparatus, SimulatorApparatus):
         return []
     system = diagnosis.apparatus.system
@@ -180,7 +182,7 @@ def _reason_in_words(diagnosis: Diagnosis) -> str:
     return re.sub(rf"\b(?:{names})\b", lambda name: name[0].replace("_", " "), said)
 
 
-def _prediction_in_words(nats: float, sd: float) -> str:
+def _heldout_gain_in_words(nats: float, sd: float) -> str:
     measured = f"{_signed_nats(nats, sd)} per held-out reading"
     if nats > 2 * sd:
         return f"Yes: each reading is {math.exp(min(nats, 50.0)):.3g} times as probable as before ({measured})."
@@ -192,7 +194,7 @@ def _signed_nats(nats: float, sd: float) -> str:
     return f"{typeset(written if written.startswith('-') else f'+{written}')} nats"
 
 
-def _shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str:
+def _sample_shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str:
     held = (
         f"{join_names(map(effect_in_words, names)) if names else 'no effect'} ({100 * share:.0f} %)"
         for names, share in shares.items()
@@ -200,7 +202,7 @@ def _shares_in_words(shares: Mapping[tuple[str, ...], float], model: str) -> str
     return f"Posterior samples in {model} contain: {', '.join(held)}."
 
 
-def _chance_in_words(diagnosis: Diagnosis) -> str:
+def _could_be_chance_in_words(diagnosis: Diagnosis) -> str:
     p_value, p = diagnosis.p_value, p_in_words(diagnosis.p_value)
     if p_value > _CHANCE:
         often = f"with nothing missing, {100 * p_value:.0f} of 100 recordings look as odd as this ({p})"
@@ -234,21 +236,21 @@ def _next_readings_in_words(diagnosis: Diagnosis) -> str:
             f"Bayes factor of {number(told, 1)} nats. It is in {file}: {description} ({asked})."
         )
     said = f"{description}: {asked}, {file}."
-    *others, last = map(_label_in_words, plan.between)
+    *others, last = map(_hypothesis_label_in_words, plan.between)
     rivals = f"{others[0]} from {last}" if len(others) == 1 else f"{', '.join(others)} and {last}"
     return f"{said[:1].upper()}{said[1:]} Expected to separate {rivals} by {number(told, 1)} nats."
 
 
-def _label_in_words(label: str) -> str:
+def _hypothesis_label_in_words(label: str) -> str:
     """Write in words the label of a hypothesis that a plan separates; a label without effect names stays as it is."""
     named, weak, _ = label.partition(_WEAK)
     names = [part.replace(" ", "_") for part in named.split(" with ")]
-    said = join_names(map(effect_in_words, names)) if all(is_in_words(name) for name in names) else named
+    said = join_names(map(effect_in_words, names)) if all(effect_has_words(name) for name in names) else named
     return f"{said}, too weak to be detected so far" if weak else said
 
 
 def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    credible = [hypothesis_in_words(_effects_of(label)) for label in diagnosis.judged.credible]
+    credible = [hypothesis_in_words(_effects_in_label(label)) for label in diagnosis.judged.credible]
     return (
         *(
             paragraph(_as_sentence(f"{effect_in_words(e.name)} ({probability(e.probability)}): {e.sentence}"))
@@ -263,49 +265,49 @@ def _explanation_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
                 if h.probability > 1e-3
             ),
         ),
-        *_credible_set(credible),
-        *_candidates_paragraph(diagnosis),
+        *_credible_set_elements(credible),
+        *_unknown_effect_candidates(diagnosis),
         *_unlisted_corrections(diagnosis),
-        *_evidence_comparison(diagnosis),
+        *_laplace_and_nested_table(diagnosis),
         *_effect_elements(diagnosis),
     )
 
 
-def _effects_of(label: str) -> tuple[str, ...]:
-    """Split a label of the credible set into effects."""
+def _effects_in_label(label: str) -> tuple[str, ...]:
+    """Return the names of the effects in a hypothesis's label "A+B"; none for "clean"."""
     return () if label == "clean" else tuple(label.split("+"))
 
 
-def _credible_set(names: Sequence[str]) -> tuple[Markup, ...]:
+def _credible_set_elements(names: Sequence[str]) -> tuple[Markup, ...]:
     if len(names) <= _MOST_CREDIBLE:
         return (paragraph(f"95 % credible set (the fewest explanations that hold 0.95): {'; '.join(names)}."),)
     summary = element("summary", f"95 % credible set: {len(names)} explanations")
     return (element("details", summary, paragraph(f"{'; '.join(names)}.")),)
 
 
-def _candidates_paragraph(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """List the candidates for an unknown effect, if one is likely."""
+def _unknown_effect_candidates(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+    """Build the paragraph on the likely candidates for an unknown effect; empty if none is likely."""
     likely = [(name, p) for name, p in diagnosis.judged.unknown_candidates if p > _LIKELY]
     if not likely:
         return ()
-    said = ", ".join(f"{_candidate_in_words(name)} ({probability(p)})" for name, p in likely)
+    said = ", ".join(f"{_unknown_candidate_in_words(name)} ({probability(p)})" for name, p in likely)
     return (paragraph(f"Candidates for the unknown effect (a covariate that it depends on, or a form): {said}."),)
 
 
-def _candidate_in_words(name: str) -> str:
-    return effect_in_words(name) if is_in_words(name) else family_words(name)
+def _unknown_candidate_in_words(name: str) -> str:
+    return effect_in_words(name) if effect_has_words(name) else family_words(name)
 
 
 def _unlisted_corrections(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """List corrections that samples of the repaired model contain, but none of the explanations above."""
+    """Build a paragraph for each correction in posterior samples of the repaired model that no explanation has."""
     return tuple(
         paragraph(_as_sentence(f"In {share:.0%} of the repaired model's samples: {sentence}"))
         for _, share, sentence in diagnosis.unstated_effects
     )
 
 
-def _evidence_comparison(diagnosis: Diagnosis) -> tuple[Markup, ...]:
-    """Tabulate the explanations whose evidence was computed twice: by Laplace and by nested sampling."""
+def _laplace_and_nested_table(diagnosis: Diagnosis) -> tuple[Markup, ...]:
+    """Build the table of the explanations whose evidence was computed twice; empty if none was."""
     if not diagnosis.report.weighings:
         return ()
     return (
@@ -326,13 +328,13 @@ def _evidence_comparison(diagnosis: Diagnosis) -> tuple[Markup, ...]:
     )
 
 
-def _place_figures(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
-    """Show where the residuals are significant; all but the first few figures are folded away."""
+def _place_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+    """Build the figures of the places where residuals are significant; all but the first three are folded away."""
     if not diagnosis.where:
         return (paragraph("No residual is larger than noise explains."),)
     shown = [
-        figure(drawn[place.figure_name], _place_words(diagnosis, place, seen=seen))
-        for place, seen in places_in_order(diagnosis, ResidualNoise.of(diagnosis))
+        figure(drawn[place.figure_name], _place_caption(diagnosis, place, seen=seen))
+        for place, seen in ranked_places_with_visibility(diagnosis, ResidualNoise.of_diagnosis(diagnosis))
     ]
     opening = paragraph(
         "Residuals of the calibrated model against each covariate in which they are significant: the headline's "
@@ -344,7 +346,7 @@ def _place_figures(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Ma
     return (opening, *first, *more)
 
 
-def _before_and_after_figures(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
+def _before_and_after_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Markup, ...]:
     run = diagnosis.apparatus.words.run
     which = f"The {run} that the repair changes most" if diagnosis.repair.changes_predictions else f"One {run}"
     colours = "orange as calibrated, blue repaired" if diagnosis.repair.changes_predictions else "orange"
@@ -369,7 +371,7 @@ def _gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Ma
             ),
         )
         if "gain.svg" in drawn
-        else (paragraph(_nothing_held_out(diagnosis)),)
+        else (paragraph(_why_nothing_held_out(diagnosis)),)
     )
     held = f"{_signed_nats(gain.heldout_log_density_per_reading, gain.heldout_sd)} per reading"
     rms = f"{gain.rms_before:.3g} {unit} before, {gain.rms_after:.3g} {unit} after the repair"
@@ -390,7 +392,7 @@ def _gain_elements(diagnosis: Diagnosis, drawn: Mapping[str, bytes]) -> tuple[Ma
     )
 
 
-def _nothing_held_out(diagnosis: Diagnosis) -> str:
+def _why_nothing_held_out(diagnosis: Diagnosis) -> str:
     if not diagnosis.repair.changes_predictions:
         return "The predicted mean is as calibrated: there is no repair to test on held-out readings."
     run = diagnosis.apparatus.words.run
@@ -428,7 +430,7 @@ def _effect_elements(diagnosis: Diagnosis) -> tuple[Markup, ...]:
 def _effect_table(effects: Sequence[EffectFound]) -> Markup:
     rows = [
         (
-            _words_and_name(effect.name) if k == 0 else "",
+            _effect_words_and_name(effect.name) if k == 0 else "",
             probability(effect.probability) if k == 0 else "",
             number(effect.size_lambda, 1) if k == 0 else "",
             p.name.removesuffix(f"_{p.unit}").replace("_", " "),
@@ -440,14 +442,14 @@ def _effect_table(effects: Sequence[EffectFound]) -> Markup:
     return table(("effect", "probability", "size λ", "parameter", "value", "95 % interval"), rows)
 
 
-def _words_and_name(name: str) -> str:
+def _effect_words_and_name(name: str) -> str:
     """Name an effect in words, followed by its name in diagnosis.json."""
     said = effect_in_words(name)
     return f"{said} ({name})" if said != name else name
 
 
 def _value_and_interval(found: ParameterFound, *, unit: bool = False) -> tuple[str, str]:
-    """Write a parameter with its sd (and unit, if asked), and its interval."""
+    """Return two texts: a parameter with its sd (and unit, if asked), and its 95 % interval."""
     low, high = found.interval95
     own = _unit_text(found) if unit else ""
     return typeset(f"{value_with_sd(found.mean, found.sd)} {own}".rstrip()), typeset(f"{low:.4g} to {high:.4g}")
@@ -478,20 +480,20 @@ def _alias_table(aliases: Sequence[Alias]) -> Markup:
                 " and ".join(map(effect_in_words, a.effects)),
                 number(a.cosine, 3),
                 typeset(a.settle_by),
-                _readings_needed(a.readings),
+                _readings_needed_text(a.readings),
             )
             for a in aliases
         ),
     )
 
 
-def _readings_needed(n: int) -> str:
+def _readings_needed_text(n: int) -> str:
     """Write the number of readings that would separate a pair: a dash for 0, a bound above the largest plan."""
     return "–" if n == 0 else str(n) if n < MOST_READINGS else f"{MOST_READINGS} or more"
 
 
-def _design_elements(audit: PlanAudit) -> tuple[Markup, ...]:
-    def names(found: Sequence[str]) -> str:
+def _audit_elements(audit: PlanAudit) -> tuple[Markup, ...]:
+    def joined(found: Sequence[str]) -> str:
         return ", ".join(found).replace("_", " ") or "none"
 
     aliased = [f"{e.name} (with {e.alike[0][0]})" for e in audit.seen_as("aliased")]
@@ -499,12 +501,12 @@ def _design_elements(audit: PlanAudit) -> tuple[Markup, ...]:
     return (
         definition_list(
             (
-                ("fine (detected, and told from every other)", names([e.name for e in audit.seen_as("fine")])),
+                ("fine (detected, and told from every other)", joined([e.name for e in audit.seen_as("fine")])),
                 (
                     "aliased (detected, but another effect can imitate it)",
-                    names(aliased),
+                    joined(aliased),
                 ),
-                ("invisible (not detected)", names([e.name for e in audit.seen_as("invisible")])),
+                ("invisible (not detected)", joined([e.name for e in audit.seen_as("invisible")])),
             )
         ),
         element("details", element("summary", "every effect, with numbers"), audit_table(audit.effects)),
@@ -516,8 +518,8 @@ def _as_sentence(text: str) -> str:
     return typeset(f"{text[:1].upper()}{text[1:].rstrip('.')}.")
 
 
-def _place_words(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
-    """Describe where residuals are significant, and whether their means leave the band."""
+def _place_caption(diagnosis: Diagnosis, place: Place, *, seen: bool = True) -> str:
+    """Return a place's caption: where residuals are significant, the p-value, whether a mean leaves the band."""
     run = diagnosis.apparatus.words.run
     covariate, unit = covariate_words_and_unit(diagnosis, place.covariate)
     if place.covariate == run:

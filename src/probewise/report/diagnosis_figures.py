@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis import Diagnosis, Place
 from probewise.recordings import Plan
-from probewise.report.covariate import axis_label, covariate_values
+from probewise.report.covariate import axis_label, covariate_values_by_place
 from probewise.report.covariate_view import (
     CovariateView,
     ResidualNoise,
@@ -21,13 +21,13 @@ from probewise.report.covariate_view import (
 )
 from probewise.report.effect_words import hypothesis_in_words
 from probewise.report.plots import (
-    correlation_of_neighbours,
     gain_by_scan,
     hypothesis_probabilities,
-    lattice_of_readings,
     lost_readings,
     mean_residuals_along,
     readings_in_order,
+    readings_modulo_step,
+    residual_autocorrelation,
     residual_histogram,
     residuals_against_covariates,
     scan_with_residuals,
@@ -44,14 +44,17 @@ _MOST_BARS = 6
 _LOST = 5.0  # sds from the prediction beyond which a reading at the lost readings' value counts as lost
 
 
-def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
-    """Draw all figures: first screen, before and after, residuals, noise, held-out gain, and one for each place."""
-    chance, values = ResidualNoise.of(diagnosis), covariate_values(diagnosis)
+def encoded_figures(diagnosis: Diagnosis) -> dict[str, bytes]:
+    """Draw all figures; return their SVGs by file name.
+
+    They show: evidence and explanations, before and after, residuals, noise, held-out gain, and each place.
+    """
+    chance, values = ResidualNoise.of_diagnosis(diagnosis), covariate_values_by_place(diagnosis)
     drawn = {
-        "first.svg": _draw_evidence(diagnosis, chance),
-        "before_after.svg": _draw_before_and_after(diagnosis),
-        "residuals.svg": _draw_residuals(diagnosis),
-        "noise.svg": _draw_noise(diagnosis, chance),
+        "first.svg": _first_figure_svg(diagnosis, chance),
+        "before_after.svg": _before_and_after_svg(diagnosis),
+        "residuals.svg": _all_residuals_svg(diagnosis),
+        "noise.svg": _noise_tests_svg(diagnosis, chance),
     }
     gain = diagnosis.improvement
     if gain.heldout_by_scan:
@@ -64,7 +67,7 @@ def figures(diagnosis: Diagnosis) -> dict[str, bytes]:
             )
         )
     for place in diagnosis.where:
-        drawn[place.figure_name] = _draw_place(diagnosis, chance, place, values[place.figure_name])
+        drawn[place.figure_name] = _place_svg(diagnosis, chance, place, values[place.figure_name])
     return drawn
 
 
@@ -79,11 +82,11 @@ def first_figure_content(diagnosis: Diagnosis, chance: ResidualNoise | None = No
     if diagnosis.verdict == "noise":
         sizes = {effect.name: effect.size_lambda for effect in diagnosis.effects}
         return max(diagnosis.combination, key=lambda name: sizes.get(name, 0.0))
-    return choose_first_view(diagnosis, ResidualNoise.of(diagnosis) if chance is None else chance)
+    return choose_first_view(diagnosis, ResidualNoise.of_diagnosis(diagnosis) if chance is None else chance)
 
 
-def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
-    """Draw the evidence for the verdict and, below it, every explanation with its probability."""
+def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+    """Draw what shows the verdict best and, below it, the probability of each explanation."""
     listed = [h for h in diagnosis.hypotheses if h.probability > _WORTH_A_BAR]
     names = [hypothesis_in_words(h.effects) for h in listed]
     n_bars = min(len(listed), _MOST_BARS) + (len(diagnosis.hypotheses) > min(len(listed), _MOST_BARS))
@@ -92,7 +95,7 @@ def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     if shown == "readings":
         readings_in_order(diagnosis.recording, ax=above)
     elif isinstance(shown, str):
-        _noise_panel(diagnosis, chance, shown)(above)
+        _noise_panel_drawer(diagnosis, chance, shown)(above)
     else:
         _draw_means_along(diagnosis, chance, shown, after=True, each=False, ax=above)
     # All are passed on: the last bar adds up those that are not drawn.
@@ -106,7 +109,7 @@ def _draw_evidence(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
     return svg(above)
 
 
-def _draw_place(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
+def _place_svg(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
     """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
 
     A scan is drawn along its path, which shows residuals that change sign, and below that beside the other scans.
@@ -124,10 +127,10 @@ def _draw_place(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: F
 def _draw_means_along(
     diagnosis: Diagnosis, chance: ResidualNoise, view: CovariateView, *, after: bool, each: bool, ax: Axes
 ) -> Axes:
-    names = view.shown_names
-    at = view.at if names is None else _spread_categories(view.at)
+    names = view.category_names_on_axis
+    at = view.at if names is None else _spread_within_categories(view.at)
     return mean_residuals_along(
-        chance.means(diagnosis, view, after=after),
+        chance.mean_residuals(diagnosis, view, after=after),
         label=view.label,
         unit=unit_name(diagnosis.recording.plan.instrumentation.unit),
         each=(at, diagnosis.repair.before.residuals) if each else None,
@@ -137,8 +140,8 @@ def _draw_means_along(
     )
 
 
-def _spread_categories(at: FloatArray) -> FloatArray:
-    """Spread the rows of each categorical value evenly about its position, in order of time, (n_points,)."""
+def _spread_within_categories(at: FloatArray) -> FloatArray:
+    """Return positions on the axis, (n_points,): rows of the k-th value spread evenly, in order of time, about k."""
     out = np.full(at.shape, np.nan)
     for k, value in enumerate(np.unique(at[np.isfinite(at)])):
         rows = np.flatnonzero(at == value)
@@ -146,10 +149,10 @@ def _spread_categories(at: FloatArray) -> FloatArray:
     return out
 
 
-def _draw_before_and_after(diagnosis: Diagnosis) -> bytes:
-    """Draw the line scan that the repair changes most (or the longest): readings, both models, residuals of each."""
+def _before_and_after_svg(diagnosis: Diagnosis) -> bytes:
+    """Draw the scan that the repair changes most: readings and both models, and below them the residuals."""
     recording, plan = diagnosis.recording, diagnosis.recording.plan
-    rows = scan_changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
+    rows = rows_of_scan_changed_most(plan, diagnosis.repair.after.readings - diagnosis.repair.before.readings)
     shown = view_along_scan(diagnosis, plan.scan_names[int(plan.scan[rows[0]])])
     rows = rows[np.argsort(shown.at[rows], kind="stable")]
     models = [(BEFORE, diagnosis.repair.before.readings[rows]), (AFTER, diagnosis.repair.after.readings[rows])]
@@ -163,8 +166,10 @@ def _draw_before_and_after(diagnosis: Diagnosis) -> bytes:
     )
 
 
-def scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
-    """Choose the line scan with the largest total change; the longest if none changes; any scan if none is a line.
+def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
+    """Return the rows of the scan with the largest sum of squared changes; the longest if none changes.
+
+    Scans along a line are preferred.
 
     `change` is the change of each predicted reading, (n_points,).
     """
@@ -173,7 +178,7 @@ def scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntArray:
     return max(lines or scans, key=lambda rows: (float(change[rows] @ change[rows]), rows.size))
 
 
-def _draw_residuals(diagnosis: Diagnosis) -> bytes:
+def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
     """Draw all residuals against time and predicted reading, before and after the repair."""
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
@@ -187,16 +192,16 @@ def _draw_residuals(diagnosis: Diagnosis) -> bytes:
     )
 
 
-def _draw_noise(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
-    """Draw the tests of the noise model: autocorrelation, spread by level, tails."""
+def _noise_tests_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
+    """Draw the tests of the noise model: autocorrelation, spread by predicted reading, histogram."""
     axes = stack_of_axes([2.2, 2.4, 2.2])
     for ax, name in zip(axes, ("correlated_noise", "signal_dependent_noise", "outliers"), strict=True):
-        _noise_panel(diagnosis, chance, name)(ax)
+        _noise_panel_drawer(diagnosis, chance, name)(ax)
     return svg(axes)
 
 
-def _noise_panel(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
-    """Return the function that draws the panel of a noise effect: by default the residuals' spread by level."""
+def _noise_panel_drawer(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Callable[[Axes], Axes]:
+    """Return a function that draws on given axes the panel of a noise effect; the default is spread by level."""
     recording, residuals = diagnosis.recording, np.array(diagnosis.repair.after.residuals)
     unit = unit_name(recording.plan.instrumentation.unit)
     found = {p.name: p.mean for p in diagnosis.report.noise.parameters}
@@ -207,9 +212,9 @@ def _noise_panel(diagnosis: Diagnosis, chance: ResidualNoise, name: str) -> Call
         if name == "dropouts":
             return lambda ax: lost_readings(diagnosis.repair.after.readings, recording.readings, lost, unit=unit, ax=ax)
     if name == "quantisation" and "step" in found:
-        return lambda ax: lattice_of_readings(recording.readings, found["step"], unit=unit, ax=ax)
+        return lambda ax: readings_modulo_step(recording.readings, found["step"], unit=unit, ax=ax)
     if name in ("correlated_noise", "random_walk"):
-        return lambda ax: correlation_of_neighbours(residuals, recording.plan.scan, rho=found.get("rho"), ax=ax)
+        return lambda ax: residual_autocorrelation(residuals, recording.plan.scan, rho=found.get("rho"), ax=ax)
     if name == "outliers":
         return lambda ax: residual_histogram(residuals, float(chance.sd.mean()), ax=ax)
     model_sd = chance.sd if "ratio" in found else None

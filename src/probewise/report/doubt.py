@@ -28,8 +28,8 @@ def summary_sentence(searches: Sequence[RobotSearch]) -> str:
     return f"The robot that trusts its sensor model took {trusting}; the one that doubts it took {doubting}."
 
 
-def figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
-    """Draw each robot's final posterior of the circle, and the doubting robot's effect probabilities: PNG by name."""
+def encoded_figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
+    """Draw both final posteriors, and the doubting robot's probabilities of effects; return PNGs by file name."""
     ends = np.array([window_mm([s.run], len(s.run.steps)) for s in searches])
     corners = np.concatenate([ends[:, ::2], ends[:, 1::2], *(s.truth_mm for s in searches)])
     (left, low), (right, high) = corners.min(axis=0), corners.max(axis=0)
@@ -53,7 +53,7 @@ def figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
 
 
 def section(searches: Sequence[RobotSearch], drawn: Mapping[str, bytes]) -> Section:
-    """Build the demo's section from both searches, the trusting robot's first, and from `figures`."""
+    """Build the demo's section from both searches, the trusting robot's first, and from `encoded_figures`."""
     doubting = searches[-1].run
     missing = left_out_after_step(doubting.last, doubting.experiment.trust)
     introduction = paragraph(

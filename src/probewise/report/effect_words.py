@@ -21,14 +21,14 @@ FORMS_IN_WORDS: Mapping[str, str] = MappingProxyType(
 """A noun phrase for each effect on a user's simulator, with placeholders for its targets."""
 
 
-def is_in_words(name: str) -> bool:
+def effect_has_words(name: str) -> bool:
     """Return whether an effect has a name in words."""
     kind = public_name(name).partition(":")[0]
     return name in EFFECTS_IN_WORDS or kind in FORMS_IN_WORDS or name.startswith(PROPOSAL)
 
 
 def effect_in_words(name: str) -> str:
-    """Name an effect in words; a user's own effect keeps its name."""
+    """Return an effect's name in words; a user's own effect keeps its name."""
     kind, *targets = public_name(name).split(":")
     if name.startswith(PROPOSAL):
         return f"a term {targets[-1]} in {'the rate of ' if targets[0] == 'rate' else ''}{targets[1]}"
@@ -38,7 +38,10 @@ def effect_in_words(name: str) -> str:
 
 
 def hypothesis_in_words(effects: Sequence[str]) -> str:
-    """Name a hypothesis in words: a set of effects, () for clean, ("unknown",) for an effect out of vocabulary."""
+    """Return the name in words of a hypothesis.
+
+    It is given by its effects: () for clean, ("unknown",) for an effect out of vocabulary.
+    """
     if not effects:
         return "nothing is missing"
     return "something without a name" if tuple(effects) == ("unknown",) else join_names(map(effect_in_words, effects))

@@ -60,7 +60,7 @@ def view(
     truth_mm
         Outline of the true shape, (n_vertices, 2), where known.
     title
-        Title; by default the number of readings.
+        Title; by default the number of readings and of bits known.
     ax
         Axes to draw on; a new figure without.
     """
@@ -83,7 +83,7 @@ def view(
     )
 
 
-def frame(
+def robot_view_png(
     step: Step,
     experiment: Experiment,
     readings: Sequence[tuple[float, float, float]],
@@ -97,7 +97,7 @@ def frame(
     return png(ax, dpi=90, tight=False)
 
 
-def frame_of_several_models(
+def robot_views_png(
     views: Sequence[tuple[str, Step, Experiment]],
     readings: Sequence[tuple[float, float, float]],
     *,
@@ -116,8 +116,8 @@ def frame_of_several_models(
     return png(axes, dpi=75, tight=False)
 
 
-def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust: float = 1.0) -> str:
-    """Write the page that shows a running exploration: it reloads every second until the run ends.
+def live_page_html(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust: float = 1.0) -> str:
+    """Return the HTML of the page that shows a running exploration: it reloads every second until the run ends.
 
     Where `trust` in the sensor is below 1, the probabilities of sensor faults after every step follow the picture.
     """
@@ -125,12 +125,12 @@ def live_page(step: Step, picture: bytes, *, earlier: Sequence[Step] = (), trust
     following = "" if step.next_pose is None else "Next, the robot reads at the green square. "
     found = figure(picture, f"{following}{step.summary()}.")
     every_s = None if step.stop_reason else 1
-    sections = (_fault_probabilities((*earlier, step), trust),) if trust < 1 else ()
+    sections = (_fault_section((*earlier, step), trust),) if trust < 1 else ()
     return page("The robot's search", answer=f"{state}.", key_figure=found, sections=sections, reload_s=every_s)
 
 
-def _fault_probabilities(steps: Sequence[Step], trust: float) -> Section:
-    """Build the section on possible faults of the sensor: their probabilities after each reading."""
+def _fault_section(steps: Sequence[Step], trust: float) -> Section:
+    """Build the section on effects that the sensor model may leave out: their probabilities after each reading."""
     doubted = left_out_after_step(steps[-1], trust)
     beliefs = [{n or CLEAN: p for n, p in s.left_out.items()} for s in steps]
     changed = len({max(each, key=each.__getitem__) for each in beliefs if each}) > 1
@@ -153,7 +153,7 @@ def _fault_probabilities(steps: Sequence[Step], trust: float) -> Section:
 
 
 def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
-    """Write each estimate minus its truth, with the posterior sd."""
+    """Write each parameter's estimate minus its truth, with the posterior sd; those without a truth are left out."""
     step = run.last
     return ", ".join(
         f"{without_unit(_without_shape(step, name))} {with_error(float(mean) - truth[name], float(sd), unit_of(name))}"
@@ -163,7 +163,7 @@ def errors_text(run: Exploration, truth: Mapping[str, float]) -> str:
 
 
 def summary_sentence(run: Exploration) -> str:
-    """Summarise the result in one sentence."""
+    """Summarise in one sentence: the number of readings, the shape found, and its parameters."""
     found = found_shape(run)
     several = f" (probability {probability(found.probability)})" if run.last.shapes else ""
     known = ", ".join(f"{without_unit(p.name)} {with_error(p.mean, p.sd, unit_of(p.name))}" for p in found.parameters)
@@ -216,7 +216,7 @@ def steps_table(run: Exploration, unit: str = "LEGO") -> Markup:
     )
 
 
-def write_page(
+def page_html(
     run: Exploration,
     frames: Sequence[bytes],
     *,
@@ -226,7 +226,7 @@ def write_page(
     beside: Mapping[str, Sequence[Step]] | None = None,
     unit: str = "LEGO",
 ) -> str:
-    """Write the whole page.
+    """Return the page's HTML.
 
     Parameters
     ----------
@@ -241,7 +241,7 @@ def write_page(
     beside
         Steps of other sensor models from the same readings, by name of the model.
     unit
-        Of readings.
+        Unit of the readings.
     """
     said = {name: f"{MODEL_NAMES.get(name, name)} model" for name in (model, *(beside or {}))}
     runs = {said[model]: run.steps} | {said[name]: steps for name, steps in (beside or {}).items()}
@@ -278,7 +278,7 @@ def write_page(
                 *(paragraph(f"Doubtful: {note}.") for note in run.notes),
             ),
         ),
-        *((_fault_probabilities(run.steps, run.experiment.trust),) if run.experiment.trust < 1 else ()),
+        *((_fault_section(run.steps, run.experiment.trust),) if run.experiment.trust < 1 else ()),
         Section(
             "How fast",
             (
@@ -320,7 +320,7 @@ def write_page(
 
 
 def _fit_in_words(p_value: float) -> str:
-    """Write the p-value of the fit with its meaning."""
+    """Write the p-value of the best hypothesis's fit, and its meaning."""
     return f"p = {p_value:.2g}: if the model is right, {100 * p_value:.0f} of 100 runs fit no better"
 
 

@@ -19,24 +19,27 @@ _LEAST_VALUES = 8  # distinct values of a column, for a running mean along it
 
 
 def summary_sentence(fit: SystemFit) -> str:
-    """Summarise in one sentence how well the simulator fits."""
+    """Summarise in one sentence: number of readings, and rms of the residuals."""
     unit = unit_name(fit.recording.plan.instrumentation.unit)
     n = int(fit.recording.usable.sum())
     return f"The simulator fits {n} readings with residuals of {fit.rms:.3g} {unit} (rms)."
 
 
-def figures(fit: SystemFit) -> dict[str, bytes]:
-    """Draw predicted against recorded, and residuals against time, level and every column that varies."""
+def encoded_figures(fit: SystemFit) -> dict[str, bytes]:
+    """Draw recorded against predicted, and residuals; return SVGs by file name.
+
+    Residuals are drawn against time, predicted reading, and up to four columns of eight values or more.
+    """
     recording, own = fit.recording, fit.fitted.simulator
     unit, readings = unit_name(own.unit), np.where(fit.recording.usable, fit.recording.readings, np.nan)
     drawn = svg(predicted_and_recorded(readings, fit.predicted, fit.sd, label=own.reading, unit=unit))
     clouds = residuals_against_covariates(
-        _columns_to_draw(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
+        _labelled_columns(fit, cast(RunTable, recording.plan)), [("fitted", fit.residuals)], unit=unit
     )
     return {"predicted.svg": drawn, "residuals.svg": svg(clouds)}
 
 
-def _columns_to_draw(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
+def _labelled_columns(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatArray], ...]:
     own = fit.fitted.simulator
     time = f"{plan.time} ({own.time_unit})" if plan.has_varying_time else "row of the table"
     out = [(time, plan.time_s), (f"predicted {own.reading} ({unit_name(own.unit)})", fit.predicted)]
@@ -45,8 +48,8 @@ def _columns_to_draw(fit: SystemFit, plan: RunTable) -> tuple[tuple[str, FloatAr
     return (*out, *list(varying.items())[: _MOST_COLUMNS - len(out)])
 
 
-def write_page(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
-    """Write the whole page."""
+def page_html(fit: SystemFit, drawn: Mapping[str, bytes], *, seed: int) -> str:
+    """Return the page's HTML; `drawn` is from `encoded_figures`."""
     own, evidence = fit.fitted, fit.evidence
     median, interval = np.median(own.samples, axis=0), own.interval()
     error = f" ± {number(evidence.error, 2)}" if evidence.error else ""

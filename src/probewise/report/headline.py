@@ -19,11 +19,11 @@ _MOST_RIVALS = 3
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Return the verdict in words: the most complete version that is short enough."""
-    return next(said for said in _versions(diagnosis) if len(said.split()) <= MOST_WORDS)
+    """Return the verdict in one or two sentences: the most complete version of at most twenty words."""
+    return next(said for said in _verdict_versions(diagnosis) if len(said.split()) <= MOST_WORDS)
 
 
-def _versions(diagnosis: Diagnosis) -> list[str]:
+def _verdict_versions(diagnosis: Diagnosis) -> list[str]:
     """List versions of the verdict, the most complete first; the last is always short enough."""
     n = int(diagnosis.recording.usable.sum())
     if diagnosis.judged.too_little:
@@ -87,7 +87,7 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
         return [f"{plain}; if so, most likely {hypothesis_in_words(leading)}.", f"{plain}."]
     rivals = [h.effects for h in diagnosis.hypotheses[:_MOST_RIVALS] if h.probability > _RIVAL]
     said = [
-        f"Something is missing: {_join_alternatives(rivals[:n])}; these readings cannot tell which." for n in (3, 2)
+        f"Something is missing: {_join_rival_hypotheses(rivals[:n])}; these readings cannot tell which." for n in (3, 2)
     ]
     if len(rivals) < len(said):
         said = [
@@ -97,8 +97,8 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
     return [*said, "Something is missing, but these readings cannot tell what."]
 
 
-def _join_alternatives(rivals: Sequence[tuple[str, ...]]) -> str:
-    """Join hypotheses as in "A, B or C", without the effects that they share."""
+def _join_rival_hypotheses(rivals: Sequence[tuple[str, ...]]) -> str:
+    """Name hypotheses as in "A, B or C", without the effects that all share."""
     shared = frozenset.intersection(*map(frozenset, rivals))
     *others, last = (hypothesis_in_words([k for k in names if k not in shared] or names) for names in rivals)
     return f"{', '.join(others)} or {last}" if others else last

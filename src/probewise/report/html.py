@@ -31,7 +31,7 @@ class Section:
 
 
 def element(tag: str, *children: str, **attributes: str) -> Markup:
-    """Build one element; attribute names lose a trailing underscore (`class_`), other underscores become hyphens."""
+    """Build an element; in names of attributes a trailing underscore is dropped (`class_`), others become hyphens."""
     written = "".join(
         f' {name.rstrip("_").replace("_", "-")}="{html.escape(value)}"' for name, value in attributes.items()
     )
@@ -74,23 +74,23 @@ def definition_list(pairs: Iterable[tuple[str, str]]) -> Markup:
 
 
 def figure(image: bytes, caption: str, *, alt: str = "") -> Markup:
-    """Embed a PNG or an SVG; `alt`, by default the caption, is its alternative text."""
+    """Build a figure that embeds a PNG or an SVG; `alt`, by default the caption, is its alternative text."""
     kind = "svg+xml" if image.startswith(b"<svg") else "png"
     source = f"data:image/{kind};base64," + base64.b64encode(image).decode("ascii")
-    size = "" if kind == "svg+xml" else _least_width(image)
+    size = "" if kind == "svg+xml" else _least_width_attribute(image)
     shown = Markup(f'<img src="{source}" alt="{html.escape(alt or caption)}"{size}>')
     return element("figure", element("div", shown, class_="drawing"), element("figcaption", caption))
 
 
-def _least_width(png: bytes) -> str:
-    """Return the CSS width below which a PNG's text is too small to read: nine tenths of the width it was drawn for."""
+def _least_width_attribute(png: bytes) -> str:
+    """Return a style attribute: the width below which a PNG's text is too small, 0.9 of the width as drawn."""
     with Image.open(io.BytesIO(png)) as picture:
         dots_per_inch, _ = picture.info.get("dpi", (_CSS_DPI, _CSS_DPI))
         return f' style="--least: {0.9 * _CSS_DPI * picture.width / dots_per_inch:.0f}px"'
 
 
 def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
-    """Embed pictures with a slider that selects one; without scripts the last one is shown.
+    """Build a slideshow: embedded pictures, and a slider that selects one; without scripts the last one is shown.
 
     Parameters
     ----------
@@ -111,9 +111,9 @@ def slideshow(slides: Sequence[tuple[bytes, str]], caption: str) -> Markup:
 def page(
     title: str, *, answer: str, key_figure: Markup, sections: Sequence[Section], reload_s: int | None = None
 ) -> str:
-    """Build a page whose first screen is the answer in one sentence and the picture that shows it.
+    """Return the HTML of a page whose first screen is the answer in one sentence and the picture that shows it.
 
-    Four sections or more are listed before the first, with links.
+    A table of contents precedes the sections if there are four or more, parts included.
 
     Parameters
     ----------
@@ -153,7 +153,7 @@ def _section_element(section: Section, number: str, level: int) -> Markup:
 
 
 def _table_of_contents(sections: Sequence[Section]) -> tuple[Markup, ...]:
-    """Build a table of contents with links, where there are many sections."""
+    """Build a table of contents with links; empty for fewer than four sections and parts."""
     if sum(1 + len(s.parts) for s in sections) < _FEWEST_LISTED:
         return ()
     entries = (_contents_entry(s, str(k)) for k, s in enumerate(sections, start=1))

@@ -20,26 +20,26 @@ _LEAST_TOLD = 0.005
 
 
 def probabilities_png(found: Investigation) -> bytes:
-    """Draw the probability of each explanation after each round, as a PNG."""
-    return png(probabilities_by_round({_round_title(each): _explanation_probabilities(each) for each in found.rounds}))
+    """Draw the probability of each explanation after each round; return a PNG."""
+    return png(probabilities_by_round({_round_title(each): _probability_by_explanation(each) for each in found.rounds}))
 
 
-def probabilities_figure(found: Investigation) -> Markup:
-    """Build the figure of the probability of each explanation after each round."""
+def probabilities_figure_html(found: Investigation) -> Markup:
+    """Build the HTML of the figure, with caption, of the probability of each explanation after each round."""
     return figure(
         probabilities_png(found), "Probability of each explanation after each round, given all readings so far."
     )
 
 
 def summary_sentence(found: Investigation) -> str:
-    """Return the verdict in words, and how many readings beyond the first plan it took."""
+    """Return the last verdict in words, the number of readings beyond the first plan, and whether they settled it."""
     extra = found.extra_readings
     taken = f"{count(extra, 'reading')} beyond the first plan" if extra else "No reading beyond the first plan"
     came = "settled it" if found.last.settled else "did not settle it"
     return f"{headline(found.last.diagnosis)} {taken} {came}."
 
 
-def write_page(
+def page_html(
     found: Investigation,
     drawn: Mapping[str, bytes],
     *,
@@ -47,7 +47,7 @@ def write_page(
     seed: int,
     concealed: Sequence[str] | None = None,
 ) -> str:
-    """Write the whole page.
+    """Return the page's HTML.
 
     Parameters
     ----------
@@ -60,10 +60,10 @@ def write_page(
     seed
         Of the run.
     concealed
-        Effect that a simulated world concealed, stated at the end; None for a real arm.
+        Names of the effects that a simulated world concealed, stated at the end; None for any other arm.
     """
     last = found.last
-    bars = probabilities_figure(found)
+    bars = probabilities_figure_html(found)
     run = definition_list(
         (
             ("arm", source),
@@ -92,7 +92,7 @@ def _round_title(each: Round) -> str:
     return f"round {each.number}: {n}" if each.number == 1 else f"round {each.number}: {len(each.recording)} more"
 
 
-def _explanation_probabilities(each: Round) -> dict[str, float]:
+def _probability_by_explanation(each: Round) -> dict[str, float]:
     out: dict[str, float] = {}
     for hypothesis in each.diagnosis.hypotheses:
         name = hypothesis_in_words(hypothesis.effects)
@@ -101,10 +101,10 @@ def _explanation_probabilities(each: Round) -> dict[str, float]:
 
 
 def _round_section(each: Round) -> Section:
-    """Describe one round: the readings and their reason, the diagnosis, the next plan."""
+    """Build the section of one round: the readings and their reason, the diagnosis, the next plan."""
     diagnosis = each.diagnosis
     why = "as the first plan lists them" if each.number == 1 else f"as requested: {each.reason_for_readings}"
-    likely = [(name, p) for name, p in _explanation_probabilities(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
+    likely = [(name, p) for name, p in _probability_by_explanation(each).items() if p >= _LEAST_TOLD][:_MOST_TOLD]
     asked = diagnosis.next_measurement
     between = (
         "" if asked is None or len(asked.between) < 2 else f", which tell {asked.between[0]} from {asked.between[1]}"

@@ -1,4 +1,4 @@
-"""Notebook representations of results: a line of text, a picture, sometimes a table."""
+"""HTML of results in notebooks, registered by type with `render_html`: a sentence, a picture, sometimes a table."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def _pre(text: str) -> Markup:
 
 
 @render_html.register
-def _(value: SSFField) -> str:
+def _ssf_field_html(value: SSFField) -> str:
     return _div(
         figure(
             png(spatial_sensitivity(value), dpi=DPI),
@@ -62,7 +62,7 @@ def _(value: SSFField) -> str:
 
 
 @render_html.register
-def _(value: Recording) -> str:
+def _recording_html(value: Recording) -> str:
     said = (
         f"{count(len(value), 'reading')}, {int(value.usable.sum())} usable, {count(len(value.plan.scan_names), 'scan')}"
     )
@@ -70,12 +70,12 @@ def _(value: Recording) -> str:
 
 
 @render_html.register
-def _(value: RunRecording) -> str:
+def _run_recording_html(value: RunRecording) -> str:
     return _div(paragraph(f"{value.summary()}; {count(len(value.plan.scan_names), 'run')}"))
 
 
 @render_html.register
-def _(value: FittedSensor) -> str:
+def _fitted_sensor_html(value: FittedSensor) -> str:
     picture = figure(png(spatial_sensitivity(value.field), dpi=DPI), "Mean SSF field")
     return _div(
         paragraph(calibration_report.summary_sentence(value)), picture, calibration_report.parameter_table(value)
@@ -83,8 +83,8 @@ def _(value: FittedSensor) -> str:
 
 
 @render_html.register
-def _(value: Calibration) -> str:
-    drawn = calibration_report.ssf_of_each_order(value)
+def _calibration_html(value: Calibration) -> str:
+    drawn = calibration_report.draw_ssf_of_each_order(value)
     return _div(
         paragraph(calibration_report.summary_sentence(value.sensor)),
         figure(png(drawn, dpi=DPI), "Mean SSF by number of Gaussians"),
@@ -93,7 +93,7 @@ def _(value: Calibration) -> str:
 
 
 @render_html.register
-def _(value: NestedResult) -> str:
+def _nested_result_html(value: NestedResult) -> str:
     text = _pre(value.summary())
     if not value.names:
         return _div(text)
@@ -104,7 +104,7 @@ def _(value: NestedResult) -> str:
 
 
 @render_html.register
-def _(value: Weighted) -> str:
+def _weighted_html(value: Weighted) -> str:
     names = value.names[:MOST_PARAMETERS]
     believed = zip(names, value.mean(), value.sd(), strict=False)
     known = ", ".join(f"{without_unit(n)} {with_error(float(m), float(s), unit_of(n))}" for n, m, s in believed)
@@ -116,17 +116,17 @@ def _(value: Weighted) -> str:
 
 
 @render_html.register
-def _(value: Step) -> str:
+def _step_html(value: Step) -> str:
     pose = value.reading.pose
     return _div(paragraph(value.summary()), paragraph(f"Taken at ({pose.x_mm:g}, {pose.y_mm:g}) mm."))
 
 
 @render_html.register
-def _(value: Exploration) -> str:
+def _exploration_html(value: Exploration) -> str:
     readings = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in value.readings]
     seen = [r.value for r in value.readings]
     truth_mm = None if value.hidden is None else value.hidden.outline_mm
-    picture = exploration_report.frame(
+    picture = exploration_report.robot_view_png(
         value.last, value.experiment, readings, levels=(min(seen), max(seen)), truth_mm=truth_mm
     )
     widths = posterior_widths(
@@ -140,7 +140,7 @@ def _(value: Exploration) -> str:
 
 
 @render_html.register
-def _(value: Prediction) -> str:
+def _prediction_html(value: Prediction) -> str:
     recording = Recording(value.plan, value.readings)
     drawn = predicted_against_recorded(recording, value.mean, value.sd)
     said = value.summary().replace("\n", "; ")
@@ -148,8 +148,8 @@ def _(value: Prediction) -> str:
 
 
 @render_html.register
-def _(value: PlanAudit) -> str:
-    drawn = png(audit_report.picture(value), dpi=DPI)
+def _plan_audit_html(value: PlanAudit) -> str:
+    drawn = png(audit_report.detectability_figure(value), dpi=DPI)
     text = _pre(value.summary())
     return _div(
         paragraph(audit_report.summary_sentence(value)), figure(drawn, "Detectability of effects, and aliases"), text
@@ -157,7 +157,7 @@ def _(value: PlanAudit) -> str:
 
 
 @render_html.register
-def _(value: Diagnosis) -> str:
+def _diagnosis_html(value: Diagnosis) -> str:
     hypotheses = [h for h in value.hypotheses if h.probability > 1e-3]
     bars = hypothesis_probabilities(
         [hypothesis_in_words(h.effects) for h in hypotheses], [h.probability for h in hypotheses]
@@ -173,7 +173,7 @@ def _(value: Diagnosis) -> str:
 
 
 @render_html.register
-def _(value: SystemFit) -> str:
+def _system_fit_html(value: SystemFit) -> str:
     own = value.fitted.simulator
     readings = np.where(value.recording.usable, value.recording.readings, np.nan)
     unit = unit_name(own.unit)
@@ -186,7 +186,7 @@ def _(value: SystemFit) -> str:
 
 
 @render_html.register
-def _(value: SystemPrediction) -> str:
+def _system_prediction_html(value: SystemPrediction) -> str:
     said = _pre(value.summary())
     if not np.isfinite(value.readings).any():
         return _div(said)
@@ -196,8 +196,10 @@ def _(value: SystemPrediction) -> str:
 
 
 @render_html.register
-def _(value: Investigation) -> str:
+def _investigation_html(value: Investigation) -> str:
     said = _pre(value.summary())
     return _div(
-        paragraph(investigation_report.summary_sentence(value)), investigation_report.probabilities_figure(value), said
+        paragraph(investigation_report.summary_sentence(value)),
+        investigation_report.probabilities_figure_html(value),
+        said,
     )

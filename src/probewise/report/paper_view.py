@@ -46,7 +46,7 @@ def paper_view(
     title: str = "",
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the entropy map after a reading, with the circles, as the paper does.
+    """Draw the robot's view after a reading as the paper does: a fine entropy map, with the sampled circles.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def paper_view(
 
 
 def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, float, float]:
-    """Return the limits of a window that holds all readings and each run's circles sampled after reading `first`.
+    """Return the limits (mm) of a window that holds all readings and each run's circles sampled after reading `first`.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def window_mm(runs: Sequence[Exploration], first: int) -> tuple[float, float, fl
 
 
 def _reachable_on_fine_grid(coarse: Grid, fine: Grid, reachable: BoolArray) -> BoolArray:
-    """Return which places of the finer grid are reachable, (n_places,), by the nearest place of the robot's grid."""
+    """Return the mask of reachable places on the finer grid, (n_places,), by the nearest place of the robot's grid."""
     rows = np.rint(np.linspace(0, coarse.n_y - 1, fine.n_y)).astype(np.int64)
     columns = np.rint(np.linspace(0, coarse.n_x - 1, fine.n_x)).astype(np.int64)
     return np.asarray(reachable.reshape(coarse.n_y, coarse.n_x)[np.ix_(rows, columns)].ravel())

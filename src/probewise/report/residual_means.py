@@ -33,7 +33,7 @@ class ResidualMeans:
     size: IntArray
 
     @property
-    def largest_in_sds(self) -> float:
+    def largest_mean_in_sds(self) -> float:
         """Largest absolute mean of the calibrated model's residuals, in sds of that mean under chance."""
         return float(np.max(np.abs(self.before) / np.maximum(self.chance / 1.96, 1e-300), initial=0.0))
 
@@ -93,7 +93,7 @@ def _groups_by_value(values: FloatArray) -> list[IntArray]:
 
 
 def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> list[IntArray]:
-    """Group rows in equal steps of the covariate; join small neighbouring groups, but keep the window separate."""
+    """Group rows by equal steps of the covariate; small neighbours are joined, but not across the window's ends."""
     if values.size == 0:
         return []
     if window is None:
@@ -105,7 +105,7 @@ def _groups_in_steps(values: FloatArray, window: tuple[float, float] | None) -> 
 
 
 def _groups_of_part(values: FloatArray, rows: IntArray, least: int) -> list[IntArray]:
-    """Group rows in equal steps of the covariate; in equal numbers where most rows share a few values."""
+    """Group some of the rows, by equal steps of the covariate; in equal numbers where most rows share a few values."""
     mine = values[rows]
     share = float(np.ptp(mine)) / max(float(np.ptp(values)), 1e-300)
     n = int(np.clip(round(_STEPS * share), 1, _MOST_STEPS))
@@ -134,7 +134,7 @@ def _merged_groups(parts: Sequence[IntArray], least: int) -> list[IntArray]:
 
 
 def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float) -> float:
-    """Return the variance of the mean of readings with AR(1) noise."""
+    """Return the variance of the mean of some rows' noise, which is AR(1) within scans."""
     own = np.zeros(len(scan))
     own[rows] = sd[rows]
     variance = float(own @ own)
@@ -144,12 +144,15 @@ def _variance_of_mean(rows: IntArray, sd: FloatArray, scan: IntArray, rho: float
 
 
 def _longest_lag(rho: float) -> int:
-    """Return the lag at which an AR(1) correlation falls below a hundredth."""
+    """Return the lag at which an AR(1) correlation falls below a hundredth; 0 if it is that small, or not below 1."""
     return math.ceil(math.log(0.01) / math.log(abs(rho))) if 0.01 < abs(rho) < 1 else 0
 
 
-def running_mean(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the means of x and y in groups of neighbours in x: at most 20 groups, of four points or more."""
+def running_mean_curve(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the points of a running mean, means of x and of y, (n_groups,) each.
+
+    Groups are of equal numbers of neighbours in x: at most 20, of four points or more.
+    """
     ok = np.isfinite(x) & np.isfinite(y)
     x, y = x[ok], y[ok]
     if x.size == 0:

@@ -24,7 +24,7 @@ class RobotSearch:
 
     @property
     def largest_error_mm(self) -> float:
-        """Largest absolute error of a parameter, in mm."""
+        """Largest absolute error of a place or length at the end, in mm."""
         last = self.run.last
         return max(
             abs(float(mean) - self.truth[name])
@@ -33,12 +33,12 @@ class RobotSearch:
         )
 
     @property
-    def first_white(self) -> int:
-        """Number of the first reading closer to white than to black: reaching it is luck, whatever the model."""
+    def readings_until_first_white(self) -> int:
+        """Number, from 1, of the first reading closer to white than to black; that of the last one if none is."""
         middle = sum(self.levels) / 2
         seen = [r.value > middle for r in self.run.readings]
         return seen.index(True) + 1 if any(seen) else len(seen)
 
-    def step_at(self, n: int) -> int:
+    def step_number_after(self, n: int) -> int:
         """Return the number of the step after `n` readings, or of the last step if the run ended earlier."""
         return min(n, len(self.run.steps))

@@ -122,12 +122,12 @@ def tiles_of(sheet: Sheet, paper: str) -> tuple[Tile, ...]:
     Raises
     ------
     ParameterError
-        If it needs hundreds of pages, or the paper size is unknown.
+        If it needs more than 400 pages, or the paper size is unknown.
     """
     if paper not in PAPERS_MM:
         raise ParameterError("paper", paper, " or ".join(PAPERS_MM))
     width, height = PAPERS_MM[paper]
-    ways = [(_pages_needed(sheet, page), page) for page in ((width, height), (height, width))]
+    ways = [(_pages_across_and_up(sheet, page), page) for page in ((width, height), (height, width))]
     (n_columns, n_rows), page = min(ways, key=lambda way: way[0][0] * way[0][1])
     if n_columns * n_rows > _MOST_PAGES:
         w, h = sheet.size_mm
@@ -158,7 +158,7 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
     patterns
         By name.
     plan
-        The plan; patterns that it does not use are left out. None: sheets of default size.
+        The plan; patterns that it does not use are left out. None: the sheets show each pattern's own extent.
     """
     sheets = []
     for name, pattern in patterns.items():
@@ -180,13 +180,13 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
 
 def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
     """Make the sheet of the black field with a white target of the given outline, (n, 2), in place."""
-    pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_corner_pairs(outline_mm))
+    pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_vertices_without_closing(outline_mm))
     said = "all black" if outline_mm is None else "black, the target white at its place"
     return Sheet("field", pattern, (0.0, 0.0), field_mm, (said,), frame="the field's lower left corner")
 
 
 def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
-    """Make a white target of the given outline, (n, 2), to cut out and lay on a black field."""
+    """Make the sheet of a white target of the given outline, (n, 2), to cut out and lay on a black field."""
     low = np.floor((outline_mm.min(axis=0) - _ROUND_MM) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((outline_mm.max(axis=0) + _ROUND_MM) / _ROUND_MM) * _ROUND_MM
     lines = ("white: cut it out along the line and lay it on the black field",)
@@ -223,7 +223,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     crosses = np.array([*joints, face])
     beams = [_beam_outline(a, b) for a, b in itertools.pairwise(joints)]
     drawn = np.concatenate([crosses, *beams, [[0.0, 0.0]]])
-    low, high = _sheet_around(drawn, _JIG_MM)
+    low, high = _corners_around(drawn, _JIG_MM)
     if drawn[:, 1].min() >= 0:
         low = low[0], 0.0  # cut there, the sheet stands on the table
     middles = [(a + b) / 2 for a, b in itertools.pairwise(joints)]
@@ -259,7 +259,7 @@ def jig_sheets(geometry: Geometry) -> tuple[Sheet, Sheet]:
     axis, out = np.array(geometry.axis_mm), float(face[0])
     along = np.array([math.cos(base), math.sin(base)])
     rest = axis + out * along
-    low, high = _sheet_around(np.array([axis, rest]), _JIG_BASE_MM)
+    low, high = _corners_around(np.array([axis, rest]), _JIG_BASE_MM)
     x_low, y_low, x_high, y_high = *low, *high
     width, height = geometry.field_mm
     edges = [np.array([[max(x_low, 0.0), y], [min(x_high, width), y]]) for y in (0.0, height) if y_low < y < y_high]
@@ -295,25 +295,25 @@ def _beam_outline(start_mm: FloatArray, end_mm: FloatArray) -> FloatArray:
     return np.concatenate([*ends, ends[0][:1]])
 
 
-def _sheet_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def _corners_around(points_mm: FloatArray, margin_mm: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the lower left and upper right corner of a sheet that shows points, (n, 2), with a margin."""
     low = np.floor((points_mm.min(axis=0) - margin_mm) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((points_mm.max(axis=0) + margin_mm) / _ROUND_MM) * _ROUND_MM
     return _two_floats(low), _two_floats(high)
 
 
-def _pages_needed(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
+def _pages_across_and_up(sheet: Sheet, page_mm: tuple[float, float]) -> tuple[int, int]:
     width, height = page_mm[0] - LEFT_MM - RIGHT_MM, page_mm[1] - BOTTOM_MM - TOP_MM
     w, h = sheet.size_mm
-    return _n_pages(w, width), _n_pages(h, height)
+    return _n_pages_along(w, width), _n_pages_along(h, height)
 
 
-def _n_pages(length_mm: float, room_mm: float) -> int:
+def _n_pages_along(length_mm: float, room_mm: float) -> int:
     return 1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
 
 
 def _places_to_show(pattern: Pattern) -> FloatArray:
-    """Return places that a sheet must show when there is no plan, (n, 2)."""
+    """Return places of a pattern that its sheet must show when there is no plan, (n, 2)."""
     match pattern:
         case Disc((x, y), radius):
             return np.array([[x - radius, y - radius], [x + radius, y + radius]])
@@ -331,7 +331,7 @@ def _places_to_show(pattern: Pattern) -> FloatArray:
             return np.array([[-AROUND_MM, 0.0], [AROUND_MM, 0.0]])
 
 
-def _corner_pairs(outline_mm: FloatArray) -> tuple[tuple[float, float], ...]:
+def _vertices_without_closing(outline_mm: FloatArray) -> tuple[tuple[float, float], ...]:
     return tuple((x, y) for x, y in outline_mm[:-1].tolist())
 
 

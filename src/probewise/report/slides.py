@@ -11,7 +11,7 @@ from PIL import Image
 _COLOURS = 256
 
 
-def side_by_side(left: Sequence[bytes], right: Sequence[bytes]) -> list[bytes]:
+def join_side_by_side(left: Sequence[bytes], right: Sequence[bytes]) -> list[bytes]:
     """Join the pictures of two runs step by step; the shorter run keeps its last picture.
 
     Parameters

@@ -31,7 +31,7 @@ _INTERVALS = (
 
 
 def summary_sentence(study: Study) -> str:
-    """Summarise in one sentence how many readings the study's first row needs."""
+    """Summarise the study's first row: mean and median readings, and the share of runs that reached the precision."""
     row, found = next(iter(study.table().items()))
     share = "All" if found.reached.value == 1 else f"{number(100 * found.reached.value, 1)} % of the"
     return (
@@ -40,8 +40,8 @@ def summary_sentence(study: Study) -> str:
     )
 
 
-def table_of_rows(study: Study) -> Markup:
-    """Build two tables with a line for each row of the study: readings needed; information, errors and cost."""
+def result_tables(study: Study) -> Markup:
+    """Build two tables, each with a line for every row of the study: readings needed; information, errors and cost."""
     readings = (
         "row",
         "runs",
@@ -67,7 +67,7 @@ def table_of_rows(study: Study) -> Markup:
     )
 
 
-def table_of_bounds(study: Study) -> Markup | None:
+def lower_bound_table(study: Study) -> Markup | None:
     """Build the table of a lower bound, for any strategy, on the mean number of readings, beside the measured mean.
 
     None if the study has no row to which the bound applies: default options and the correct sensor model.
@@ -76,8 +76,8 @@ def table_of_bounds(study: Study) -> Markup | None:
     for row, found in study.table().items():
         if row == replace(REFERENCE, population=row.population, noise_sd=row.noise_sd):
             least = least_readings(experiment_of(row), rng=np.random.default_rng(0))
-            search = _ratio_words(least.search_bits, least.search_capacity_bits)
-            refinement = _ratio_words(least.refinement_bits, least.capacity_bits)
+            search = _bits_over_capacity(least.search_bits, least.search_capacity_bits)
+            refinement = _bits_over_capacity(least.refinement_bits, least.capacity_bits)
             lines.append(
                 (row.name, search, _estimate_words(found.to_white), refinement, _estimate_words(found.after_white))
             )
@@ -92,7 +92,7 @@ def table_of_bounds(study: Study) -> Markup | None:
 
 
 def table_csv(study: Study) -> str:
-    """Write the table as CSV: every estimate with its bounds; processor times, which vary, are left out."""
+    """Return the table as text of a CSV file: estimates with bounds; processor times, which vary, are left out."""
     bounds = [f"{name}{end}" for name, _ in _COLUMNS for end in ("", "_low", "_high")]
     rows = []
     for row, found in study.table().items():
@@ -103,8 +103,8 @@ def table_csv(study: Study) -> str:
     return csv_text_of_rows(["row", "runs", *bounds, "error_mm", "wrong", "wrong_expected", "wrong_limit"], rows)
 
 
-def write_page(study: Study, *, command: str) -> str:
-    """Write the whole page; `command` is what made it."""
+def page_html(study: Study, *, command: str) -> str:
+    """Return the page's HTML; `command` is the command line that made it."""
     summaries = study.table()
     curves = {
         row.name: [np.asarray(t["widest_mm"], dtype=np.float64) for t in study.trials[row]]
@@ -118,7 +118,7 @@ def write_page(study: Study, *, command: str) -> str:
         png(readings_needed({row.name: found for row, found in summaries.items()})),
         f"Readings until every length is known to 4 mm, of at most {study.max_readings}; a miss counts as that many.",
     )
-    sections = [Section("The table", (table_of_rows(study), _legend()))]
+    sections = [Section("The table", (result_tables(study), _table_legend()))]
     if curves:
         drawn = figure(
             png(posterior_widths_of_runs(curves)),
@@ -126,7 +126,7 @@ def write_page(study: Study, *, command: str) -> str:
             "width.",
         )
         sections.insert(0, Section("How fast", (drawn,)))
-    least = table_of_bounds(study)
+    least = lower_bound_table(study)
     if least is not None:
         bounds = paragraph(
             "Bits needed over the capacity of a reading in bits. Up to the first reading on white, a reading answers "
@@ -138,7 +138,7 @@ def write_page(study: Study, *, command: str) -> str:
     return page("How many measurements?", answer=summary_sentence(study), key_figure=needed, sections=sections)
 
 
-def _legend() -> Markup:
+def _table_legend() -> Markup:
     return paragraph(
         "± is the standard error. Every row uses the same circles and the same noise. On white: "
         "a reading at least a tenth of the way from dark to bright. Error: of the worst length, median over the runs "
@@ -178,7 +178,7 @@ def _information_row(row: Row, found: Summary) -> tuple[str, ...]:
     )
 
 
-def _ratio_words(bits: float, capacity_bits: float) -> str:
+def _bits_over_capacity(bits: float, capacity_bits: float) -> str:
     return f"{number(bits / capacity_bits, 1)} = {number(bits, 1)} / {number(capacity_bits, 2)}"
 
 

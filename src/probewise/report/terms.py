@@ -38,7 +38,10 @@ TERMS: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 def explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
-    """Explain the terms that a text of HTML uses and that are not in `known`; add them to `known`."""
+    """Build the paragraph that explains the terms of an HTML text which are not in `known`, and add them to `known`.
+
+    Empty if there is none.
+    """
     text = html.unescape(re.sub(r"<style.*?</style>|<[^>]*>", " ", content, flags=re.S))
     new: list[str] = []
     while text:  # an explanation may use a term itself
@@ -51,5 +54,5 @@ def explain_new_terms(content: str, known: set[str]) -> tuple[Markup, ...]:
 
 
 def with_explanations(sections: Sequence[Section], known: set[str]) -> list[Section]:
-    """Add to each section the explanations of the terms that it uses first."""
+    """Return the sections, each with a paragraph on the terms that it is the first to use; add them to `known`."""
     return [replace(s, body=(*s.body, *explain_new_terms(" ".join((s.heading, *s.body)), known))) for s in sections]

@@ -15,13 +15,16 @@ def number(value: float, digits: int) -> str:
 
 
 def with_error(value: float, error: float, unit: str = "") -> str:
-    """Write a value with its error, both to the error's second significant digit, so that no error shows as zero."""
+    """Write a value with its error, both to the error's second significant digit, so that no error shows as zero.
+
+    A dash if the value is not finite; the value alone if the error is not above zero.
+    """
     if not math.isfinite(value):
         return "–"
     if not (math.isfinite(error) and error > 0):
         written = f"{value:.6g}"
     elif -6 < (digits := 1 - math.floor(math.log10(error))) <= 8:
-        written = f"{signed(value, max(digits, 0))} ± {number(error, max(digits, 0))}"
+        written = f"{number_unsigned_zero(value, max(digits, 0))} ± {number(error, max(digits, 0))}"
     else:
         written = f"{value:.3g} ± {error:.1g}"
     return typeset(f"{written} {unit}".rstrip()).replace("-", "−")
@@ -33,18 +36,18 @@ def interval(low: float, high: float) -> str:
     if not (math.isfinite(width) and width > 0):
         return "–" if not math.isfinite(low) else f"{low:.6g}"
     digits = min(max(2 - math.floor(math.log10(width)), 0), 8)
-    return f"{signed(low, digits)} to {signed(high, digits)}"
+    return f"{number_unsigned_zero(low, digits)} to {number_unsigned_zero(high, digits)}"
 
 
 def value_and_interval(value: float, low: float, high: float) -> tuple[str, str]:
-    """Write a value and its interval with the same decimals: to the third significant digit of the interval's width."""
+    """Return texts of a value and of its interval, to the third significant digit of the interval's width."""
     ends = interval(low, high)
     decimals = len(ends.partition(" ")[0].partition(".")[2])
-    return (signed(value, decimals) if high > low else f"{value:.6g}"), ends
+    return (number_unsigned_zero(value, decimals) if high > low else f"{value:.6g}"), ends
 
 
 def unit_of(name: str) -> str:
-    """Return the unit at the end of a parameter's name, or ""."""
+    """Return the unit as written that a parameter's name ends with: "mm" of x_mm, "°" of turn_deg; "" if none."""
     stem, _, suffix = name.rpartition("_")
     return _UNITS.get(suffix, "") if stem else ""
 
@@ -55,19 +58,19 @@ def without_unit(name: str) -> str:
     return stem.replace("_", " ").replace(".", " ")
 
 
-def signed(value: float, digits: int) -> str:
-    """Write a signed number; one that rounds to zero has no sign."""
+def number_unsigned_zero(value: float, digits: int) -> str:
+    """Write a number with fixed decimals as `number` does, but without a minus sign if it rounds to zero."""
     return number(value if abs(value) >= 0.5 * 10**-digits else 0.0, digits)
 
 
 def typeset(text: str) -> str:
     """Typeset the numbers in a text: 2 × 10⁻⁷ for 2e-07, true minus signs, no line break within "p = 0.2"."""
 
-    def power(found: re.Match[str]) -> str:
+    def power_of_ten(found: re.Match[str]) -> str:
         return f"{found[1]}\u00a0×\u00a010{str(int(found[2])).translate(_RAISED)}"
 
     together = re.sub(r"\bp ([=<]) (?=\d)", "p\u00a0\\1\u00a0", text)
-    return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power, together))
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", re.sub(r"(\d)e([+-]\d+)", power_of_ten, together))
 
 
 def count(n: int, noun: str) -> str:
@@ -76,7 +79,7 @@ def count(n: int, noun: str) -> str:
 
 
 def unit_name(unit: str) -> str:
-    """Write a unit after a number: the LEGO brick's are "LEGO units", all others are unchanged."""
+    """Return a unit as written after a number: "LEGO units" for "LEGO"; all others are unchanged."""
     return "LEGO units" if unit == "LEGO" else unit
 
 

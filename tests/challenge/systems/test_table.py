@@ -4,7 +4,7 @@ import pytest
 
 from probewise.challenge.systems import name_without_target, score_systems
 from probewise.challenge.systems.table import gains_on_held_out_runs
-from probewise.report.challenge import write_page
+from probewise.report.challenge import page_html
 
 
 def _hidden(name, size=12.0, *, rivals=None, on_the_list=True, shows_in=("time",)):
@@ -140,6 +140,6 @@ def test_the_page_tells_every_case():
     failed = {"kind": "single", "size": 12.0, "other_noise": False, "failed": "ParameterError: no", "at": "diagnosis"}
     strange = _case("outside", 20.0, truth=["unknown"], hides=[_hidden("strange_switch:u", 20.0, on_the_list=False)])
     results = [_case(), _single("drifts:k"), strange, failed]
-    text = write_page(results, score_systems(results), command="probewise challenge", systems=True)
+    text = page_html(results, score_systems(results), command="probewise challenge", systems=True)
     for expected in ("drifts:k", "strange_switch:u", "ParameterError: no", "right covariate first, lambda 12"):
         assert expected in text

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.effects import public_name
-from probewise.report.effect_words import FORMS_IN_WORDS, effect_in_words, is_in_words
+from probewise.report.effect_words import FORMS_IN_WORDS, effect_has_words, effect_in_words
 from probewise.systems import Law, Noise, RunTable, Simulator, System
 from probewise.systems.forms import ReferenceFit, forms_of
 from probewise.world.systems.vocabulary import FAMILIES
@@ -41,7 +41,7 @@ def test_every_form_has_a_counterpart_in_the_world_that_conceals(names):
 
 
 def test_the_report_has_words_for_every_form(names):
-    assert [name for name in names if not is_in_words(name)] == []
+    assert [name for name in names if not effect_has_words(name)] == []
     assert {effect_in_words(name).count("{") for name in names} == {0}
 
 

@@ -19,9 +19,9 @@ from probewise.report.plots.doubt import effect_probabilities_by_reading
 from probewise.report.plots.fit import predicted_and_recorded
 from probewise.report.plots.nested import corner_plot, insertion_plot, run_plot, trace_plot
 from probewise.report.plots.noise import (
-    correlation_of_neighbours,
-    lattice_of_readings,
     lost_readings,
+    readings_modulo_step,
+    residual_autocorrelation,
     residual_histogram,
     spread_by_level,
 )
@@ -52,7 +52,6 @@ __all__ = [
     "calibration_check",
     "confusion_matrix",
     "corner_plot",
-    "correlation_of_neighbours",
     "doubt_against_trust",
     "effect_probabilities_by_reading",
     "field_legend",
@@ -61,7 +60,6 @@ __all__ = [
     "hypothesis_probabilities",
     "information_gained",
     "insertion_plot",
-    "lattice_of_readings",
     "log_evidences",
     "lost_readings",
     "mean_residuals_along",
@@ -76,8 +74,10 @@ __all__ = [
     "reach_map",
     "readings_by_orientation",
     "readings_in_order",
+    "readings_modulo_step",
     "readings_needed",
     "reliability_diagram",
+    "residual_autocorrelation",
     "residual_histogram",
     "residuals_against",
     "residuals_against_covariates",
@@ -116,3 +116,9 @@ residual_clouds = residuals_against_covariates
 
 widths_of_runs = posterior_widths_of_runs
 """The old name of `posterior_widths_of_runs`."""
+
+correlation_of_neighbours = residual_autocorrelation
+"""The old name of `residual_autocorrelation`."""
+
+lattice_of_readings = readings_modulo_step
+"""The old name of `readings_modulo_step`."""

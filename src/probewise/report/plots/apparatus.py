@@ -59,8 +59,8 @@ def arm_and_sensor(
     axes = grid_of_axes(1, 3, size_in=(9.6, 3.3), width_ratios=[1.75, 1.6, 0.75])
     side, above, face = axes[0]
     lower = shoulder + elbow if geometry.elbow_is_relative else elbow
-    _draw_side(side, geometry, shoulder, lower)
-    _draw_above(above, geometry, place_mm, outline_mm)
+    _draw_arm_from_side(side, geometry, shoulder, lower)
+    _draw_arm_from_above(above, geometry, place_mm, outline_mm)
     draw_sensor_face(face, size=1.0)
     face.set_axis_off()
     face.set(xlim=(-0.95, 0.95), ylim=(-0.95, 0.95), aspect="equal")
@@ -103,7 +103,7 @@ def arm_lengths(geometry: Geometry, away_mm: float | None = None, *, ax: Axes | 
     joint = np.array([forward, height])
     knee = joint + upper_mm * np.array([np.cos(shoulder), np.sin(shoulder)])
     wrist = knee + lower_mm * np.array([np.cos(lower), np.sin(lower)])
-    _draw_side(ax, geometry, shoulder, lower, named=False)
+    _draw_arm_from_side(ax, geometry, shoulder, lower, named=False)
     across = 40.0 * np.array([-np.sin(shoulder), np.cos(shoulder)])
     _draw_dimension(ax, joint, knee, across, f"upper_mm {upper_mm:g}")
     _draw_dimension(ax, knee, wrist, 40.0 * np.array([-np.sin(lower), np.cos(lower)]), f"lower_mm {lower_mm:g}")
@@ -190,7 +190,7 @@ def draw_sensor_face(
         ax.add_patch(part)
 
 
-def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, named: bool = True) -> None:
+def _draw_arm_from_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, named: bool = True) -> None:
     forward, height = geometry.shoulder_mm
     joint = np.array([forward, height])
     knee = joint + geometry.links_mm[0] * np.array([np.cos(shoulder), np.sin(shoulder)])
@@ -223,7 +223,9 @@ def _draw_side(ax: Axes, geometry: Geometry, shoulder: float, lower: float, *, n
     label_axes(ax, x="distance from the arm's axis (mm)", y="height (mm)", title="from the side")
 
 
-def _draw_above(ax: Axes, geometry: Geometry, place_mm: tuple[float, float], outline_mm: FloatArray | None) -> None:
+def _draw_arm_from_above(
+    ax: Axes, geometry: Geometry, place_mm: tuple[float, float], outline_mm: FloatArray | None
+) -> None:
     width, height = geometry.field_mm
     ax.add_patch(Rectangle((0, 0), width, height, fc="#222222", ec=BLACK))
     if outline_mm is not None:

@@ -41,7 +41,7 @@ def reach_map(
     """
     ax = axes_or_new(ax, size_in=(8.2, 5.0))
     dx, dy = (x_mm[1] - x_mm[0]) / 2, (y_mm[1] - y_mm[0]) / 2
-    degrees = _unwrapped_degrees(np.degrees(orientation_rad))
+    degrees = _unwrapped_about_mean_deg(np.degrees(orientation_rad))
     image = ax.imshow(
         np.ma.masked_invalid(degrees),
         origin="lower",
@@ -49,18 +49,18 @@ def reach_map(
         cmap="cividis",
         interpolation="nearest",
     )
-    levels = _lines_within(degrees)
+    levels = _contour_levels_deg(degrees)
     if levels.size:
         style: dict[str, Any] = {"colors": "white", "linewidths": 0.8, "linestyles": "solid"}
         lines = ax.contour(x_mm, y_mm, np.ma.masked_invalid(degrees), levels, **style)
-        for label in ax.clabel(lines, fmt=_angle, fontsize=SMALL_PT):
+        for label in ax.clabel(lines, fmt=_angle_text, fontsize=SMALL_PT):
             label.set_path_effects([withStroke(linewidth=2.0, foreground=BLACK)])
     left, right, low, high = image.get_extent()
     paint_out_of_reach(ax)
     add_colour_bar(ax, image, "orientation of the sensor (degrees)")
     bar = ax.child_axes[-1].yaxis
     bar.set_major_locator(MultipleLocator(_LINES_DEG) if levels.size else MaxNLocator())
-    bar.set_major_formatter(FuncFormatter(lambda angle, _: _angle(angle)))
+    bar.set_major_formatter(FuncFormatter(lambda angle, _: _angle_text(angle)))
     ax.add_patch(Rectangle((left, low), right - left, high - low, fill=False, edgecolor=BLACK, linewidth=0.8))
     ax.plot(*axis_mm, marker="o", markersize=9, color=BLACK)
     ax.annotate("arm's axis", axis_mm, textcoords="offset points", xytext=(8, 0), va="center", fontsize=SMALL_PT)
@@ -72,21 +72,21 @@ def reach_map(
     return label_axes(ax, x="x (mm)", y="y (mm)", title=title)
 
 
-def _unwrapped_degrees(degrees: FloatArray) -> FloatArray:
-    """Unwrap angles about their mean direction, so that 179 and -179 degrees are neighbours on the colour scale."""
+def _unwrapped_about_mean_deg(degrees: FloatArray) -> FloatArray:
+    """Shift angles by full turns to within 180 degrees of their mean, so that 179 and -179 are neighbours in colour."""
     known = np.radians(degrees[np.isfinite(degrees)])
     middle = float(np.degrees(np.angle(np.exp(1j * known).sum()))) if known.size else 0.0
     return np.asarray(middle + np.mod(degrees - middle + 180.0, 360.0) - 180.0)
 
 
-def _lines_within(degrees: FloatArray) -> FloatArray:
-    """Return the angles at which contours are drawn, (n_lines,)."""
+def _contour_levels_deg(degrees: FloatArray) -> FloatArray:
+    """Return the multiples of 15 degrees at which contours are drawn, (n_lines,); none if no angle is finite."""
     known = degrees[np.isfinite(degrees)]
     if not known.size:
         return known
     return np.arange(np.ceil(known.min() / _LINES_DEG) * _LINES_DEG, known.max(), _LINES_DEG)
 
 
-def _angle(degrees: float) -> str:
-    """Write an angle between -180 and 180 degrees with a true minus sign."""
+def _angle_text(degrees: float) -> str:
+    """Write an angle, taken to between -180 and 180 degrees, without decimals and with a true minus sign."""
     return number((degrees + 180.0) % 360.0 - 180.0, 0)

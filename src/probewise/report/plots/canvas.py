@@ -1,7 +1,7 @@
 """Figures and axes, the palette, legends, and rendering to PNG and SVG.
 
-Without axes, a plot function opens a pyplot figure, so that `plt.savefig` and `plt.show` find it; `png` closes it
-again, so that a page of many pictures leaves none open.
+Without axes, a plot function opens a pyplot figure, so that `plt.savefig` and `plt.show` find it; `png` and
+`svg` close it, so that a page of many pictures leaves none open.
 """
 
 from __future__ import annotations
@@ -30,7 +30,16 @@ from probewise.report.words import typeset
 
 __all__ = ["BLACK", "BLUE", "COPPER", "CYCLE", "GREEN", "GREY", "ORANGE", "PURPLE", "SKY", "VERMILLION", "YELLOW"]
 __all__ += ["OUT_OF_REACH", "PAGE_IN", "SMALL_PT", "AxesGrid", "axes_or_grid", "axes_or_new", "grid_of_axes"]
-__all__ += ["label_axes", "legend_above", "legend_below", "new_figure", "plain_numbers", "png", "stack_of_axes", "svg"]
+__all__ += [
+    "label_axes",
+    "legend_above",
+    "legend_below",
+    "new_figure",
+    "png",
+    "set_plain_tick_labels",
+    "stack_of_axes",
+    "svg",
+]
 
 _LETTERS_PER_IN = 16.2  # letters per inch of a legend, about
 _LINE_SAMPLE = 6  # letters that the sample of the line or colour before a label takes
@@ -68,7 +77,7 @@ def axes_or_new(ax: Axes | None, *, size_in: tuple[float, float] = (6.4, 4.2)) -
 
 
 def grid_of_axes(n_rows: int, n_columns: int, *, size_in: tuple[float, float], **options: Any) -> AxesGrid:
-    """Open a figure of several axes, shape (n_rows, n_columns); options go to `Figure.subplots`."""
+    """Open a figure and return its axes, (n_rows, n_columns); options go to `Figure.subplots`."""
     return np.asarray(
         new_figure(size_in, layout="constrained").subplots(n_rows, n_columns, squeeze=False, **options),
         dtype=np.object_,
@@ -93,14 +102,14 @@ def axes_or_grid(
 
 
 def new_figure(size_in: tuple[float, float], *, layout: Any = None) -> Figure:
-    """Open a pyplot figure, which `png` closes."""
+    """Open a pyplot figure, which `png` or `svg` will close."""
     sheet = plt.figure(figsize=size_in, layout=layout)
     _OPENED.add(sheet)
     return sheet
 
 
 def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True) -> bytes:
-    """Render the figure that holds a drawing; one that a plot function opened is closed, others stay open.
+    """Render the figure of a drawing as PNG; a figure that a plot function opened is closed, others stay open.
 
     Parameters
     ----------
@@ -124,7 +133,7 @@ def png(drawing: Axes | AxesGrid | Figure, *, dpi: int = 110, tight: bool = True
 
 
 def stack_of_axes(heights_in: Sequence[float], *, width_in: float = 6.8) -> AxesGrid:
-    """Open a figure of stacked axes, shape (n_axes,); `svg` computes their margins in one pass."""
+    """Open a figure and return its axes, one above the other, (n_axes,); `svg` computes their margins."""
     sheet = new_figure((width_in, sum(heights_in)))
     axes = sheet.subplots(len(heights_in), 1, squeeze=False, height_ratios=list(heights_in))
     return np.asarray(axes[:, 0], dtype=np.object_)
@@ -157,7 +166,7 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
         return 0
     room = _LETTERS_PER_IN * ax.get_position().width * cast(Figure, ax.figure).get_figwidth()
     labels = [textwrap.fill(label, max(int(room) - _LINE_SAMPLE, 1)) for label in labels]
-    n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width(labels, n) < room), 1)
+    n_columns = next((n for n in range(len(labels), 1, -1) if _legend_width_letters(labels, n) < room), 1)
     ax.legend(
         handles,
         labels,
@@ -172,21 +181,21 @@ def legend_above(ax: Axes, *, title: str = "") -> int:
         borderaxespad=0.1,
         columnspacing=1.2,
     )
-    return max(map(len, _legend_columns(labels, n_columns)))
+    return max(map(len, _lines_of_legend_columns(labels, n_columns)))
 
 
-def _legend_width(labels: Sequence[str], n_columns: int) -> int:
+def _legend_width_letters(labels: Sequence[str], n_columns: int) -> int:
     """Estimate a legend's width in letters."""
-    return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _legend_columns(labels, n_columns))
+    return sum(max(map(len, lines)) + _LINE_SAMPLE for lines in _lines_of_legend_columns(labels, n_columns))
 
 
-def _legend_columns(labels: Sequence[str], n_columns: int) -> list[list[str]]:
-    """Return the lines of each column of a legend: matplotlib fills its first columns first."""
+def _lines_of_legend_columns(labels: Sequence[str], n_columns: int) -> list[list[str]]:
+    """Return the lines of text in each column of a legend, which matplotlib fills from the left."""
     columns = np.array_split(np.array(labels, dtype=np.object_), n_columns)
     return ["\n".join(column).split("\n") for column in columns]
 
 
-def plain_numbers(ax: Axes, *, x: bool = True, y: bool = True) -> None:
+def set_plain_tick_labels(ax: Axes, *, x: bool = True, y: bool = True) -> None:
     """Write tick labels in full, without a separate factor or offset."""
     for axis in ([ax.xaxis] if x else []) + ([ax.yaxis] if y else []):
         low, high = axis.get_view_interval()

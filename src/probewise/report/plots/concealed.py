@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from probewise.report.effect_words import effect_in_words, is_in_words
+from probewise.report.effect_words import effect_has_words, effect_in_words
 from probewise.report.plots.canvas import (
     BLUE,
     GREY,
@@ -29,7 +29,7 @@ _PANELS = (
 
 def row_name(row: ConcealedRow) -> str:
     """Name a row: the concealed effect in words, and its size."""
-    name = effect_in_words(row.concealed) if is_in_words(row.concealed) else row.concealed.replace("_", " ")
+    name = effect_in_words(row.concealed) if effect_has_words(row.concealed) else row.concealed.replace("_", " ")
     return name if row.size is None else f"{name}, {row.size:g}"
 
 

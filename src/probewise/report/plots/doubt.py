@@ -18,7 +18,8 @@ _CLEAN, _REST = "#D9D9D9", "#7F7F7F"
 def effect_probabilities_by_reading(left_out: Sequence[Mapping[str, float]], *, ax: Axes | None = None) -> Axes:
     """Draw one stacked bar per reading: the probability of each effect that the sensor model may leave out.
 
-    A dashed line marks each reading after which the most probable effect changes.
+    A dashed line before a bar marks a reading that changed the most probable effect. The five effects of the highest
+    probability have colours; the others are one part.
 
     Parameters
     ----------

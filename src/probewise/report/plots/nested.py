@@ -68,7 +68,7 @@ def trace_plot(
     -------
     Axes, (1 + number of parameters drawn, 2).
     """
-    columns = _columns(result, parameters)
+    columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
     height = 1.5 if n <= _FEW else 1.15
     axes = axes_or_grid(
@@ -85,7 +85,7 @@ def trace_plot(
     top.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
     top.plot(depth, mass, color=BLUE, linewidth=1.2)
     top.set_ylim(bottom=0)
-    label_axes(top, x="", y="posterior\nper nat", title=_evidence(result))
+    label_axes(top, x="", y="posterior\nper nat", title=_evidence_text(result))
     key.axis("off")
     scale = ScalarMappable(Normalize(0, 1), _WEIGHT)
     place = key.inset_axes((0.05, 0.42, 0.9, 0.16))
@@ -107,9 +107,9 @@ def trace_plot(
             rasterized=True,
         )
         last = row == n
-        label_axes(trace, x=_DEPTH if last else "", y=_label(result.names[i]))
+        label_axes(trace, x=_DEPTH if last else "", y=_parameter_label(result.names[i]))
         span = _axis_limits(result, i)
-        centres, density = _smoothed_density(values, result.weight, span, result.n_eff)
+        centres, density = _centres_and_smoothed_density(values, result.weight, span, result.n_eff)
         side.fill_betweenx(centres, density, color=BLUE, alpha=0.25, lw=0)
         side.plot(density, centres, color=BLUE, linewidth=1.2)
         side.set_xlim(left=0)
@@ -141,7 +141,7 @@ def corner_plot(
     Parameters
     ----------
     result
-        The run.
+        The run, or weighted samples.
     parameters
         Names of the parameters to draw, in this order; default: all.
     axes
@@ -151,7 +151,7 @@ def corner_plot(
     -------
     Axes, (n, n), of the n parameters drawn; None above the diagonal.
     """
-    columns = _columns(result, parameters)
+    columns = _checked_parameter_columns(result, parameters)
     n = len(columns)
     side = (min(1.9, (PAGE_IN - _LEFT_IN - _RIGHT_IN) / n) if n <= _FEW else 1.25) if n > 1 else 3.2
     cells = _corner_axes(n, side) if axes is None else axes_or_grid(axes, n, n, size_in=(PAGE_IN, PAGE_IN))
@@ -165,7 +165,7 @@ def corner_plot(
             continue
         drawn[row, column] = ax
         if row == column:
-            _draw_one(ax, result, columns[row], spans[row], titled=n <= _FEW)
+            _draw_marginal(ax, result, columns[row], spans[row], titled=n <= _FEW)
         else:
             _draw_pair(ax, result, (columns[column], columns[row]), (spans[column], spans[row]))
             ax.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
@@ -174,12 +174,12 @@ def corner_plot(
         ax.tick_params(axis="x", labelrotation=45)
         ax.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
         if row == n - 1:
-            ax.set_xlabel(_label(result.names[columns[column]]))
+            ax.set_xlabel(_parameter_label(result.names[columns[column]]))
             ax.xaxis.set_label_coords(0.5, -0.6 / (side - _GAP_IN))
         else:
             ax.set_xticklabels([])
         if column == 0 and row > 0:
-            ax.set_ylabel(_label(result.names[columns[row]]))
+            ax.set_ylabel(_parameter_label(result.names[columns[row]]))
             ax.yaxis.set_label_coords(-0.65 / (side - _GAP_IN), 0.5)
         elif row != column:
             ax.set_yticklabels([])
@@ -190,7 +190,7 @@ def corner_plot(
         ]
         cells[0, n - 1].legend(
             handles=patches,
-            title=f"{_evidence(result)}\nposterior within",
+            title=f"{_evidence_text(result)}\nposterior within",
             loc="upper right",
             borderaxespad=0.0,
             frameon=False,
@@ -235,7 +235,7 @@ def insertion_plot(result: NestedResult, *, ax: Axes | None = None) -> Axes:
         ax.text(0.5, 0.5, "no point was inserted", transform=ax.transAxes, ha="center", va="center")
         return label_axes(ax, x="rank among the live points (0: worst, 1: best)", y="new points")
     edges = np.linspace(0.0, 1.0, int(np.clip(n / 60, 4, 25)) + 1)
-    counts = _spread_ranks(result.insertion_rank, result.insertion_n_ranked, edges)
+    counts = _new_points_per_bar(result.insertion_rank, result.insertion_n_ranked, edges)
     n_bars = len(counts)
     tail = (1.0 - 0.99 ** (1.0 / n_bars)) / 2.0
     low, high = (float(binom.ppf(q, n, 1.0 / n_bars)) for q in (tail, 1.0 - tail))
@@ -270,7 +270,7 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
 
     Returns
     -------
-    Axes, (4, 1). The likelihood's axis starts where posterior mass begins.
+    Axes, (4, 1). The likelihood's axis leaves out values far below those that carry posterior mass.
     """
     require_kind("result", result, NestedResult, "a NestedResult, as nested.run returns it")
     axes = axes_or_grid(axes, 4, 1, size_in=(7.0, 7.6), sharex=True)
@@ -281,7 +281,7 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     floor = max(float(result.log_likelihood.min()), peak - below)
     likelihood.plot(depth, result.log_likelihood, color=BLUE, linewidth=1.4)
     likelihood.set_ylim(floor - 0.03 * (peak - floor), peak + 0.05 * (peak - floor))
-    label_axes(likelihood, x="", y="ln likelihood", title=_evidence(result))
+    label_axes(likelihood, x="", y="ln likelihood", title=_evidence_text(result))
     posterior.fill_between(depth, mass, color=BLUE, alpha=0.25, lw=0)
     posterior.plot(depth, mass, color=BLUE, linewidth=1.4)
     posterior.set_ylim(bottom=0)
@@ -301,11 +301,11 @@ def run_plot(result: NestedResult, *, axes: AxesGrid | None = None) -> AxesGrid:
     return axes
 
 
-def _evidence(result: Posterior) -> str:
+def _evidence_text(result: Posterior) -> str:
     return f"ln Z = {with_error(result.log_z, result.log_z_error)}"
 
 
-def _columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
+def _checked_parameter_columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
     require_like("result", result, ("names", "theta"), "a NestedResult, as nested.run returns it, or weighted samples")
     if not result.names:
         raise ParameterError("names", result.names, "one parameter or more; without any there is nothing to draw")
@@ -317,8 +317,8 @@ def _columns(result: Posterior, parameters: Sequence[str] | None) -> list[int]:
     return [result.names.index(name) for name in parameters]
 
 
-def _label(name: str) -> str:
-    """Write a parameter's name as an axis label: unit in brackets, index as a subscript."""
+def _parameter_label(name: str) -> str:
+    """Return a parameter's axis label: its name, its unit in brackets, an index as a subscript."""
     unit = unit_of(name)
     if unit:
         return f"{without_unit(name)} ({unit})"
@@ -340,7 +340,7 @@ def _thinned_rows(n: int) -> IntArray:
 
 
 def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
-    """Return limits that hold 99 % of the posterior with a margin, within the range of the dead points."""
+    """Return the limits of a parameter's axis: 99 % of the posterior with a margin, within the range of the points."""
     values = result.theta[:, column]
     low, high = result.interval(0.99)[:, column]
     margin = 0.15 * (high - low)
@@ -351,7 +351,7 @@ def _axis_limits(result: Posterior, column: int) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def _smoothed_density(
+def _centres_and_smoothed_density(
     values: FloatArray, weight: FloatArray, span: tuple[float, float], n_eff: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the middles of 80 bins and the smoothed density of weighted values there, (80,) each.
@@ -368,8 +368,8 @@ def _smoothed_density(
     return centres, np.asarray(gaussian_filter1d(density, width, mode="reflect"))
 
 
-def _draw_one(ax: Axes, result: Posterior, column: int, span: tuple[float, float], *, titled: bool) -> None:
-    centres, density = _smoothed_density(result.theta[:, column], result.weight, span, result.n_eff)
+def _draw_marginal(ax: Axes, result: Posterior, column: int, span: tuple[float, float], *, titled: bool) -> None:
+    centres, density = _centres_and_smoothed_density(result.theta[:, column], result.weight, span, result.n_eff)
     cuts = result.interval(_MASSES[1])[:, column], result.interval(_MASSES[0])[:, column]
     ax.plot(centres, density, color=BLUE, linewidth=1.2)
     for (low, high), colour in zip(cuts, _SHADES, strict=True):
@@ -407,8 +407,12 @@ def _draw_pair(
     ax.contour(*middles, smooth.T, levels=levels, colors=BLUE, linewidths=0.6)
 
 
-def _spread_ranks(rank: IntArray, n_ranked: IntArray, edges: FloatArray) -> FloatArray:
-    """Count new points per bar, (n_bars,); each of the m + 1 ranks is spread evenly over its part of the axis."""
+def _new_points_per_bar(rank: IntArray, n_ranked: IntArray, edges: FloatArray) -> FloatArray:
+    """Return the number of new points per bar, (n_bars,).
+
+    With m ranked points, each of the m + 1 ranks is spread evenly over its part of the axis from 0 to 1, so that counts
+    are fractions.
+    """
     low, high = rank / (n_ranked + 1.0), (rank + 1.0) / (n_ranked + 1.0)
     below = np.array([np.clip((edge - low) / (high - low), 0.0, 1.0).sum() for edge in edges])
     return np.asarray(np.diff(below))

@@ -13,7 +13,7 @@ from probewise.report.plots.canvas import (
     VERMILLION,
     label_axes,
     legend_above,
-    plain_numbers,
+    set_plain_tick_labels,
     stack_of_axes,
 )
 
@@ -22,7 +22,7 @@ _STEPS = 12
 _PLAIN = "95 % of white noise"
 
 
-def correlation_of_neighbours(
+def residual_autocorrelation(
     residuals: FloatArray, scan: IntArray, *, rho: float | None = None, ax: Axes | None = None
 ) -> Axes:
     """Draw the autocorrelation of residuals within scans by lag, with the 95 % band of white noise.
@@ -53,7 +53,7 @@ def correlation_of_neighbours(
         ax.plot(lags, rho**lags, "--", color=BLUE, linewidth=1.5, label=f"noise model found: {rho:.2f} per step")
     ax.set_xticks(lags)
     label_axes(ax, x="how many readings apart (within a scan or run)", y="correlation (no unit)")
-    plain_numbers(ax, x=False)
+    set_plain_tick_labels(ax, x=False)
     legend_above(ax)
     return ax
 
@@ -66,7 +66,7 @@ def spread_by_level(
     model_sd: FloatArray | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the rms of residuals in bins of the predicted reading, with the band expected for constant noise.
+    """Draw the rms of residuals by predicted reading, in bins of equal numbers, with the band expected of white noise.
 
     Parameters
     ----------
@@ -95,20 +95,20 @@ def spread_by_level(
         ax.plot(at, by_model, "--", color=BLUE, linewidth=1.6, label="noise model found")
     ax.set_ylim(bottom=0.0)
     label_axes(ax, x=f"predicted reading ({unit})", y=f"rms residual ({unit})")
-    plain_numbers(ax)
+    set_plain_tick_labels(ax)
     legend_above(ax)
     return ax
 
 
 def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = None) -> Axes:
-    """Draw a histogram of residuals, with a normal distribution of the noise's sd.
+    """Draw a histogram of residuals in noise sds on a logarithmic scale, with a normal distribution.
 
     Parameters
     ----------
     residuals
         Shape (n_points,), NaN where there is no usable reading.
     sd
-        Sd of the noise without its tail.
+        Sd of the noise, tails left out.
     ax
         Axes to draw on; a new figure without.
     """
@@ -124,7 +124,7 @@ def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = No
     ax.set_yscale("log")
     ax.set_ylim(0.5, 2 * max(float(counts.max(initial=1)), 1.0))
     label_axes(ax, x="residual (sds of the noise)", y="readings per half sd")
-    plain_numbers(ax, y=False)
+    set_plain_tick_labels(ax, y=False)
     legend_above(ax)
     return ax
 
@@ -132,25 +132,25 @@ def residual_histogram(residuals: FloatArray, sd: float, *, ax: Axes | None = No
 def lost_readings(
     predicted: FloatArray, readings: FloatArray, lost: BoolArray, *, unit: str, ax: Axes | None = None
 ) -> Axes:
-    """Draw recorded against predicted readings, with the lost ones marked; all arrays (n_points,)."""
+    """Draw recorded against predicted readings, (n_points,) each; those where the mask `lost` is True are marked."""
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     ax.plot(predicted[~lost], readings[~lost], "o", color=GREY, markersize=3, label="reading")
     ax.plot(predicted[lost], readings[lost], "X", color=VERMILLION, markersize=7, label="lost reading")
     ax.axline((float(np.nanmean(predicted)),) * 2, slope=1, color=BLACK, linewidth=0.7)
     label_axes(ax, x=f"predicted reading ({unit})", y=f"reading ({unit})")
-    plain_numbers(ax)
+    set_plain_tick_labels(ax)
     legend_above(ax)
     return ax
 
 
-def lattice_of_readings(readings: FloatArray, step: float, *, unit: str, ax: Axes | None = None) -> Axes:
-    """Draw a histogram of readings, (n_points,), modulo a step: rounded ones fall in one bin."""
+def readings_modulo_step(readings: FloatArray, step: float, *, unit: str, ax: Axes | None = None) -> Axes:
+    """Draw a histogram of readings, (n_points,), modulo a step: if they are rounded to it, all fall in one bin."""
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     finite = readings[np.isfinite(readings)]
     counts, edges = np.histogram(np.mod(finite / step + 0.5, 1.0) - 0.5, 41, (-0.5, 0.5))
     ax.bar((edges[:-1] + edges[1:]) / 2, counts, 0.9 / 41, color=VERMILLION, label="readings")
     ax.axhline(len(finite) / 41, color=GREY, linestyle="--", label="without rounding")
     label_axes(ax, x=f"distance from a multiple of {step:.4g} {unit} (steps)", y="readings")
-    plain_numbers(ax)
+    set_plain_tick_labels(ax)
     legend_above(ax)
     return ax

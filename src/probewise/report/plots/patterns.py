@@ -11,8 +11,8 @@ from probewise.recordings import HalfPlane, Quadrant, Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots.apparatus import draw_sensor_face
 from probewise.report.plots.canvas import BLACK, CYCLE, GREY, AxesGrid, axes_or_new, grid_of_axes
-from probewise.report.plots.readings import MARKERS, split_into_tracks
-from probewise.report.words import number, signed, unit_name
+from probewise.report.plots.readings import MARKERS, tracks_and_single_rows
+from probewise.report.words import number, number_unsigned_zero, unit_name
 
 _DARK, _BRIGHT = "#1b1b1b", "#ffffff"
 _AROUND_MM = 16.0
@@ -35,7 +35,7 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
     """
     require_recording(recording)
     plan = recording.plan
-    lines = [(k, track) for k, track in enumerate(split_into_tracks(plan)[0]) if track.from_edge]
+    lines = [(k, track) for k, track in enumerate(tracks_and_single_rows(plan)[0]) if track.from_edge]
     if not lines:
         raise ParameterError("recording", recording.source or "as given", "one with a scan over a half_plane")
     turns = {track.label: (k, float(plan.orientation_rad[track.rows[0]]), track) for k, track in lines}
@@ -63,7 +63,7 @@ def sensor_orientations(recording: Recording, *, ax: Axes | None = None) -> Axes
         ax.text(at - 0.02, 2.42, label, va="center")
     along = np.concatenate([track.along_mm for _, track in lines])
     ax.annotate("", (n - 0.3, -0.2), xytext=(0.3, -0.2), arrowprops={"arrowstyle": "-|>", "color": BLACK})
-    span = f"{signed(along.min(), 0)} to {signed(along.max(), 0)} mm"
+    span = f"{number_unsigned_zero(along.min(), 0)} to {number_unsigned_zero(along.max(), 0)} mm"
     ax.text(n / 2, -0.28, f"every scan runs across the edge, {span}", ha="center", va="top")
     ax.set(xlim=(-0.05, n + 0.05), ylim=(-0.62, 2.65), aspect="equal")
     ax.set_axis_off()
@@ -107,7 +107,7 @@ def quadrant_patterns(recording: Recording) -> AxesGrid:
         middle = ((x + dx * _AROUND_MM) / 2, (y + dy * _AROUND_MM) / 2)
         inside, around = (BLACK, "white") if pattern.inside >= pattern.outside else ("white", BLACK)
         ax.text(*middle, number(mean, 1), ha="center", va="center", color=inside, fontsize="large")
-        said = f"({signed(x, 0)}, {signed(y, 0)}) mm"
+        said = f"({number_unsigned_zero(x, 0)}, {number_unsigned_zero(y, 0)}) mm"
         ax.text(x - dx * 1.2, y - dy * 1.2, said, ha="right" if dx > 0 else "left", va="top", color=around)
         ax.plot(0.0, 0.0, marker="+", markersize=10, markeredgewidth=1.4, color=GREY)
         ax.set(xlim=(-_AROUND_MM, _AROUND_MM), ylim=(-_AROUND_MM, _AROUND_MM), aspect="equal")

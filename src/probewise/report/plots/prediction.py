@@ -22,8 +22,8 @@ from probewise.report.plots.canvas import (
     legend_above,
     legend_below,
 )
-from probewise.report.plots.readings import Track, along_label, split_into_tracks
-from probewise.report.residual_means import running_mean
+from probewise.report.plots.readings import Track, track_axis_label, tracks_and_single_rows
+from probewise.report.residual_means import running_mean_curve
 from probewise.report.words import unit_name
 
 MAX_PANELS = 8
@@ -34,8 +34,8 @@ def predicted_against_recorded(
 ) -> AxesGrid:
     """Draw recorded and predicted readings with the 95 % band of new readings (paper, figure 7).
 
-    Each panel shows a scan, the last one all single readings. Of too many scans, evenly spaced ones are drawn, so that
-    there are at most eight panels.
+    Each panel shows a scan over one pattern, the last one all single readings. Of more than eight panels, evenly spaced
+    ones are drawn.
 
     Parameters
     ----------
@@ -51,8 +51,8 @@ def predicted_against_recorded(
     Axes, three columns (two where there are two or four panels, one for one panel).
     """
     require_recording(recording)
-    found, alone = split_into_tracks(recording.plan)
-    shown = [found[i] for i in _evenly_spaced(len(found), MAX_PANELS - bool(alone.size))]
+    found, alone = tracks_and_single_rows(recording.plan)
+    shown = [found[i] for i in _evenly_spaced_indices(len(found), MAX_PANELS - bool(alone.size))]
     n_panels = max(len(shown) + bool(alone.size), 1)
     n_columns = min(n_panels, 2 if n_panels in (2, 4) else 3)
     n_rows = -(-n_panels // n_columns)
@@ -65,14 +65,14 @@ def predicted_against_recorded(
         label_axes(ax, x="", y="", title=track.label)
     if alone.size:
         ax = axes.flat[len(shown)]
-        _draw_alone(ax, recording, alone, mean, sd)
+        _draw_single_readings(ax, recording, alone, mean, sd)
         label_axes(ax, x="", y="", title="single readings")
     for ax in list(axes.flat)[n_panels:]:
         ax.set_visible(False)
     for ax in axes[:, 0]:
         ax.set_ylabel(f"reading ({unit_name(unit)})")
     for k in range(max(n_panels - n_columns, 0), len(shown)):
-        axes.flat[k].set_xlabel(along_label(shown).replace(", white side positive", ""))
+        axes.flat[k].set_xlabel(track_axis_label(shown).replace(", white side positive", ""))
     if own:
         legend_below(axes)
     else:
@@ -80,8 +80,8 @@ def predicted_against_recorded(
     return axes
 
 
-def _evenly_spaced(n: int, most: int) -> IntArray:
-    """Choose at most `most` of n indices, evenly spaced."""
+def _evenly_spaced_indices(n: int, most: int) -> IntArray:
+    """Return at most `most` of the indices 0 to n - 1, evenly spaced."""
     return np.unique(np.linspace(0, max(n - 1, 0), min(n, most)).round().astype(np.int64))[:n]
 
 
@@ -96,7 +96,7 @@ def _draw_track(ax: Axes, recording: Recording, track: Track, mean: FloatArray, 
     ax.plot(along, mean[rows], color=BLACK, linewidth=1.1, label="predicted")
 
 
-def _draw_alone(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray, sd: FloatArray) -> None:
+def _draw_single_readings(ax: Axes, recording: Recording, rows: IntArray, mean: FloatArray, sd: FloatArray) -> None:
     at = np.arange(len(rows))
     ax.errorbar(at, mean[rows], yerr=1.96 * sd[rows], fmt="_", color=BLACK, capsize=4, markersize=12)
     ok = recording.usable[rows]
@@ -155,7 +155,7 @@ def residuals_against(
     for residual, colour, name in ((before, VERMILLION, "model as calibrated"), (after, BLUE, "repaired model")):
         ok = np.isfinite(residual) & np.isfinite(covariate)
         ax.plot(covariate[ok], residual[ok], ".", color=colour, markersize=2.5, alpha=0.45)
-        center, average = running_mean(covariate[ok], residual[ok])
+        center, average = running_mean_curve(covariate[ok], residual[ok])
         ax.plot(center, average, color=colour, linewidth=2.0, label=name)
     ax.axhline(0, color=BLACK, linewidth=0.7)
     legend_above(ax)

@@ -19,7 +19,7 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
     Parameters
     ----------
     widths_mm
-        By name of the run: largest posterior sd after each reading, shape (n_readings,).
+        By name of the run: largest posterior sd after each reading, shape (n_readings,), in mm.
     target_mm
         The stopping rule: 4 mm, half the spacing of LEGO holes (paper, section 3.2).
     ax
@@ -30,11 +30,11 @@ def posterior_widths(widths_mm: Mapping[str, FloatArray], *, target_mm: float = 
         number = np.arange(1, len(sd) + 1)
         ax.plot(number, sd, marker="o", markersize=3.5, color=colour, label=f"{name}: {count(len(sd), 'reading')}")
     legend_above(ax)
-    return label_progress_axes(ax, target_mm)
+    return set_up_width_axes(ax, target_mm)
 
 
-def label_progress_axes(ax: Axes, target_mm: float) -> Axes:
-    """Set up axes for posterior sds against the number of readings, with a line at the target precision."""
+def set_up_width_axes(ax: Axes, target_mm: float) -> Axes:
+    """Label axes of posterior sds (log scale) by number of readings, draw the line of the target; return the axes."""
     ax.axhline(target_mm, color=BLACK, linewidth=0.9, linestyle="--")
     ax.annotate(
         f"{target_mm:g} mm,\ntarget",

@@ -21,10 +21,10 @@ MAX_NAMED = 8  # tracks in the legend; with more there is none
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Rows of a plan along one line over one pattern, which a curve may join.
+    """Rows of one scan over one pattern, which a curve may join: `rows`, (n_rows,), numbers rows of the plan.
 
-    `along_mm`, (n_rows,), is the signed distance from a half-plane's edge; over another pattern, the position along the
-    scan from its middle.
+    `along_mm`, (n_rows,), is the signed distance from a half-plane's edge (`from_edge` True); over another pattern, the
+    position along the scan from its mean.
     """
 
     label: str
@@ -33,12 +33,12 @@ class Track:
     from_edge: bool
 
 
-def split_into_tracks(plan: Plan) -> tuple[list[Track], IntArray]:
-    """Split a plan into tracks and single rows.
+def tracks_and_single_rows(plan: Plan) -> tuple[list[Track], IntArray]:
+    """Split the rows of a plan into tracks and single rows.
 
     Returns
     -------
-    The tracks, one per scan and pattern with at least three places; and the numbers of the other rows.
+    The tracks, one per scan and pattern with at least three places along it; and the numbers of the other rows.
     """
     found: list[Track] = []
     single: list[IntArray] = []
@@ -46,11 +46,11 @@ def split_into_tracks(plan: Plan) -> tuple[list[Track], IntArray]:
         for code in np.unique(plan.pattern[scan_rows]):
             rows = scan_rows[plan.pattern[scan_rows] == code]
             pattern = plan.patterns.get(plan.pattern_names[code])
-            along = _along_path(plan, rows, pattern)
+            along = _signed_position_mm(plan, rows, pattern)
             if np.unique(np.round(along, 6)).size < 3:
                 single.append(rows)
                 continue
-            found.append(Track(_label(plan, rows), rows, along, isinstance(pattern, HalfPlane)))
+            found.append(Track(_track_label(plan, rows), rows, along, isinstance(pattern, HalfPlane)))
     names = [t.label for t in found]
     if len(set(names)) < len(names):  # several scans at one orientation: the scan's name tells them apart
         found = [
@@ -60,7 +60,7 @@ def split_into_tracks(plan: Plan) -> tuple[list[Track], IntArray]:
     return found, np.concatenate(single) if single else np.empty(0, dtype=np.int64)
 
 
-def _along_path(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
+def _signed_position_mm(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
     x, y = plan.x_mm[rows], plan.y_mm[rows]
     if isinstance(pattern, HalfPlane):
         return np.asarray(x * np.cos(pattern.normal_rad) + y * np.sin(pattern.normal_rad) - pattern.offset_mm)
@@ -69,7 +69,7 @@ def _along_path(plan: Plan, rows: IntArray, pattern: object) -> FloatArray:
     return np.asarray(dx * np.cos(angle) + dy * np.sin(angle))
 
 
-def _label(plan: Plan, rows: IntArray) -> str:
+def _track_label(plan: Plan, rows: IntArray) -> str:
     degrees = np.unique(np.round(np.degrees(plan.orientation_rad[rows]), 1) % 360)
     label = f"{degrees[0]:g}°" if degrees.size == 1 else plan.scan_names[plan.scan[rows[0]]]
     if len(plan.rows_by_pattern()) > 1 and not isinstance(
@@ -79,8 +79,8 @@ def _label(plan: Plan, rows: IntArray) -> str:
     return label
 
 
-def along_label(found: Sequence[Track]) -> str:
-    """Return the label of the tracks' horizontal axis."""
+def track_axis_label(found: Sequence[Track]) -> str:
+    """Return the label of the horizontal axis along which tracks are drawn."""
     if all(t.from_edge for t in found):
         return "distance from the edge, white side positive (mm)"
     return "place along the scan (mm)"
@@ -99,7 +99,7 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
     """
     require_recording(recording)
     ax = axes_or_new(ax)
-    found, _ = split_into_tracks(recording.plan)
+    found, _ = tracks_and_single_rows(recording.plan)
     for k, track in enumerate(found):
         ok = recording.usable[track.rows]
         ax.plot(
@@ -115,4 +115,4 @@ def readings_by_orientation(recording: Recording, *, ax: Axes | None = None) -> 
         )
     if 0 < len(found) <= MAX_NAMED:
         legend_above(ax, title="orientation of the sensor")
-    return label_axes(ax, x=along_label(found), y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
+    return label_axes(ax, x=track_axis_label(found), y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")

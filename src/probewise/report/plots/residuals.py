@@ -23,11 +23,11 @@ from probewise.report.plots.canvas import (
     AxesGrid,
     label_axes,
     legend_above,
-    plain_numbers,
+    set_plain_tick_labels,
     stack_of_axes,
 )
-from probewise.report.residual_means import ResidualMeans, running_mean
-from probewise.report.words import number, signed, unit_name
+from probewise.report.residual_means import ResidualMeans, running_mean_curve
+from probewise.report.words import number, number_unsigned_zero, unit_name
 
 BEFORE, AFTER = "as calibrated", "repaired"
 _CROWDED = 500  # number of dots from which they are paler
@@ -66,7 +66,7 @@ def mean_residuals_along(
     """
     ax = ax if ax is not None else stack_of_axes([2.7])[0]
     if each is not None:
-        _dots(ax, *each, GREY, "one reading")
+        _draw_dots(ax, *each, GREY, "one reading")
     ax.axhline(0, color=BLACK, linewidth=0.7)
     if names:
         ax.bar(means.at, 2 * means.chance, 0.84, -means.chance, color=GREY, alpha=0.3, label=_CHANCE)
@@ -82,14 +82,14 @@ def mean_residuals_along(
             line = f"{marker}" if names else f"{marker}-"
             ax.plot(means.at + step, values, line, color=colour, ms=4.5, lw=1.4, label=f"{said}{name}")
     if names:
-        _names_on_x(ax, names)
+        _label_x_by_name(ax, names)
     if window is not None:
         low, high = ax.get_xlim()
         middle, half = sum(window) / 2, max((window[1] - window[0]) / 2, _LEAST_SHADE * (high - low))
         ax.axvspan(middle - half, middle + half, color=SKY, alpha=0.25, linewidth=0, label="stands out here", zorder=0)
     averaged = each is None and int(means.size.max(initial=1)) > 1
     label_axes(ax, x=label, y=f"{'mean residual' if averaged else 'residual'} ({unit})")
-    plain_numbers(ax, x=not names)
+    set_plain_tick_labels(ax, x=not names)
     legend_above(ax)
     return ax
 
@@ -130,12 +130,12 @@ def scan_with_residuals(
         above.plot(along, predicted, label=f"predicted, {name}", **curve)
         below.plot(along, readings - predicted, label=f"residual, {name}", **{**style, "alpha": 0.5})
         if joined:
-            below.plot(*running_mean(along, readings - predicted), color=colour, linewidth=1.6, linestyle=line)
+            below.plot(*running_mean_curve(along, readings - predicted), color=colour, linewidth=1.6, linestyle=line)
     below.sharex(above)
     label_axes(above, x="", y=f"reading ({unit})")
     label_axes(below, x=label, y=f"residual ({unit})")
     for ax in axes:
-        plain_numbers(ax)
+        set_plain_tick_labels(ax)
         legend_above(ax)
     return axes
 
@@ -147,7 +147,7 @@ def readings_in_order(recording: Recording, *, ax: Axes | None = None) -> Axes:
     usable = np.flatnonzero(recording.usable)
     ax.plot(usable + 1, recording.readings[usable], "o", color=BLUE, markersize=5)
     label_axes(ax, x="reading number", y=f"reading ({unit_name(recording.plan.instrumentation.unit)})")
-    plain_numbers(ax)
+    set_plain_tick_labels(ax)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     return ax
 
@@ -174,16 +174,16 @@ def residuals_against_covariates(
     for ax, (label, at) in zip(axes, covariates, strict=True):
         ax.axhline(0, color=BLACK, linewidth=0.7)
         for (name, residuals), (colour, _, line) in zip(models, _STYLES, strict=False):
-            _dots(ax, at, residuals, colour, "")
+            _draw_dots(ax, at, residuals, colour, "")
             ax.plot(
-                *running_mean(at, residuals),
+                *running_mean_curve(at, residuals),
                 color=colour,
                 linewidth=2.0,
                 linestyle=line,
                 label=f"running mean, {name}",
             )
         label_axes(ax, x=label, y=f"residual ({unit})")
-        plain_numbers(ax)
+        set_plain_tick_labels(ax)
         legend_above(ax)
     return axes
 
@@ -212,13 +212,13 @@ def gain_by_scan(
     at = -np.arange(len(ranked), dtype=np.float64)
     ax.barh(at, gains, 0.62, color=[BLUE if gain >= 0 else VERMILLION for gain in gains])
     ax.axvspan(mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, zorder=0)
-    said = f"all {part}s: {signed(mean, 3)} ± {number(sd, 3)} nats per reading"
+    said = f"all {part}s: {number_unsigned_zero(mean, 3)} ± {number(sd, 3)} nats per reading"
     ax.axvline(mean, color=GREY, linewidth=1.4, label=said)
     ax.axvline(0, color=BLACK, linewidth=0.7)
     ax.set_yticks(at, [name.replace("_", " ") for name, _ in ranked])
     ax.set_ylim(min(at[-1], -2.0) - 0.6, 0.6)
     label_axes(ax, x=f"gain on each held-out {part} (nats per reading)", y=f"held-out {part}")
-    plain_numbers(ax, y=False)
+    set_plain_tick_labels(ax, y=False)
     legend_above(ax)
     return ax
 
@@ -227,7 +227,7 @@ _CHANCE = "95 % by chance alone"
 _STYLES = ((VERMILLION, "o", "-"), (BLUE, "s", (0, (4, 1.5))))
 
 
-def _dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
+def _draw_dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> None:
     """Draw dots, smaller and paler if there are many."""
     ok = np.isfinite(x) & np.isfinite(y)
     n = max(int(ok.sum()), 1)
@@ -235,8 +235,8 @@ def _dots(ax: Axes, x: FloatArray, y: FloatArray, colour: str, label: str) -> No
     ax.scatter(x[ok], y[ok], size, color=colour, alpha=alpha, linewidth=0, label=label or None, rasterized=n > _MANY)
 
 
-def _names_on_x(ax: Axes, names: Sequence[str]) -> None:
-    """Label values by name, slanted and thinned where they do not fit side by side."""
+def _label_x_by_name(ax: Axes, names: Sequence[str]) -> None:
+    """Label the positions 0, 1, 2 ... of the x axis by name; slanted and thinned where names do not fit."""
     width_in = cast(Figure, ax.figure).get_figwidth()  # none of our figures has subfigures
     fits = sum(len(name) + 2 for name in names) < 12 * width_in
     skip = max(1, round(len(names) / (4 * width_in)))

@@ -12,7 +12,7 @@ from probewise.errors import ParameterError
 from probewise.recordings import Recording
 from probewise.recordings.plan import require_recording
 from probewise.report.plots.canvas import BLACK, BLUE, SMALL_PT, VERMILLION, AxesGrid, grid_of_axes, label_axes
-from probewise.report.plots.readings import Track, split_into_tracks
+from probewise.report.plots.readings import Track, tracks_and_single_rows
 from probewise.report.words import unit_name
 
 _MOST_GROUPS, _LEAST_ROWS = 18, 5  # number of groups of neighbours in a running mean
@@ -25,7 +25,7 @@ _ALONG_OTHERS = "place along the scan (mm)"
 def residuals_by_scan(
     recording: Recording, before: FloatArray, after: FloatArray, *, most: int = 9, columns: int = 3
 ) -> AxesGrid:
-    """Draw the residuals of two models along each scan, all panels on the same axes.
+    """Draw the residuals of two models along each scan, one panel per scan, all with the same scales.
 
     Parameters
     ----------
@@ -43,18 +43,18 @@ def residuals_by_scan(
     Axes, (n_rows, columns); those without a scan are hidden.
     """
     require_recording(recording)
-    found, _ = split_into_tracks(recording.plan)
+    found, _ = tracks_and_single_rows(recording.plan)
     change = [float(np.mean((after[track.rows] - before[track.rows]) ** 2)) for track in found]
     shown = [found[k] for k in sorted(np.argsort(change, kind="stable")[::-1][:most].tolist())]
     n_rows = max(-(-len(shown) // columns), 1)
     axes = grid_of_axes(n_rows, columns, size_in=(3.2 * columns, 1.75 * n_rows + 0.7), sharex=True, sharey=True)
     for ax, track in zip(axes.flat, shown, strict=False):
         for predicted, colour in ((before, VERMILLION), (after, BLUE)):
-            along, residual = _residuals(recording, track, predicted)
+            along, residual = _positions_and_residuals(recording, track, predicted)
             ax.plot(along, residual, ".", color=colour, markersize=2.2, alpha=0.4)
-            ax.plot(*_means(along, residual), color=colour, linewidth=1.8)
+            ax.plot(*_running_mean_by_position(along, residual), color=colour, linewidth=1.8)
         ax.axhline(0.0, color=BLACK, linewidth=0.7)
-        label_axes(ax, x="", y="", title=_title(recording, track))
+        label_axes(ax, x="", y="", title=_scan_title(recording, track))
     for ax in list(axes.flat)[len(shown) :]:
         ax.set_visible(False)
     sheet = axes.flat[0].figure
@@ -93,7 +93,7 @@ def before_and_after(
     require_recording(recording)
     axes = grid_of_axes(2, 1, size_in=(7.4, 5.0), sharex=True, height_ratios=[1.7, 1.0])
     above, below = axes[:, 0]
-    found, _ = split_into_tracks(recording.plan.take(rows))
+    found, _ = tracks_and_single_rows(recording.plan.take(rows))
     if not found:
         raise ParameterError("rows", rows.tolist(), "readings at three places or more along one line")
     for k, track in enumerate(found):
@@ -103,13 +103,16 @@ def before_and_after(
         above.plot(along[ok], recording.readings[at][ok], ".", color=BLACK, markersize=4, label="" if k else "recorded")
         for predicted, colour, said in ((before, VERMILLION, _BEFORE), (after, BLUE, _AFTER)):
             above.plot(along, predicted[at], color=colour, linewidth=1.5, label="" if k else said)
-    low, high = _interval_to_show(found, rows, np.abs(after - before))
+    low, high = _x_limits_around_change(found, rows, np.abs(after - before))
     for predicted, colour in ((before, VERMILLION), (after, BLUE)):
-        sides = [_residuals(recording, Track("", rows[t.rows], t.along_mm, t.from_edge), predicted) for t in found]
+        sides = [
+            _positions_and_residuals(recording, Track("", rows[t.rows], t.along_mm, t.from_edge), predicted)
+            for t in found
+        ]
         along, residual = (np.concatenate(parts) for parts in zip(*sides, strict=True))
         shown = (along >= low) & (along <= high)
         below.plot(along[shown], residual[shown], ".", color=colour, markersize=4, alpha=0.5)
-        below.plot(*_means(along[shown], residual[shown]), color=colour, linewidth=1.8)
+        below.plot(*_running_mean_by_position(along[shown], residual[shown]), color=colour, linewidth=1.8)
     below.axhline(0.0, color=BLACK, linewidth=0.7)
     below.set_xlim(low, high)
     unit = unit_name(recording.plan.instrumentation.unit)
@@ -120,8 +123,8 @@ def before_and_after(
     return axes
 
 
-def _interval_to_show(found: Sequence[Track], rows: IntArray, change: FloatArray) -> tuple[float, float]:
-    """Return the ends of the interval in which two models differ, widened by its length on either side."""
+def _x_limits_around_change(found: Sequence[Track], rows: IntArray, change: FloatArray) -> tuple[float, float]:
+    """Return limits of the x axis: the interval in which two models differ, widened by its length on both sides."""
     along = np.concatenate([track.along_mm for track in found])
     by_place = np.concatenate([change[rows[track.rows]] for track in found])
     differs = along[by_place >= _TELLING * max(float(by_place.max()), 1e-300)]
@@ -131,14 +134,16 @@ def _interval_to_show(found: Sequence[Track], rows: IntArray, change: FloatArray
     )
 
 
-def _residuals(recording: Recording, track: Track, predicted: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _positions_and_residuals(
+    recording: Recording, track: Track, predicted: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     ok = recording.usable[track.rows]
     rows = track.rows[ok]
     return track.along_mm[ok], np.asarray(recording.readings[rows] - predicted[rows])
 
 
-def _means(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Average neighbours along the scan in groups of equal width, since readings are dense where a scan is slow."""
+def _running_mean_by_position(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return mean position and mean residual in bins of equal width, since readings are dense where a scan is slow."""
     if along.size == 0:
         return along, residual
     edges = np.linspace(along.min(), along.max(), min(_MOST_GROUPS, max(along.size // _LEAST_ROWS, 1)) + 1)
@@ -149,5 +154,5 @@ def _means(along: FloatArray, residual: FloatArray) -> tuple[FloatArray, FloatAr
     return middle, np.bincount(group, residual, minlength=len(count))[some] / count[some]
 
 
-def _title(recording: Recording, track: Track) -> str:
+def _scan_title(recording: Recording, track: Track) -> str:
     return recording.plan.scan_names[int(recording.plan.scan[track.rows[0]])].replace("_", " ")

@@ -129,7 +129,7 @@ def field_legend(axes: Axes | AxesGrid) -> None:
 
 
 def paint_out_of_reach(ax: Axes) -> None:
-    """Paint the background grey: whatever the map does not cover is out of the arm's reach."""
+    """Paint the axes' background grey, with an entry for the legend: what a map leaves blank is out of reach."""
     ax.set_facecolor(OUT_OF_REACH)
     ax.add_patch(Rectangle((0.0, 0.0), 0.0, 0.0, facecolor=OUT_OF_REACH, label="out of the arm's reach"))
 

@@ -31,7 +31,7 @@ _CROSS_MM = 15.0  # long enough to show beyond a block of two LEGO studs
 
 
 def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
-    """Draw a cover page with instructions, then every sheet at true scale.
+    """Draw cover pages with instructions, one for five sheets, then every sheet at true scale.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
         If a sheet needs too many pages.
     """
     cut = [(sheet, tiles_of(sheet, paper)) for sheet in sheets]
-    n_covers = len(_groups_of_five(cut))
+    n_covers = len(_batches_of_five(cut))
     buffer = io.BytesIO()
     about = {"Title": title, "Creator": "probewise", "Producer": None, "CreationDate": None}
     with mpl.rc_context({"path.simplify": False}), PdfPages(buffer, metadata=about) as pdf:
@@ -62,7 +62,7 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
             firsts.append(number)
             number += len(tiles)
         n_pages = number - 1
-        for k, batch in enumerate(_groups_of_five(list(zip(cut, firsts, strict=True)))):
+        for k, batch in enumerate(_batches_of_five(list(zip(cut, firsts, strict=True)))):
             pdf.savefig(_draw_cover_page(batch, paper, title, f"page {k + 1} of {n_pages}"))
         for (sheet, tiles), first in zip(cut, firsts, strict=True):
             for k, tile in enumerate(tiles):
@@ -70,12 +70,12 @@ def sheets_pdf(sheets: Sequence[Sheet], *, paper: str, title: str) -> bytes:
     return buffer.getvalue()
 
 
-def _groups_of_five(items: Sequence[Any]) -> list[Sequence[Any]]:
+def _batches_of_five(items: Sequence[Any]) -> list[Sequence[Any]]:
     return [items[k : k + 5] for k in range(0, len(items), 5)]
 
 
-def _open_page(page_mm: tuple[float, float]) -> Axes:
-    """Open a page with coordinates in mm from its lower left corner."""
+def _new_page_axes(page_mm: tuple[float, float]) -> Axes:
+    """Return axes that fill a new page, with coordinates in mm from its lower left corner."""
     figure = Figure(figsize=(page_mm[0] / _MM_PER_IN, page_mm[1] / _MM_PER_IN), facecolor="none")
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     ax.set(xlim=(0.0, page_mm[0]), ylim=(0.0, page_mm[1]))
@@ -85,7 +85,7 @@ def _open_page(page_mm: tuple[float, float]) -> Axes:
 
 def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) -> Figure:
     page = PAPERS_MM[paper]
-    ax = _open_page(page)
+    ax = _new_page_axes(page)
     top = page[1] - 18.0
     ax.text(LEFT_MM, top, title, fontsize=_LARGE, va="baseline")
     told = (
@@ -106,7 +106,10 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
         last = first + len(tiles) - 1
         said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; page {first}"]
         if len(tiles) > 1:
-            said = [f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; pages {first} to {last}", _grid_in_words(tiles)]
+            said = [
+                f"{sheet.size_mm[0]:g} x {sheet.size_mm[1]:g} mm; pages {first} to {last}",
+                _page_grid_in_words(tiles),
+            ]
         said += [*sheet.lines, f"origin: {sheet.frame}"]
         if sheet.orientations_rad:
             turns = ", ".join(f"{np.degrees(turn):.4g}" for turn in sheet.orientations_rad)
@@ -120,7 +123,7 @@ def _draw_cover_page(batch: Sequence[Any], paper: str, title: str, number: str) 
     return ax.figure  # type: ignore[return-value]
 
 
-def _grid_in_words(tiles: Sequence[Tile]) -> str:
+def _page_grid_in_words(tiles: Sequence[Tile]) -> str:
     return f"{tiles[-1].column + 1} side by side, {tiles[-1].row + 1} one above the other, from the lower left"
 
 
@@ -130,30 +133,30 @@ def _draw_thumbnail(ax: Axes, sheet: Sheet, tiles: Sequence[Tile], at_mm: tuple[
     scale = min(66.0 / width, (_THUMB_MM - 2.0) / height)
     low = np.array(sheet.low_mm)
 
-    def small(points: FloatArray) -> FloatArray:
+    def to_thumbnail_mm(points: FloatArray) -> FloatArray:
         return np.asarray((np.asarray(points) - low) * scale + np.array(at_mm))
 
     frame = Rectangle(at_mm, width * scale, height * scale, fc="none", ec=GREY, lw=0.6, zorder=4)
     clip = ax.add_patch(Rectangle(at_mm, width * scale, height * scale, fc="none", ec="none"))
-    _paint(ax, sheet, sheet.low_mm, sheet.high_mm, small, clip, named=False)
+    _draw_sheet_part(ax, sheet, sheet.low_mm, sheet.high_mm, to_thumbnail_mm, clip, named=False)
     ax.add_patch(frame)
     for tile in tiles:
-        corner = small(np.array(tile.low_mm))
+        corner = to_thumbnail_mm(np.array(tile.low_mm))
         size = (np.array(tile.high_mm) - tile.low_mm) * scale
         ax.add_patch(Rectangle(tuple(corner), *size, fc="none", ec=GREY, lw=0.4, ls=(0, (3, 2)), zorder=4))
     if (low <= 0).all() and (np.array(sheet.high_mm) >= 0).all():
-        x, y = small(np.zeros(2))
+        x, y = to_thumbnail_mm(np.zeros(2))
         if sheet.orientations_rad:
             draw_sensor_face(ax, center=(x, y), size=8.0, zorder=5)
         ax.plot(x, y, marker="+", ms=7, mew=1.2, color=VERMILLION, zorder=7, clip_on=False)
 
 
 def _draw_page(sheet: Sheet, tiles: Sequence[Tile], tile: Tile, first: int, number: str) -> Figure:
-    ax = _open_page(tile.page_mm)
+    ax = _new_page_axes(tile.page_mm)
     low, high = np.array(tile.low_mm), np.array(tile.high_mm)
     size, beyond = high - low, np.array(tile.beyond_mm)
     clip = ax.add_patch(Rectangle((LEFT_MM, BOTTOM_MM), *(size + beyond), fc="none", ec="none"))
-    _paint(ax, sheet, tuple(low), tuple(high + beyond), tile.on_page_mm, clip)
+    _draw_sheet_part(ax, sheet, tuple(low), tuple(high + beyond), tile.on_page_mm, clip)
     (x0, y0), (x1, y1) = (LEFT_MM, BOTTOM_MM), (LEFT_MM + size[0], BOTTOM_MM + size[1])
     far_x, far_y = x1 + beyond[0], y1 + beyond[1]
     line: dict[str, Any] = {"color": BLACK, "lw": 0.4, "solid_capstyle": "butt"}
@@ -212,14 +215,20 @@ def _draw_ruler(ax: Axes, x_mm: float, y_mm: float) -> None:
     ax.text(x_mm + _RULER_MM + 3.0, y_mm + 1.0, "100 mm?", fontsize=_SMALL, va="center")
 
 
-def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any, *, named: bool = True) -> None:
-    """Paint the part of the sheet between two corners; `place` maps points, (n, 2), from the sheet to the page."""
-    for corners, albedo in _painted_outlines(sheet.pattern, low_mm, high_mm):
+def _draw_sheet_part(
+    ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: Any, *, named: bool = True
+) -> None:
+    """Draw the part of a sheet between two corners: pattern, lines, crosses and texts.
+
+    `place` maps points, (n, 2), from the sheet to the page; `clip` is the patch beyond which nothing is drawn; `named`
+    says whether texts are drawn in full.
+    """
+    for corners, albedo in _outlines_with_albedo(sheet.pattern, low_mm, high_mm):
         ink = str(round(float(np.clip(albedo, 0.0, 1.0)), 4))
         patch = ax.add_patch(Outline(place(corners), closed=True, fc=ink, ec="none", lw=0, zorder=1))
         patch.set_clip_path(clip)
     if not isinstance(sheet.pattern, Uniform | HalfPlane | Quadrant | Disc | Polygon | Stripes):
-        _raster(ax, sheet.pattern, low_mm, high_mm, place)
+        _draw_raster(ax, sheet.pattern, low_mm, high_mm, place)
     if sheet.outline_mm is not None:
         line = ax.add_patch(Outline(place(sheet.outline_mm), closed=True, fc="none", ec=BLACK, lw=0.4, zorder=2))
         line.set_clip_path(clip)
@@ -244,18 +253,18 @@ def _paint(ax: Axes, sheet: Sheet, low_mm: Any, high_mm: Any, place: Any, clip: 
             told.set_clip_path(clip)
 
 
-def _painted_outlines(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:
-    """Return outlines (n, 2), each with the albedo inside, in the order of painting; none if the pattern has none."""
+def _outlines_with_albedo(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple[FloatArray, float]]:
+    """Return closed outlines (n, 2) with the albedo inside, in the order of painting; none for an image or a ramp."""
     (x0, y0), (x1, y1) = low_mm, high_mm
     whole = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1]])
     match pattern:
         case Uniform(albedo):
             return [(whole, albedo)]
         case HalfPlane(normal, offset, inside, outside):
-            return [(whole, outside), (_clipped(whole, normal, offset), inside)]
+            return [(whole, outside), (_clipped_to_half_plane(whole, normal, offset), inside)]
         case Quadrant((x, y), (dx, dy), inside, outside):
-            across = _clipped(whole, 0.0 if dx > 0 else np.pi, x * dx)
-            return [(whole, outside), (_clipped(across, dy * np.pi / 2, y * dy), inside)]
+            across = _clipped_to_half_plane(whole, 0.0 if dx > 0 else np.pi, x * dx)
+            return [(whole, outside), (_clipped_to_half_plane(across, dy * np.pi / 2, y * dy), inside)]
         case Disc(center, radius, inside, outside):
             circle = np.array(center) + radius * np.stack([np.cos(_ROUND), np.sin(_ROUND)], axis=-1)
             return [(whole, outside), (circle, inside)]
@@ -266,14 +275,14 @@ def _painted_outlines(pattern: Pattern, low_mm: Any, high_mm: Any) -> list[tuple
             first, last = int(np.floor(along.min() / period)), int(np.ceil(along.max() / period))
             painted = [(whole, outside)]
             for k in range(first, last + 1):
-                begin = _clipped(whole, normal, phase + k * period)
-                painted.append((_clipped(begin, normal + np.pi, -(phase + (k + duty) * period)), inside))
+                begin = _clipped_to_half_plane(whole, normal, phase + k * period)
+                painted.append((_clipped_to_half_plane(begin, normal + np.pi, -(phase + (k + duty) * period)), inside))
             return [(corners, albedo) for corners, albedo in painted if len(corners)]
         case _:
             return []
 
 
-def _clipped(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> FloatArray:
+def _clipped_to_half_plane(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> FloatArray:
     """Clip a convex outline, (n, 2), to the half-plane x cos(normal) + y sin(normal) >= offset."""
     if not len(corners_mm):
         return corners_mm
@@ -287,7 +296,7 @@ def _clipped(corners_mm: FloatArray, normal_rad: float, offset_mm: float) -> Flo
     return np.array(kept).reshape(-1, 2)
 
 
-def _raster(ax: Axes, pattern: Pattern, low_mm: Any, high_mm: Any, place: Any) -> None:
+def _draw_raster(ax: Axes, pattern: Pattern, low_mm: Any, high_mm: Any, place: Any) -> None:
     n_x, n_y = (max(round((high - low) / _PIXEL_MM), 1) for low, high in zip(low_mm, high_mm, strict=True))
     x = low_mm[0] + (np.arange(n_x) + 0.5) * (high_mm[0] - low_mm[0]) / n_x
     y = low_mm[1] + (np.arange(n_y) + 0.5) * (high_mm[1] - low_mm[1]) / n_y

@@ -58,7 +58,10 @@ def spatial_sensitivity(field: SSFField, *, ax: Axes | None = None, title: str =
 
 
 def _visible_half_width(values: FloatArray, x: FloatArray, y: FloatArray, pixel_mm: float) -> float:
-    """Return the half width of a square about the origin that holds the visible SSF, rounded up to half a decade."""
+    """Return the half width (mm) of a square about the origin that holds the SSF above 1 % of its peak.
+
+    It is rounded up to a multiple of half the power of ten below it.
+    """
     matters = values > 0.01 * values.max()
     far = 1.1 * max(np.abs(x[matters.any(axis=0)]).max(), np.abs(y[matters.any(axis=1)]).max(), pixel_mm)
     unit = 0.5 * 10 ** np.floor(np.log10(far))
@@ -79,7 +82,11 @@ def ssf_by_order(
     fields, log_z, log_z_error
         By number of Gaussians: mean field, natural log of the evidence and its standard error.
     axes
-        Axes to draw on, two columns where there are two orders or more; a new figure without.
+        Axes to draw on, of the shape returned; a new figure without.
+
+    Returns
+    -------
+    Axes, two columns; one for a single number of Gaussians.
     """
     orders = sorted(fields)
     n_columns = min(len(orders), 2)

@@ -19,7 +19,7 @@ from probewise.report.plots.canvas import (
     label_axes,
     legend_below,
 )
-from probewise.report.plots.progress import label_progress_axes
+from probewise.report.plots.progress import set_up_width_axes
 from probewise.report.words import count
 from probewise.study import Summary
 
@@ -62,7 +62,7 @@ def posterior_widths_of_runs(
             _reading_numbers(table), low, high, color=BLUE, alpha=0.2, linewidth=0, label="middle 68 % of the runs"
         )
         ax.plot(_reading_numbers(table), np.median(table, axis=0), color=BLUE, linewidth=1.8, label="median")
-        label_progress_axes(ax, target_mm)
+        set_up_width_axes(ax, target_mm)
         ax.set_title(f"{name} ({count(len(table), 'run')})", fontsize="medium", loc="left")
         ax.label_outer()
     for ax in list(axes.flat)[len(runs) :]:

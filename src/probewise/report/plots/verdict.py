@@ -56,8 +56,8 @@ def probabilities_by_round(beliefs: Mapping[str, Mapping[str, float]], *, ax: Ax
     Parameters
     ----------
     beliefs
-        Probability of each hypothesis by name, for each round by name, the first on top. The six hypotheses that are
-        the most probable in any round have colours, the others share a grey.
+        Probability of each hypothesis by name, for each round by name, the first on top. Up to six hypotheses have
+        colours, those of the highest probability in any round if it is 0.02 or more; the others share a grey.
     ax
         Axes to draw on; a new figure without.
     """

@@ -21,7 +21,7 @@ from scipy.stats import binomtest
 
 from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of, shipped_geometry
 from probewise.cli._bench import Bench
-from probewise.cli._plans import for_lego_arm
+from probewise.cli._plans import plan_for_lego_arm
 from probewise.diagnosis import diagnose
 from probewise.recordings import Recording, paper_plan, read_recording, write_recording
 from probewise.world.shipped import truth
@@ -30,7 +30,7 @@ from probewise.world.shipped import truth
 def recording(file: Path, folder: Path, *, seed: int) -> tuple[Recording, np.ndarray]:
     """Record the plan; return what is on file, and place told minus true place and height minus 14 mm, (n, 3)."""
     geometry = read_geometry(file)
-    plan = for_lego_arm(paper_plan(), geometry)
+    plan = plan_for_lego_arm(paper_plan(), geometry)
     origin_mm = (524 + 0.37 * seed, 260 + 0.61 * seed)
     bench = Bench(truth("paper"), "600,250,80", scale=ReadingScale(), seed=seed)
     arm = bench.open_emulated_arm(geometry, file)

@@ -14,7 +14,7 @@ pytest.importorskip("tty")
 from marlin import Marlin
 
 from probewise.cli import main
-from probewise.cli._bench import moved_pattern
+from probewise.cli._bench import shifted_pattern
 from probewise.recordings import Disc, paper_plan
 from probewise.world import World
 from probewise.world.spots import Blob, gaussian_spot
@@ -50,7 +50,7 @@ class Person:
         request, self._heard = self._heard, ""
         self.asked.append(request)
         if sheet := re.search(r"Lay sheet '(\w+)', its origin at \(110, 110\) mm", request):
-            self.surface = moved_pattern(paper_plan().patterns[sheet[1]], ORIGIN_MM)
+            self.surface = shifted_pattern(paper_plan().patterns[sheet[1]], ORIGIN_MM)
         elif turn := re.search(r"Turn the sensor on its mount to (-?[\d.]+) degrees", request):
             self.turned_rad = np.radians(float(turn[1]))
         else:

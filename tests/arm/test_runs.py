@@ -22,7 +22,7 @@ def bricks(monkeypatch, make_paper_brick):
     """Open a new paper brick each time; the n-th dies as it is to be read the m-th time, bricks[n] = m."""
     deaths, opened = {}, []
 
-    def open_nxt(port, geometry, *, start_s=0.0):
+    def open_nxt_arm(port, geometry, *, start_s=0.0):
         paper = make_paper_brick()
         paper.raw_counts = DARK_COUNTS
         carry_out, asked = paper.carry_out, []
@@ -42,8 +42,8 @@ def bricks(monkeypatch, make_paper_brick):
         machine = BrickMachine(Brick(Link(paper, clock=clock), clock=clock), geometry)
         return LegoArm(machine, geometry, clock=clock, start_s=start_s)
 
-    monkeypatch.setattr("probewise.cli.arm.open_nxt", open_nxt)
-    monkeypatch.setattr("probewise.cli._explore_arm.open_nxt", open_nxt)
+    monkeypatch.setattr("probewise.cli.arm.open_nxt_arm", open_nxt_arm)
+    monkeypatch.setattr("probewise.cli._explore_arm.open_nxt_arm", open_nxt_arm)
     monkeypatch.setattr("sys.stdin", io.StringIO("\n" * 100))
     deaths["opened"] = opened
     return deaths

@@ -8,7 +8,7 @@ import pytest
 from probewise.arm import ReadingScale, Request
 from probewise.calibration import predict, read_sensor
 from probewise.cli import main
-from probewise.cli._bench import Bench, moved_pattern, world_of
+from probewise.cli._bench import Bench, shifted_pattern, world_and_instrumentation
 from probewise.errors import ParameterError
 from probewise.recordings import (
     Disc,
@@ -43,21 +43,23 @@ def run(*arguments):
 
 @pytest.mark.parametrize("pattern", PATTERNS, ids=lambda pattern: type(pattern).__name__)
 def test_a_pattern_that_was_moved_reads_at_its_new_place_as_it_did_at_its_old(pattern):
-    world, _ = world_of(None)
+    world, _ = world_and_instrumentation(None)
     for x_mm, y_mm, turned_rad in ((0.0, 0.0, 0.0), (4.0, 1.0, 1.0), (-3.0, 6.0, 2.0)):
         here = world.read(pattern, x_mm, y_mm, turned_rad, time_s=0.0, rng=None)
-        there = world.read(moved_pattern(pattern, ORIGIN), x_mm + 300.0, y_mm + 200.0, turned_rad, time_s=0.0, rng=None)
+        there = world.read(
+            shifted_pattern(pattern, ORIGIN), x_mm + 300.0, y_mm + 200.0, turned_rad, time_s=0.0, rng=None
+        )
         assert there == pytest.approx(here, abs=1e-6)
 
 
 def test_a_ramp_stays_where_it_is():
-    assert moved_pattern(Ramp(0.0, 0.1), (0.0, 0.0)) == Ramp(0.0, 0.1)
+    assert shifted_pattern(Ramp(0.0, 0.1), (0.0, 0.0)) == Ramp(0.0, 0.1)
     with pytest.raises(ParameterError, match="0,0 with a ramp"):
-        moved_pattern(Ramp(0.0, 0.1), ORIGIN)
+        shifted_pattern(Ramp(0.0, 0.1), ORIGIN)
 
 
 def test_a_bench_does_what_a_person_would_be_asked_for():
-    world = dataclasses.replace(world_of(None)[0], noise_sd=0.0)
+    world = dataclasses.replace(world_and_instrumentation(None)[0], noise_sd=0.0)
     bench = Bench(world, "uniform:1", scale=ReadingScale(), seed=1)
     with bench.open_simulated_arm(None) as arm:
         place = type(arm.pose)(*ORIGIN)

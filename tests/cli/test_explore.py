@@ -12,7 +12,7 @@ import pytest
 from probewise.arm import Pose, SimulatedArm
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.cli._arm import ReportingInstrument
+from probewise.cli._arm import InstrumentWithCallbacks
 from probewise.recordings import Instrumentation
 from probewise.report import exploration
 
@@ -67,13 +67,13 @@ def test_readings_may_be_chosen_several_at_a_time(explore):
 @pytest.mark.slow
 def test_what_the_other_model_makes_of_the_readings_is_shown_beside(explore, monkeypatch, tmp_path):
     """The naive model left, as in the paper, whichever chooses; the run itself is the same as without."""
-    drawn, quick = [], exploration.frame_of_several_models
+    drawn, quick = [], exploration.robot_views_png
 
     def remember(views, *_, **__):
         drawn.append(views)
         return quick()
 
-    monkeypatch.setattr(exploration, "frame_of_several_models", remember)
+    monkeypatch.setattr(exploration, "robot_views_png", remember)
     status, lines = explore("--both-models", "--max-readings", 2)
     assert status == 0
     assert [[title for title, *_ in views] for views in drawn] == [["naive model", "SSF model"]] * 2
@@ -178,7 +178,7 @@ def test_what_was_found_is_written_as_a_table_with_its_samples(explore, tmp_path
 def test_the_bar_says_where_the_arm_moves_before_it_does():
     told = []
     arm = SimulatedArm(lambda pose, time_s, height_mm: 42.0)
-    with ReportingInstrument(arm, told.append, told.append) as telling:
+    with InstrumentWithCallbacks(arm, told.append, told.append) as telling:
         reading = telling.measure(Pose(500.0, 200.0))
         assert telling.reachable(np.array([[500.0, 200.0], [0.0, 0.0]])).tolist() == [True, False]
     assert told == [Pose(500.0, 200.0), reading]

@@ -80,7 +80,7 @@ def test_a_second_run_on_the_same_journal_is_refused_and_the_first_goes_on(
 ):
     from probewise.report import exploration
 
-    out, drawn, second = tmp_path / "out", exploration.frame, []
+    out, drawn, second = tmp_path / "out", exploration.robot_view_png, []
 
     def begin_another(*_, **__):
         if not second:
@@ -88,7 +88,7 @@ def test_a_second_run_on_the_same_journal_is_refused_and_the_first_goes_on(
             second[:] = [main(command(sensor_file, out, "--resume")), capsys.readouterr().err]
         return drawn()
 
-    monkeypatch.setattr(exploration, "frame", begin_another)
+    monkeypatch.setattr(exploration, "robot_view_png", begin_another)
     assert main(command(sensor_file, out, "--max-readings", 1)) == 0
     status, said = second
     assert status == 2

@@ -11,10 +11,10 @@ import pytest
 from probewise.arm import DryRun, LegoArm, Request, read_geometry, shipped_geometry
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
-from probewise.cli._arm import warn_of_place_sd
-from probewise.cli._marks import _place_after, bring_to_mark
+from probewise.cli._arm import warn_if_place_sd_large
+from probewise.cli._marks import _place_after_moves, bring_to_mark
 from probewise.cli._person import PersonAtBench
-from probewise.cli._sheet_check import SheetCheck, shades_at_places
+from probewise.cli._sheet_check import SheetCheck, uniform_shades_at_places
 from probewise.emulator import parse_scene
 from probewise.emulator.scenes import scene_text
 from probewise.recordings import HalfPlane, Quadrant, Uniform, paper_plan, write_plan
@@ -77,11 +77,11 @@ def test_an_arm_that_is_known_less_well_than_a_shape_is_to_be_says_so_before_it_
     shipped = read_geometry(shipped_geometry())
     for place_sd_mm, warned in ((4.5, True), (0.6, False)):
         rows = tuple((0.0,) * 9 for _ in range(9))
-        warn_of_place_sd(dataclasses.replace(shipped, accuracy=Accuracy(8, place_sd_mm, 1.0, 0.01, rows)), 4.0)
+        warn_if_place_sd_large(dataclasses.replace(shipped, accuracy=Accuracy(8, place_sd_mm, 1.0, 0.01, rows)), 4.0)
         assert (
             "lengths will not be known to 4 mm: the arm knows its place to 4.5 mm" in capsys.readouterr().err
         ) == warned
-    warn_of_place_sd(shipped, 4.0)
+    warn_if_place_sd_large(shipped, 4.0)
     assert capsys.readouterr().err == ""
 
 
@@ -122,13 +122,13 @@ def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
     ],
 )
 def test_an_answer_is_a_move_or_nothing(answer, moved):
-    assert _place_after((1, 2, 60), answer) == moved
+    assert _place_after_moves((1, 2, 60), answer) == moved
 
 
 def test_shades_are_those_that_fill_the_sensors_view():
     places = np.array([[-20.0, 0.0], [-10.0, 0.0], [20.0, 0.0]])
-    np.testing.assert_array_equal(shades_at_places(HalfPlane(0.0, 0.0), places), [0, np.nan, 1])
-    np.testing.assert_array_equal(shades_at_places(Uniform(0.5), places), [np.nan] * 3)
+    np.testing.assert_array_equal(uniform_shades_at_places(HalfPlane(0.0, 0.0), places), [0, np.nan, 1])
+    np.testing.assert_array_equal(uniform_shades_at_places(Uniform(0.5), places), [np.nan] * 3)
 
 
 def edge(n=101):
@@ -137,7 +137,7 @@ def edge(n=101):
 
 def test_a_scan_that_starts_over_the_wrong_side_is_told_of_at_the_first_reading_that_shows_it():
     watch = SheetCheck(edge(), white_is_bright=True)
-    said = [watch.check_reading(row, 58.0 if row < 40 else 14.0) for row in range(101)]
+    said = [watch.complaint_about_reading(row, 58.0 if row < 40 else 14.0) for row in range(101)]
     first = next(k for k, text in enumerate(said) if text)
     assert first == 65  # the first that is all white, and dark
     assert "at (15, 0) mm it is white, and reads 14, where black read 58" in said[first]
@@ -145,7 +145,7 @@ def test_a_scan_that_starts_over_the_wrong_side_is_told_of_at_the_first_reading_
 
 def test_a_level_that_jumps_within_black_is_told_of_before_any_white():
     watch = SheetCheck(edge(), white_is_bright=True)
-    said = [watch.check_reading(row, 58.0 if row < 10 else 14.0) for row in range(30)]
+    said = [watch.complaint_about_reading(row, 58.0 if row < 10 else 14.0) for row in range(30)]
     assert [k for k, text in enumerate(said) if text] == [10]
 
 
@@ -154,7 +154,7 @@ def test_a_right_scan_is_not_told_of():
     noise = np.random.default_rng(3).normal(0.0, 1.5, len(plan))
     watch = SheetCheck(plan, white_is_bright=True)
     levels = 14 + 44 / (1 + np.exp(-plan.x_mm / 3))
-    assert not any(watch.check_reading(row, float(value)) for row, value in enumerate(levels + noise))
+    assert not any(watch.complaint_about_reading(row, float(value)) for row, value in enumerate(levels + noise))
 
 
 def test_a_sheet_is_looked_at_over_its_white_and_its_black():
@@ -162,12 +162,12 @@ def test_a_sheet_is_looked_at_over_its_white_and_its_black():
     watch = SheetCheck(plan, white_is_bright=True)
     everywhere = lambda places: np.ones(len(places), dtype=bool)  # noqa: E731
     for name, pattern in plan.patterns.items():
-        places = watch.places_to_check(name, everywhere)
+        places = watch.white_and_black_places(name, everywhere)
         assert set(places) == {True, False}
         for is_white, place in places.items():
-            assert shades_at_places(pattern, np.array([place]))[0] == is_white
-    assert watch.check_levels("boundary", {True: 55.0, False: 15.0}) is None
-    assert "reads 15 where it should be white and 55 where black" in watch.check_levels(
+            assert uniform_shades_at_places(pattern, np.array([place]))[0] == is_white
+    assert watch.complaint_about_levels("boundary", {True: 55.0, False: 15.0}) is None
+    assert "reads 15 where it should be white and 55 where black" in watch.complaint_about_levels(
         "quadrant_a", {True: 15.0, False: 55.0}
     )
 

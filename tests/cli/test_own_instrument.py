@@ -192,7 +192,9 @@ def test_a_journal_finds_the_sensor_of_its_run_and_refuses_another_truth(sensor_
     assert run(*words, "--truth", "400,260,90", "--resume") == 2
     assert "hidden.x_mm 600.0 there, 400.0 here" in capsys.readouterr().err
     journal, seen = out / "journal.jsonl", []
-    monkeypatch.setattr("probewise.cli.diagnose.journal_recording", lambda path, sensor: seen.append(sensor) or 1 / 0)
+    monkeypatch.setattr(
+        "probewise.cli.diagnose.journal_recording_and_shape", lambda path, sensor: seen.append(sensor) or 1 / 0
+    )
     with pytest.raises(ZeroDivisionError):
         run("diagnose", journal, "--out", tmp_path / "d")
     assert seen[0].names == read_sensor(sensor_file).names

@@ -177,7 +177,7 @@ def test_ctrl_c_while_the_report_is_written_says_how_to_go_on_and_that_goes_on(
 ):
     out = tmp_path / "out"
     with monkeypatch.context() as patch:
-        patch.setattr(exploration, "write_page", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+        patch.setattr(exploration, "page_html", lambda *_, **__: signal.raise_signal(signal.SIGINT))
         assert main(command(sensor_file, out)) == 130
     said = capsys.readouterr().err
     again = command(sensor_file, out, "--resume")
@@ -195,7 +195,7 @@ def test_ctrl_c_while_the_report_is_written_says_how_to_go_on_and_that_goes_on(
 def test_a_drawing_that_swallows_a_signal_stops_the_run_all_the_same(
     sensor_file, tmp_path, quick_frames, monkeypatch, capsys
 ):
-    drawn = exploration.frame
+    drawn = exploration.robot_view_png
 
     def swallowing(*_, **__):
         try:
@@ -203,7 +203,7 @@ def test_a_drawing_that_swallows_a_signal_stops_the_run_all_the_same(
         except KeyboardInterrupt:
             return drawn()
 
-    monkeypatch.setattr(exploration, "frame", swallowing)
+    monkeypatch.setattr(exploration, "robot_view_png", swallowing)
     out = tmp_path / "out"
     assert main(command(sensor_file, out)) == 128 + signal.SIGTERM
     assert "keeps 1 reading; go on with" in capsys.readouterr().err
@@ -217,7 +217,7 @@ def test_what_the_journal_holds_is_counted_not_what_this_command_took(
     """Stopped while it replays the first of two readings, it keeps both."""
     out = tmp_path / "out"
     assert main(command(sensor_file, out, "--max-readings", 2)) == 0
-    monkeypatch.setattr(exploration, "frame", lambda *_, **__: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr(exploration, "robot_view_png", lambda *_, **__: signal.raise_signal(signal.SIGINT))
     assert main(command(sensor_file, out, "--max-readings", 2, "--resume")) == 130
     assert "keeps 2 readings" in capsys.readouterr().err
 

@@ -66,13 +66,13 @@ def test_a_robot_at_work_can_be_watched(sensor_file, tmp_path, monkeypatch, quic
     """The page loads itself anew until the run is over; it is opened once."""
     pages, opened = [], []
     monkeypatch.setattr("webbrowser.open", lambda url: opened.append(url))
-    shown = exploration.live_page
+    shown = exploration.live_page_html
 
     def remember(*arguments, **keywords):
         pages.append(shown(*arguments, **keywords))
         return pages[-1]
 
-    monkeypatch.setattr(exploration, "live_page", remember)
+    monkeypatch.setattr(exploration, "live_page_html", remember)
     out = tmp_path / "out"
     assert run("explore", "--sensor", sensor_file, "--out", out, "--live", "--quiet", "--max-readings", 2) == 0
     assert ['http-equiv="refresh"' in page for page in pages] == [True, False]
@@ -86,7 +86,7 @@ def test_a_search_that_is_stopped_says_what_the_journal_keeps(sensor_file, tmp_p
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(exploration, "frame", stop)
+    monkeypatch.setattr(exploration, "robot_view_png", stop)
     out = tmp_path / "out"
     assert run("explore", "--sensor", sensor_file, "--out", out, "--quiet") == 130
     said = capsys.readouterr().err

@@ -7,7 +7,7 @@ import pytest
 
 from probewise.arm import read_geometry, shipped_geometry
 from probewise.cli import main
-from probewise.cli._arm import open_emulated
+from probewise.cli._arm import open_emulated_arm_and_bench
 from probewise.recordings import Uniform
 from probewise.world.shipped import truth
 
@@ -26,7 +26,7 @@ def built(tmp_path, home_deg):
 def true_off_mm(file):
     """Look where the sensor of that arm hangs, relative to the first place."""
     geometry = read_geometry(shipped_geometry())
-    lego, bench = open_emulated(geometry, file, truth("paper"), Uniform(1.0), seed=1)
+    lego, bench = open_emulated_arm_and_bench(geometry, file, truth("paper"), Uniform(1.0), seed=1)
     off = []
     with lego as arm:
         for text in PLACES:

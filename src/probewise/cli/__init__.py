@@ -2,8 +2,10 @@
 
 The steps of the paper as commands: `calibrate` (section 2.5, the SSF from a recording), `explore`
 (sections 2.2-2.3, the robot finds a shape), `audit` (what a plan can detect), `diagnose` (what the model leaves out),
-`predict` (eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once; `sheets` draws
-patterns to print, `arm` moves and reads the LEGO arm, `emulate-nxt` emulates it.
+`predict` (eq. of the sensor model with its uncertainty) and `demo`, which does all of them at once. Beyond the paper:
+`investigate` takes the readings that a diagnosis advises, `fit` fits a user's simulator, `study` and `challenge`
+measure how good the robot and the diagnosis are; `sheets` draws patterns to print, `arm` moves and reads the LEGO arm,
+`emulate-nxt` emulates it.
 
 Exit status 0: done; 1: a computation that could not finish, an instrument that does not answer;
 2: unusable input, reported in one line, nothing written; 128 + N: stopped by signal N (130: Ctrl-C).

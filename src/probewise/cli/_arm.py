@@ -66,7 +66,7 @@ class ArmName:
         return self.kind == "nxt" or (self.kind == "emulator" and bool(self.where))
 
     def true_geometry_file(self, geometry_file: Path | None) -> Path | None:
-        """Return the file of an emulated arm's true geometry; None: the shipped one."""
+        """Return the file of an emulated arm's true geometry, by default the given one; None: the shipped one."""
         return Path(self.where) if self.where else geometry_file
 
 
@@ -90,13 +90,13 @@ def parse_arm(text: str) -> ArmName:
 
 
 def open_own_instrument(path: str, *, start_s: float = 0.0) -> OwnInstrument:
-    """Load a user's file; its `connect()` is called when the instrument is entered."""
+    """Load the instrument of a user's file; its `connect()` is called when the instrument is entered."""
     from probewise.arm import OwnInstrument
 
     return OwnInstrument.from_file(path, start_s=start_s)
 
 
-def open_emulated(
+def open_emulated_arm_and_bench(
     geometry: Geometry,
     geometry_file: Path | None,
     world: World,
@@ -105,9 +105,9 @@ def open_emulated(
     seed: int,
     start_s: float = 0.0,
 ) -> tuple[LegoArm, EmulatedBench]:
-    """Open the LEGO arm on an emulated brick over a simulated table, with a clock that runs as fast as possible.
+    """Open the LEGO arm on an emulated brick over a simulated table; return the arm and the bench.
 
-    The emulator reads its own true geometry: `geometry_file`, or the shipped one.
+    The clock runs as fast as possible. The emulator reads its own true geometry: `geometry_file`, or the shipped one.
     """
     from probewise.arm.nxt import Brick, BrickMachine, Link
     from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry
@@ -117,16 +117,16 @@ def open_emulated(
     bench = set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
     brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
     machine = BrickMachine(brick, geometry)
-    return emulated_arm(machine, geometry, bench, clock=clock, start_s=start_s), bench
+    return arm_reporting_table_contact(machine, geometry, bench, clock=clock, start_s=start_s), bench
 
 
-def emulated_arm(
+def arm_reporting_table_contact(
     machine: Machine, geometry: Geometry, bench: EmulatedBench, *, clock: Clock, start_s: float
 ) -> LegoArm:
-    """Return an arm on an emulated bench, which reports at the end if its sensor went through the table."""
+    """Return the arm on an emulated bench, which warns when it is left if its sensor went through the table."""
     from probewise.arm import LegoArm
 
-    class Emulated(LegoArm):
+    class TableContactReporter(LegoArm):
         def __exit__(
             self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
         ) -> None:
@@ -138,10 +138,10 @@ def emulated_arm(
                     f"({lowest.x_mm:.0f}, {lowest.y_mm:.0f}) mm"
                 )
 
-    return Emulated(machine, geometry, clock=clock, start_s=start_s)
+    return TableContactReporter(machine, geometry, clock=clock, start_s=start_s)
 
 
-def warn_of_clearance(geometry: Geometry) -> None:
+def warn_if_clearance_doubtful(geometry: Geometry) -> None:
     """Warn if the sensor may touch the table: if its height may be wrong by more than the reading height."""
     doubt_mm = geometry.height_doubt_mm
     if doubt_mm < geometry.read_height_mm:
@@ -158,7 +158,7 @@ def warn_of_clearance(geometry: Geometry) -> None:
     )
 
 
-def warn_of_place_sd(geometry: Geometry, stop_sd_mm: float) -> None:
+def warn_if_place_sd_large(geometry: Geometry, stop_sd_mm: float) -> None:
     """Warn if the sd of the arm's place is no smaller than the sd at which a run stops."""
     accuracy = geometry.accuracy
     if accuracy is None or accuracy.place_sd_mm < stop_sd_mm:
@@ -169,8 +169,8 @@ def warn_of_place_sd(geometry: Geometry, stop_sd_mm: float) -> None:
     )
 
 
-def confirm_lowering(arm: LegoArm) -> LegoArm:
-    """Let a person confirm each step of the arm's first lowering; return the same arm."""
+def enable_confirmed_lowering(arm: LegoArm) -> LegoArm:
+    """Make the arm ask a person to confirm each step of its first lowering; return the same arm."""
     ask = prompter(arm)
 
     def confirm(height_mm: float) -> None:
@@ -181,7 +181,7 @@ def confirm_lowering(arm: LegoArm) -> LegoArm:
 
 
 def parse_place(name: str, text: str) -> tuple[float, float]:
-    """Parse "X,Y" in mm."""
+    """Parse "X,Y" in mm; raise ParameterError, with the option's name, for anything else."""
     try:
         x_mm, y_mm = (float(cell) for cell in text.split(","))
     except ValueError:
@@ -191,7 +191,7 @@ def parse_place(name: str, text: str) -> tuple[float, float]:
     return x_mm, y_mm
 
 
-def open_nxt(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
+def open_nxt_arm(port: str, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:
     """Connect to the brick at a port; return its arm."""
     from probewise.arm import LegoArm
     from probewise.arm.nxt import BrickMachine
@@ -206,7 +206,7 @@ def open_brick(port: str) -> Brick:
     return Brick.open(port)
 
 
-class ReportingInstrument:
+class InstrumentWithCallbacks:
     """An instrument that calls `moving` with the pose before each move, and `read` with each reading."""
 
     def __init__(self, instrument: Instrument, moving: Callable[[Pose], None], read: Callable[[Reading], None]) -> None:
@@ -225,14 +225,14 @@ class ReportingInstrument:
         self._instrument.__exit__(kind, error, trace)
 
     def measure(self, pose: Pose) -> Reading:
-        """Report the move, measure, report the reading."""
+        """Call `moving`, measure, call `read`, and return the reading."""
         self._moving(pose)
         reading = self._instrument.measure(pose)
         self._read(reading)
         return reading
 
 
-def require_declared(
+def require_turns_and_lifts(
     arm: Instrument, orientations_deg: Sequence[float] | None, heights_mm: Sequence[float] | None
 ) -> None:
     """Check that a user's instrument, already entered, can take the orientations and heights that were given.
@@ -274,7 +274,10 @@ def _read_line() -> str:
 
 
 def prompter_for_answer(arm: Instrument) -> Callable[[str], str]:
-    """Return a function that asks a person for a line, while keeping the arm awake."""
+    """Return a function that asks a person and returns the line typed, while keeping the arm awake.
+
+    It raises CommandError if standard input has ended.
+    """
     keep_awake: Callable[[], None] = getattr(arm, "keep_awake", lambda: None)
 
     def ask(text: str) -> str:

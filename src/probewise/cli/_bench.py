@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probewise.arm import LegoArm, OwnInstrument, Reading, ReadingScale, Request, SimulatedArm
-from probewise.cli._arm import SCENE, ArmName, open_emulated, open_nxt, open_own_instrument
+from probewise.cli._arm import SCENE, ArmName, open_emulated_arm_and_bench, open_nxt_arm, open_own_instrument
 from probewise.cli._common import DEFAULT_SEED
 from probewise.emulator import Tabletop, parse_scene
 from probewise.errors import ParameterError
@@ -56,19 +56,21 @@ class Bench:
         """Return the simulated arm over the table; its sensor takes any orientation."""
         number = itertools.count(self._n_taken)
 
-        def light(pose: Pose, time_s: float, height_mm: float) -> float:
+        def read_world(pose: Pose, time_s: float, height_mm: float) -> float:
             rng = np.random.default_rng([self._seed, next(number)])
             place = (pose.x_mm, pose.y_mm, pose.orientation_rad)
             return self._world.read(self._table.surface, *place, time_s=time_s, rng=rng, height_mm=height_mm)
 
-        make = partial(SimulatedArm, light, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
+        make = partial(SimulatedArm, read_world, reach=geometry, scale=self._scale, height_mm=self._world.height_mm)
         rest = make().pose
         return make(last=Reading(math.nan, rest, start_s))
 
     def open_emulated_arm(self, geometry: Geometry, geometry_file: Path | None, *, start_s: float = 0.0) -> LegoArm:
         """Return the LEGO arm over the table, on an emulated brick."""
         surface, seed = self._table.surface, self._seed + self._n_taken
-        arm, bench = open_emulated(geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s)
+        arm, bench = open_emulated_arm_and_bench(
+            geometry, geometry_file, self._world, surface, seed=seed, start_s=start_s
+        )
         self._table, self._stand = bench.table, bench.arm.stand
         return arm
 
@@ -99,12 +101,12 @@ class Bench:
     def carry_out_request(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
         if isinstance(request, Request) and request.pattern is not None:
-            self._table.surface = moved_pattern(patterns[request.pattern], origin_mm)
+            self._table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
         if isinstance(request, Request) and request.turned_rad is not None:
             self._table.turned_rad = request.turned_rad
 
 
-def open_arm(
+def open_arm_and_bench(
     chosen: ArmName,
     geometry: Geometry,
     geometry_file: Path | None,
@@ -115,7 +117,7 @@ def open_arm(
     start_s: float = 0.0,
     n_taken: int = 0,
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
-    """Open an arm to carry out a plan, with a simulated bench if it has one.
+    """Open an arm to carry out a plan; return it with its simulated bench, None for a real arm.
 
     Parameters
     ----------
@@ -134,12 +136,12 @@ def open_arm(
         If the brick cannot read in the sensor's unit.
     """
     if chosen.kind == "nxt":
-        return open_nxt(chosen.where, geometry, start_s=start_s), None
+        return open_nxt_arm(chosen.where, geometry, start_s=start_s), None
     if chosen.kind == "file":
         return open_own_instrument(chosen.where, start_s=start_s), None
     from probewise.experiment import scale_of
 
-    world, instrumentation = world_of(sensor)
+    world, instrumentation = world_and_instrumentation(sensor)
     if chosen.is_lego and instrumentation is not None and instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(sensor), "one that reads in LEGO units, as the brick does")
     scale = ReadingScale() if instrumentation is None else scale_of(instrumentation)
@@ -149,8 +151,8 @@ def open_arm(
     return bench.open_simulated_arm(None if geometry_file is None else geometry, start_s=start_s), bench
 
 
-def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:
-    """Return the world and instrumentation of a sensor.json, or the world of the shipped recordings."""
+def world_and_instrumentation(sensor: Path | None) -> tuple[World, Instrumentation | None]:
+    """Return the world and instrumentation of a sensor.json; None: the world of the shipped recordings, and None."""
     if sensor is None:
         from probewise.world.shipped import truth
 
@@ -162,8 +164,8 @@ def world_of(sensor: Path | None) -> tuple[World, Instrumentation | None]:
     return world_like(found), found.instrumentation
 
 
-def moved_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
-    """Return a pattern with its origin moved to `by_mm`."""
+def shifted_pattern(pattern: Pattern, by_mm: tuple[float, float]) -> Surface:
+    """Return a pattern shifted by `by_mm`; raise ParameterError for a ramp, which cannot be shifted."""
     x_mm, y_mm = by_mm
     match pattern:
         case Uniform():

@@ -31,7 +31,7 @@ class Verb:
 
 
 class CommandError(ProbewiseError, ValueError):
-    """An incomplete command line; the message says how to complete it."""
+    """A command that cannot be carried out as given: an option is missing or does not apply, or nobody answers."""
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -65,8 +65,8 @@ class OneLineParser(argparse.ArgumentParser):
             )
 
 
-def add_common(parser: argparse.ArgumentParser) -> None:
-    """Add the options that every verb with randomness or progress has."""
+def add_seed_and_quiet(parser: argparse.ArgumentParser) -> None:
+    """Add --seed and --quiet."""
     parser.add_argument(
         "--seed",
         type=seed_number,
@@ -128,8 +128,8 @@ def seed_number(text: str) -> int:
     return _parse_whole_number(text, least=0, allowed="of 0 or more")
 
 
-def positive_number(unit: str) -> Callable[[str], float]:
-    """Return a parser of numbers above 0 with some unit, for argparse."""
+def positive_number_parser(unit: str) -> Callable[[str], float]:
+    """Return a parser of finite numbers above 0, for argparse; its message names the unit."""
 
     def read(text: str) -> float:
         try:
@@ -144,7 +144,7 @@ def positive_number(unit: str) -> Callable[[str], float]:
 
 
 def print_result(text: str, *, quiet: bool = False) -> None:
-    """Write a result to standard output."""
+    """Write a line of the result to standard output, unless `quiet`."""
     if not quiet:
         sys.stdout.write(text + "\n")
         sys.stdout.flush()
@@ -156,10 +156,11 @@ def print_warning(text: str) -> None:
     sys.stderr.flush()
 
 
-def message_of_kept_results(
-    path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1
-) -> str:
-    """Return a message: how much of a run a file holds, and the command that resumes the run."""
+def message_to_resume(path: Path, n: int, noun: str, arguments: argparse.Namespace, *options: str, of: int = 1) -> str:
+    """Return a message: how much of a run a file holds, and the command that resumes the run.
+
+    `options` are added to the words of the command line; `of` is the total number, if known.
+    """
     words = [*arguments.words, *(option for option in options if option not in arguments.words)]
     command = (subprocess.list2cmdline if os.name == "nt" else shlex.join)(["probewise", *words])
     count = f"{n} of {of} {noun}s" if of > 1 else f"{n} {noun}{'' if n == 1 else 's'}"

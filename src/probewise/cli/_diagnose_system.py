@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from probewise.cli._common import print_result
-from probewise.cli._output import Stage, check_out_directory, staged_output
-from probewise.cli._simulator import read_tables, refuse_sensor_options
+from probewise.cli._output import StagingDirectory, checked_output_directory, staged_output
+from probewise.cli._simulator import read_joined_table, refuse_sensor_options
 
 if TYPE_CHECKING:
     from probewise.diagnosis import Diagnosis
@@ -18,7 +18,7 @@ _OF_ONE_RUN = ("witness_*.svg", "gain.svg", "next.csv")
 
 
 def diagnose_simulator(arguments: argparse.Namespace) -> int:
-    """Diagnose and write diagnosis.json, both models, next.csv, report.html and the figures."""
+    """Diagnose; write diagnosis.json, both models, next.csv, report.html and the figures; return the exit status."""
     from functools import partial
 
     import numpy as np
@@ -29,9 +29,9 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
     from probewise.systems import read_simulator
 
     refuse_sensor_options(arguments, "sensor")
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     simulator = read_simulator(arguments.simulator)
-    table, notes = read_tables(simulator, arguments.recordings)
+    table, notes = read_joined_table(simulator, arguments.recordings)
     diagnosis_rng, nested_rng = np.random.default_rng(arguments.seed).spawn(2)
     with progress_shown(quiet=arguments.quiet) as progress:
         weigh_again = partial(weigh_thoroughly, rng=nested_rng, progress=progress)
@@ -45,18 +45,20 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
             progress=progress,
         )
         progress("drawing the figures")
-        drawn = report.figures(diagnosis)
-        page = report.write_page(diagnosis, drawn, source=diagnosis.recording.source, seed=arguments.seed)
-    with staged_output(out, inputs=_files_to_keep(arguments, out, simulator.reading), outdated=_OF_ONE_RUN) as stage:
+        drawn = report.encoded_figures(diagnosis)
+        page = report.page_html(diagnosis, drawn, source=diagnosis.recording.source, seed=arguments.seed)
+    with staged_output(
+        out, inputs=_files_not_to_replace(arguments, out, simulator.reading), outdated=_OF_ONE_RUN
+    ) as stage:
         write_results(diagnosis, drawn, stage)
         stage.write("report.html", page)
-    for note in (*notes, *notes_on_calls(diagnosis), *stage.notes):
+    for note in (*notes, *notes_on_calls(diagnosis), *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
 
 
-def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: Stage) -> None:
+def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagingDirectory) -> None:
     """Write diagnosis.json, the calibrated and the repaired simulator, the next rows to take and the figures."""
     from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
     from probewise.systems import run_table_csv, write_fitted_system
@@ -70,7 +72,7 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: Stage) -
     stage.write_figures(drawn)
 
 
-def _files_to_keep(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
+def _files_not_to_replace(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
     """List files that results must not replace: inputs, and an earlier next.csv with readings filled in."""
     from probewise.errors import FileError
     from probewise.recordings.table import read_table

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
 
-from probewise.cli._common import message_of_kept_results, positive_int
+from probewise.cli._common import message_to_resume, positive_int
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError
 from probewise.progress import Progress
@@ -25,7 +25,7 @@ def add_executor(parser: argparse.ArgumentParser) -> None:
 
 @contextlib.contextmanager
 def _open_executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
-    """Yield the executor; None for this process."""
+    """Yield the executor that the options name; None for this process."""
     if arguments.scheduler is not None:
         with _cluster_executor(arguments.scheduler) as executor:
             yield executor
@@ -39,26 +39,29 @@ def _open_executor(arguments: argparse.Namespace) -> Iterator[Executor | None]:
 
 
 @contextlib.contextmanager
-def campaign_running(
+def executor_and_progress(
     path: Path, noun: str, arguments: argparse.Namespace
 ) -> Iterator[tuple[Executor | None, Progress]]:
-    """Yield a campaign's executor and progress function; an interruption reports what the file holds."""
+    """Yield a campaign's executor, None for this process, and its progress function.
+
+    If the block is interrupted, the message says what the campaign's file holds.
+    """
     from probewise._progress import progress_shown
 
     with (
-        reporting_what_is_kept(lambda: message_of_kept_campaign(path, noun, arguments)),
+        reporting_what_is_kept(lambda: message_to_resume_campaign(path, noun, arguments)),
         progress_shown(quiet=arguments.quiet) as progress,
         _open_executor(arguments) as executor,
     ):
         yield executor, progress
 
 
-def message_of_kept_campaign(path: Path, noun: str, arguments: argparse.Namespace) -> str:
+def message_to_resume_campaign(path: Path, noun: str, arguments: argparse.Namespace) -> str:
     """Return a message: how many finished tasks a campaign's file holds, and the command that resumes it."""
     from probewise.campaign import read_campaign
 
     return (
-        message_of_kept_results(path, len(read_campaign(path).results), noun, arguments)
+        message_to_resume(path, len(read_campaign(path).results), noun, arguments)
         if path.exists()
         else "nothing was written"
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from probewise import experiment as posing
-from probewise.cli._arm import open_emulated, open_nxt, open_own_instrument
+from probewise.cli._arm import open_emulated_arm_and_bench, open_nxt_arm, open_own_instrument
 from probewise.cli._explore_inputs import Inputs
 from probewise.cli._geometry import parse_truth
 from probewise.errors import ParameterError
@@ -44,13 +44,13 @@ def open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tup
         if chosen.kind == "file":
             return ArmAndTruth(open_own_instrument(chosen.where, start_s=start_s))
         assert geometry is not None
-        return ArmAndTruth(open_nxt(chosen.where, geometry, start_s=start_s))
+        return ArmAndTruth(open_nxt_arm(chosen.where, geometry, start_s=start_s))
     hidden = parse_truth(arguments.truth, arguments.shape, inputs.field, rng=inputs.streams.truth)
     world, surface = posing.world_like(inputs.sensor), posing.with_cards(hidden.surface, inputs.cards)
     arm: Instrument
     if chosen.is_lego and geometry is not None:
         built, seed = chosen.true_geometry_file(arguments.geometry), inputs.streams.noise
-        arm, _ = open_emulated(geometry, built, world, surface, seed=seed, start_s=start_s)
+        arm, _ = open_emulated_arm_and_bench(geometry, built, world, surface, seed=seed, start_s=start_s)
     else:
         arm = posing.arm_over(
             world,

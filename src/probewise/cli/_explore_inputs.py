@@ -31,7 +31,7 @@ class Inputs:
     """Checked inputs of a run.
 
     `other` is the experiment under the sensor model `other_model`, which --both-models shows too; otherwise None.
-    `geometry` is None unless the arm is a LEGO arm.
+    `geometry` is that of a LEGO arm, or the one that --geometry gives a simulated arm; otherwise None.
     """
 
     arm: ArmName
@@ -53,7 +53,7 @@ class Inputs:
 
 
 def checked_inputs(arguments: argparse.Namespace) -> Inputs:
-    """Read and check the options.
+    """Read the files that the options name, check the options, and build the experiment.
 
     Raises ParameterError or FileError if an option contradicts another, or a file cannot be read.
     """
@@ -61,13 +61,13 @@ def checked_inputs(arguments: argparse.Namespace) -> Inputs:
     if chosen.kind == "file" and arguments.geometry is not None:
         raise ParameterError("--geometry", str(arguments.geometry), "none with FILE.py, which defines its own reach")
     geometry = geometry_of(arguments) if chosen.is_lego or arguments.geometry is not None else None
-    field = _field_of_run(arguments.field, geometry)
+    field = _checked_field(arguments.field, geometry)
     sensor = read_sensor(arguments.sensor)
     if chosen.is_lego and sensor.instrumentation.unit not in ("", "LEGO"):
         raise ParameterError("--sensor", str(arguments.sensor), "one that reads in LEGO units, as the brick does")
     streams = posing.RandomStreams.of(np.random.default_rng(arguments.seed))
     shape = posing.shape_named(arguments.shape, field)
-    orientations_rad, heights_mm, repeats = _choices_of_settings(arguments, geometry)
+    orientations_rad, heights_mm, repeats = _checked_setting_choices(arguments, geometry)
     cards = parse_cards(arguments.reference, field)
     if cards and (arguments.both_models or arguments.model == "naive" or arguments.method == "paper"):
         allowed = "none with --both-models, --model naive or --method paper"
@@ -118,10 +118,13 @@ def _model_to_compare_with(model: Model) -> Model:
     return "naive" if model == "ssf" else "ssf"
 
 
-def _choices_of_settings(
+def _checked_setting_choices(
     arguments: argparse.Namespace, geometry: Geometry | None
 ) -> tuple[tuple[float, ...], tuple[float, ...], tuple[int, ...]]:
-    """Return the orientations (radians), heights and repeats to choose from, if the arm supports them."""
+    """Return the orientations (radians), heights (mm) and repeats to choose from.
+
+    Raises ParameterError if the arm, or the naive model, does not support them.
+    """
     turns, heights_mm = arguments.orientations, arguments.heights
     asked = {"--orientations": turns, "--heights": heights_mm}
     refused = {}
@@ -138,8 +141,11 @@ def _choices_of_settings(
     return tuple(math.radians(turn) for turn in turns or (0.0,)), heights_mm or (), arguments.repeats or (1,)
 
 
-def _field_of_run(text: str | None, geometry: Geometry | None) -> Field:
-    """Return the given field, which must agree with the geometry if there is one."""
+def _checked_field(text: str | None, geometry: Geometry | None) -> Field:
+    """Return the field given, or the geometry's, or the paper's.
+
+    Raises ParameterError if the one given contradicts the geometry.
+    """
     if geometry is None:
         return parse_field("1048,520" if text is None else text)
     own = Field(*geometry.field_mm)
@@ -151,7 +157,10 @@ def _field_of_run(text: str | None, geometry: Geometry | None) -> Field:
 def _naive_levels(
     arguments: argparse.Namespace, chosen: ArmName, sensor: FittedSensor, *, rng: np.random.Generator
 ) -> Naive | None:
-    """Return the paper's naive levels from the given recording, or from readings of the simulated sensor."""
+    """Return the levels of the paper's naive model, from a recording or the simulated sensor; None if it is not used.
+
+    Raises ParameterError if an option does not apply, or a real arm has no recording.
+    """
     if arguments.nested_stop is not None and arguments.method != "paper":
         raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
     wanted = arguments.method == "paper" and (arguments.model == "naive" or arguments.both_models)

@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise import experiment as posing
 from probewise.cli._explore_inputs import Inputs
-from probewise.cli._output import Stage
+from probewise.cli._output import StagingDirectory
 from probewise.cli._stopping import raise_if_stopped
 from probewise.recordings import write_bytes_atomically, write_text_atomically
 from probewise.report import exploration as report
@@ -37,21 +37,21 @@ class Pictures:
     """Steps of the other sensor model on the same readings."""
     frames: list[bytes] = field(default_factory=list)
 
-    def add(self, step: Step, shadow: Step | None) -> None:
-        """Draw a step, with the other sensor model's step (`shadow`) if there is one, and write the picture."""
+    def draw_and_write(self, step: Step, shadow: Step | None) -> None:
+        """Draw a step, with the other sensor model's (`shadow`) if there is one; write its PNG and the live page."""
         self.steps.append(step)
         if shadow is not None:
             self.shadows.append(shadow)
         self.frames.append(self._draw_frame(step, shadow))
         raise_if_stopped()  # a signal may have damaged the picture
         if step.number == 1 and not step.replayed:
-            _remove_pictures(self.out)
+            _remove_earlier_results(self.out)
         folder = self.out / "frames"
         folder.mkdir(exist_ok=True)
         write_bytes_atomically(folder / f"{step.number:03d}.png", self.frames[-1])
         if self.live:
             trust = self.inputs.experiment.trust
-            page = report.live_page(step, self.frames[-1], earlier=self.steps[:-1], trust=trust)
+            page = report.live_page_html(step, self.frames[-1], earlier=self.steps[:-1], trust=trust)
             write_text_atomically(self.out / "live.html", page)
             if len(self.frames) == 1:
                 webbrowser.open((self.out / "live.html").absolute().as_uri())
@@ -61,15 +61,19 @@ class Pictures:
         poses = [(each.reading.pose, each.reading.value) for each in self.steps]
         readings = [(pose.x_mm, pose.y_mm, value) for pose, value in poses]
         if shadow is None or inputs.other is None:
-            return report.frame(step, inputs.experiment, readings, levels=inputs.levels, truth_mm=self.truth_mm)
+            return report.robot_view_png(
+                step, inputs.experiment, readings, levels=inputs.levels, truth_mm=self.truth_mm
+            )
         views = {inputs.model: (step, inputs.experiment), inputs.other_model: (shadow, inputs.other)}
         titled = [("naive model", *views["naive"]), ("SSF model", *views["ssf"])]
-        return report.frame_of_several_models(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
+        return report.robot_views_png(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
 
-    def write_results(self, stage: Stage, result: Exploration, *, seed: int, known: Mapping[str, float] | None) -> None:
-        """Write the report, the animation, the result, its samples and the sensor as the run leaves it."""
+    def write_results(
+        self, stage: StagingDirectory, result: Exploration, *, seed: int, known: Mapping[str, float] | None
+    ) -> None:
+        """Write the report, the animation, the result, its samples, and the sensor as the run has learnt it."""
         beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None
-        page = report.write_page(
+        page = report.page_html(
             result,
             self.frames,
             seed=seed,
@@ -86,8 +90,8 @@ class Pictures:
         stage.write("sensor.json", learnt.to_json())
 
 
-def _remove_pictures(out: Path) -> None:
-    """Remove files of an earlier run from `out`, if its journal is gone, so that two runs do not mix."""
+def _remove_earlier_results(out: Path) -> None:
+    """Remove report, animation, live page and frames of an earlier run from `out`, so that two runs do not mix."""
     for pattern in ("report.html", "run.gif", "live.html", "frames/[0-9]*.png"):
         for path in out.glob(pattern):
             path.unlink()

@@ -13,7 +13,7 @@ from probewise.scene import SHAPES, Card, Field
 
 
 def parse_field(text: str) -> Field:
-    """Parse "WIDTH,HEIGHT" in mm."""
+    """Parse "WIDTH,HEIGHT" in mm; raise ParameterError for anything else."""
     try:
         width, height = (float(cell) for cell in text.split(","))
     except ValueError as error:
@@ -22,7 +22,10 @@ def parse_field(text: str) -> Field:
 
 
 def parse_cards(texts: Sequence[str], field: Field) -> tuple[Card, ...]:
-    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card centred at (X, Y) in mm, which must be on the field."""
+    """Parse each "X,Y,WIDTH,HEIGHT,ALBEDO": a card centred at (X, Y) in mm.
+
+    Raises ParameterError if a text is anything else, or a card is not wholly on the field.
+    """
     cards = []
     for text in texts:
         try:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def is_journal(path: Path) -> bool:
-    """Return whether a path is a journal, by its name."""
+    """Return whether a path is a journal: whether its name ends in .jsonl."""
     return path.suffix == ".jsonl"
 
 
@@ -35,8 +35,8 @@ def refuse_journal(path: Path) -> None:
         )
 
 
-def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
-    """Read a journal: its readings by the given sensor, and the hypothesised shape.
+def journal_recording_and_shape(path: Path, sensor: FittedSensor) -> tuple[Recording, Shape]:
+    """Return a journal's readings as a recording by the given sensor, and the hypothesised shape.
 
     Raises FileError if it is not a journal, has no reading, or has a shape unknown to `explore`.
     """
@@ -45,12 +45,12 @@ def journal_recording(path: Path, sensor: FittedSensor) -> tuple[Recording, Shap
     journal = read_journal(path)
     if not journal.entries:
         raise FileError(path, "no reading", "a journal with at least one measurement")
-    recording = journal.recording(instrumentation=_instrumentation(path, sensor, journal.settings))
-    return replace(recording, notes=(*recording.notes, *journal.notes)), _shape_of(path, journal.settings)
+    recording = journal.recording(instrumentation=_instrumentation_as_declared(path, sensor, journal.settings))
+    return replace(recording, notes=(*recording.notes, *journal.notes)), _hypothesised_shape(path, journal.settings)
 
 
-def journal_sensor(path: Path) -> Path:
-    """Find the sensor.json of a journal's run, at its original path or beside the journal.
+def find_journal_sensor_file(path: Path) -> Path:
+    """Return the path of the sensor.json of a journal's run: its original path, or beside the journal.
 
     Raises FileError if the journal names none, or the file found is a different one.
     """
@@ -70,7 +70,7 @@ def journal_sensor(path: Path) -> Path:
     raise FileError(path, f"its sensor {named} (as seen from {path.parent}) {found}", give)
 
 
-def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:
+def _instrumentation_as_declared(path: Path, sensor: FittedSensor, settings: Mapping[str, Any]) -> Instrumentation:
     """Return the sensor's instrumentation, with the rounding and range that the run declared."""
     try:
         step = settings["options"]["step"]
@@ -86,8 +86,11 @@ def _instrumentation(path: Path, sensor: FittedSensor, settings: Mapping[str, An
     return replace(sensor.instrumentation, step=step, min=low, max=high)
 
 
-def _shape_of(path: Path, settings: Mapping[str, Any]) -> Shape:
-    """Build the shape that the journal's first line names; it must be one that `explore` offers, or a set of these."""
+def _hypothesised_shape(path: Path, settings: Mapping[str, Any]) -> Shape:
+    """Build the hypothesised shape that the journal's first line names.
+
+    Raises FileError unless `explore` offers it, or it is a set of such shapes.
+    """
     from probewise.experiment import shape_named
     from probewise.scene import SHAPES, Field
 

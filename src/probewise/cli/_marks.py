@@ -54,7 +54,9 @@ def bring_to_mark(
     *,
     named: str,
 ) -> TouchedMark | None:
-    """Bring the sensor over a mark and down to the block on it, as a person directs; None if the mark is skipped.
+    """Bring the sensor over a mark and down to the block on it, as a person directs.
+
+    Returns the joints' turns from home there, with the mark's place and height; None if the mark is skipped.
 
     Every move turns the base first and then lowers, as in a reading.
 
@@ -67,7 +69,7 @@ def bring_to_mark(
     ask
         Function that asks the person and returns "ok", "seen", "skip", or a move such as "x 5".
     tell
-        Function that reports why a move was refused.
+        Function that tells the person what can be answered, and why a move was refused.
     named
         Name of the mark.
     """
@@ -85,7 +87,7 @@ def bring_to_mark(
             base, shoulder, elbow = (arm.angles_rad - homes).tolist()
             height_mm = block_mm if answer == "ok" else math.nan
             return TouchedMark((base, shoulder, elbow), (*mark_mm, height_mm))
-        moved = _place_after(at, answer)
+        moved = _place_after_moves(at, answer)
         if moved is None:
             tell(f"{answer!r} says nothing that can be done. {_HELP}")
             continue
@@ -98,7 +100,7 @@ def bring_to_mark(
             at = moved
 
 
-def _place_after(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
+def _place_after_moves(at_mm: tuple[float, float, float], answer: str) -> tuple[float, float, float] | None:
     """Return the sensor's place (x, y, height in mm) after the moves in an answer; None if it is not a list of moves.
 
     An answer is pairs such as "x 5 down 2"; an empty one means one step down.

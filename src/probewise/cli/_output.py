@@ -25,7 +25,7 @@ _FOLDER, _COMMIT = ".writing", "commit.json"
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 
 
-class Stage:
+class StagingDirectory:
     """An empty directory to write results into, and the input files that were renamed to make way for them.
 
     Attributes
@@ -54,17 +54,17 @@ class Stage:
         self.write(name, json.dumps(document, allow_nan=False, indent=1) + "\n")
 
     def write_figures(self, drawn: Mapping[str, bytes]) -> None:
-        """Write figures by the name of their file."""
+        """Write figures, given as bytes by file name."""
         for name, content in drawn.items():
             self.write(name, content)
 
     @property
-    def notes(self) -> list[str]:
-        """One text for each renamed file."""
+    def notes_on_renamed_inputs(self) -> list[str]:
+        """A sentence for each input file that was renamed."""
         return [f"what was {path} is now {now}" for path, now in self.kept.items()]
 
 
-def check_out_directory(path: Path) -> Path:
+def checked_output_directory(path: Path) -> Path:
     """Check before any work that results can be written there, and return the path.
 
     Raises ParameterError if a file is in the way, FileError if no directory can be made there.
@@ -81,7 +81,7 @@ def check_out_directory(path: Path) -> Path:
     return path
 
 
-def check_out_file(path: Path, *inputs: Path) -> Path:
+def checked_output_file(path: Path, *inputs: Path) -> Path:
     """Check before any work that a file can be written there, and return the path.
 
     Raises ParameterError if it is a directory, an input or below a file, FileError if its directory cannot be written
@@ -92,12 +92,14 @@ def check_out_file(path: Path, *inputs: Path) -> Path:
     for taken in inputs:
         if path.exists() and taken.exists() and path.samefile(taken):
             raise ParameterError("--out", str(path), f"another file than the input {taken}")
-    check_out_directory(path.parent)
+    checked_output_directory(path.parent)
     return path
 
 
 @contextlib.contextmanager
-def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[Stage]:
+def staged_output(
+    out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()
+) -> Iterator[StagingDirectory]:
     """Yield an empty directory; move its files into `out` only if the block succeeds.
 
     An error or a signal before that leaves `out` as it was.
@@ -128,11 +130,11 @@ def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[
         try:
             _finish_interrupted_commit(out)
             folder.mkdir()
-            stage = Stage(folder)
+            stage = StagingDirectory(folder)
             yield stage
             raise_if_stopped()
             with defer_signals():
-                commit = _prepare_commit(out, folder, inputs, outdated)
+                commit = _planned_commit(out, folder, inputs, outdated)
                 stage.kept = {out / name: out / kept for name, kept in commit.aside.items()}
                 write_text_atomically(folder / _COMMIT, json.dumps(asdict(commit)))
                 _finish_interrupted_commit(out)
@@ -155,14 +157,17 @@ class _Commit:
     remove: Sequence[str]
 
 
-def _prepare_commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[str]) -> _Commit:
-    """List the changes that move the files of `folder` into `out`, spare the inputs and remove outdated files."""
+def _planned_commit(out: Path, folder: Path, inputs: Sequence[Path], outdated: Sequence[str]) -> _Commit:
+    """Return the changes that move the files of `folder` into `out`, spare the inputs and remove outdated files.
+
+    Raises FileError if a directory has the name of a file.
+    """
     names = sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     for name in names:
         if (out / name).is_dir():
             raise FileError(out / name, "a directory of that name is in the way", "another --out, or none there")
     own = {path.resolve() for path in inputs}
-    aside = _kept_names(out, [name for name in names if (out / name).resolve() in own])
+    aside = _new_names_of_kept(out, [name for name in names if (out / name).resolve() in own])
     old = itertools.chain.from_iterable(out.glob(pattern) for pattern in outdated)
     gone = [path.relative_to(out).as_posix() for path in old if path.resolve() not in own]
     return _Commit(names, aside, [name for name in gone if name not in names])
@@ -178,7 +183,7 @@ def _finish_interrupted_commit(out: Path) -> None:
         return
     if (folder / _COMMIT).exists():
         try:
-            _put_in_place(out, folder, _Commit(**json.loads((folder / _COMMIT).read_text(encoding="utf-8"))))
+            _apply_commit(out, folder, _Commit(**json.loads((folder / _COMMIT).read_text(encoding="utf-8"))))
         except OSError as error:
             raise FileError(
                 error.filename2 or error.filename,
@@ -189,7 +194,7 @@ def _finish_interrupted_commit(out: Path) -> None:
     shutil.rmtree(folder)
 
 
-def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
+def _apply_commit(out: Path, folder: Path, commit: _Commit) -> None:
     """Make the changes of a commit; those already made are skipped."""
     for name in commit.names:
         new, target = folder / name, out / name
@@ -203,8 +208,11 @@ def _put_in_place(out: Path, folder: Path, commit: _Commit) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def _kept_names(out: Path, names: Sequence[str]) -> dict[str, str]:
-    """Return for each file its first free name NAME_kept, NAME_kept_2, ...; files of one stem get the same ending."""
+def _new_names_of_kept(out: Path, names: Sequence[str]) -> dict[str, str]:
+    """Return, by name, the new name of each file: the first free of NAME_kept, NAME_kept_2, ...
+
+    Files of one stem get the same ending.
+    """
     aside: dict[str, str] = {}
     for stem in dict.fromkeys(Path(name).with_suffix("") for name in names):
         group = [Path(name) for name in names if Path(name).with_suffix("") == stem]

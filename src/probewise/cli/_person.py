@@ -11,7 +11,7 @@ import numpy as np
 from probewise.arm import Pose
 from probewise.arm.carry_out import Request, reach_of
 from probewise.cli._arm import prompter_for_answer
-from probewise.cli._bench import moved_pattern
+from probewise.cli._bench import shifted_pattern
 from probewise.cli._common import print_warning
 from probewise.emulator.scenes import scene_text
 from probewise.errors import ParameterError
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class PersonAtBench:
-    """A person who carries out the requests of `carry_out`; each sheet's white and black are checked before its scan.
+    """A function that prompts a person to carry out a request of `carry_out`, and then checks the sheet that was laid.
 
     Parameters
     ----------
@@ -61,11 +61,11 @@ class PersonAtBench:
 
     def __call__(self, request: Request) -> None:
         """Prompt, and check the sheet until it is right or the person overrides the check."""
-        text = f"{request[0].upper()}{request[1:]}{self._typed_request(request)}"
+        text = f"{request[0].upper()}{request[1:]}{self._hint_for_emulator_terminal(request)}"
         self._answer(f"{text}, then press Enter: ")
         if request.pattern is None or not self._check_sheets:
             return
-        while (wrong := self._contradiction_of_sheet(request.pattern)) is not None:
+        while (wrong := self._complaint_after_reading_sheet(request.pattern)) is not None:
             if sys.stdin is None or not sys.stdin.isatty():  # input from a file cannot correct a sheet
                 print_warning(f"{wrong}; is the right sheet there, the right way round?")
                 break
@@ -73,8 +73,8 @@ class PersonAtBench:
             if said.lower() == "go":
                 break
 
-    def _typed_request(self, request: Request) -> str:
-        """Return the hint that says what to type in the emulator's terminal; "" without an emulator."""
+    def _hint_for_emulator_terminal(self, request: Request) -> str:
+        """Return a hint on what to type in the emulator's terminal to carry out the request; "" without an emulator."""
         if not self._emulated:
             return ""
         if request.turned_rad is not None:
@@ -82,22 +82,22 @@ class PersonAtBench:
         if request.pattern is None:
             return ""
         try:
-            scene = scene_text(moved_pattern(self._plan.patterns[request.pattern], self._origin))
+            scene = scene_text(shifted_pattern(self._plan.patterns[request.pattern], self._origin))
         except ParameterError:
             return " (the emulator's terminal knows no such pattern; --arm emulator lays it by itself)"
         return f" (in the emulator's terminal: {scene})"
 
-    def _contradiction_of_sheet(self, name: str) -> str | None:
-        """Read the sheet's white and black; return a complaint if they contradict its pattern, else None."""
+    def _complaint_after_reading_sheet(self, name: str) -> str | None:
+        """Read over the sheet's white and over its black; return a complaint if a reading is wrong, else None."""
         bounds, origin = reach_of(self._arm), np.array(self._origin)
         values = {}
-        for is_white, place in self._sheet_check.places_to_check(
+        for is_white, place in self._sheet_check.white_and_black_places(
             name, lambda places: bounds.contains(places + origin)
         ).items():
             x_mm, y_mm = (np.array(place) + origin).tolist()
             standing = float(self._arm.orientation_rad(np.array([[x_mm, y_mm]]))[0])
             values[is_white] = self._arm.measure(Pose(x_mm, y_mm, standing)).value
-        return self._sheet_check.check_levels(name, values)
+        return self._sheet_check.complaint_about_levels(name, values)
 
 
 def is_pty(port: str) -> bool:

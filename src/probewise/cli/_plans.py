@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 
 def read_or_shipped_plan(text: str) -> Plan:
-    """Read a plan from its file, or return a shipped one: paper, two_way."""
+    """Return the shipped plan "paper" or "two_way", or read a plan from the file of that name."""
     from probewise.recordings import paper_plan, read_plan, two_way_plan
 
     shipped = {"paper": paper_plan, "two_way": two_way_plan}
     return shipped[text]() if text in shipped else read_plan(text)
 
 
-def for_own_instrument(
+def plan_for_own_instrument(
     plan: Plan, *, unit: str | None = None, range_: str | None = None, step: str | None = None
 ) -> Plan:
     """Return the plan for a user's own instrument: instrumentation from its JSON, which the options override."""
@@ -36,8 +36,8 @@ def for_own_instrument(
     return without_measured_covariates(dataclasses.replace(plan, instrumentation=instrumentation))
 
 
-def for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
-    """Return the plan for the LEGO arm: readings in percent, at the arm's reading height."""
+def plan_for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
+    """Return the plan for the LEGO arm: readings in LEGO units, 0 to 100, at the arm's reading height."""
     instrumentation = dataclasses.replace(
         plan.instrumentation,
         unit="LEGO",
@@ -51,7 +51,7 @@ def for_lego_arm(plan: Plan, geometry: Geometry) -> Plan:
 
 
 def without_measured_covariates(plan: Plan) -> Plan:
-    """Return the plan with the covariates that can be commanded; others were measured in an earlier recording."""
+    """Return the plan with only the covariates that can be commanded; others were measured with earlier readings."""
     can = {*plan.instrumentation.controls, "led", "height_mm"}
     return dataclasses.replace(plan, covariates={name: v for name, v in plan.covariates.items() if name in can})
 

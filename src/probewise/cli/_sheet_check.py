@@ -50,9 +50,9 @@ class SheetCheck:
         places = np.stack([plan.x_mm, plan.y_mm], axis=-1)
         self._shades = np.full(len(plan), math.nan)
         for name, rows in plan.rows_by_pattern():
-            self._shades[rows] = shades_at_places(plan.patterns[name], places[rows])
+            self._shades[rows] = uniform_shades_at_places(plan.patterns[name], places[rows])
 
-    def check_reading(self, row: int, value: float) -> str | None:
+    def complaint_about_reading(self, row: int, value: float) -> str | None:
         """Return a complaint if the reading of a plan's row contradicts its sheet's pattern, else None.
 
         There is at most one complaint for each sheet and shade, white or black.
@@ -61,7 +61,7 @@ class SheetCheck:
         if math.isnan(shade) or math.isnan(value):
             return None
         name, is_white = self._plan.pattern_names[int(self._plan.pattern[row])], bool(shade)
-        wrong = self._contradiction_of_earlier(is_white, value)
+        wrong = self._complaint_against_earlier(is_white, value)
         if wrong is None:
             self._read[is_white].append(value)
             return None
@@ -71,18 +71,18 @@ class SheetCheck:
         place = f"({self._plan.x_mm[row]:g}, {self._plan.y_mm[row]:g}) mm"
         return f"sheet {name!r} contradicts its pattern: at {place} it is {_colour_in_words(is_white)}, and {wrong}"
 
-    def check_levels(self, name: str, values: dict[bool, float]) -> str | None:
-        """Check a sheet by its readings over white (True) and black (False); return a complaint or None.
+    def complaint_about_levels(self, name: str, values: dict[bool, float]) -> str | None:
+        """Check a sheet by a reading over its white (True) and one over its black (False); return a complaint or None.
 
         Readings that are right are kept as levels for later checks.
         """
         wrong = None
         if len(values) == 2:
             contrast = values[True] - values[False]
-            if self._bright and contrast < self._least_difference(*values.values()):
+            if self._bright and contrast < self._least_contrast(*values.values()):
                 wrong = f"it reads {values[True]:g} where it should be white and {values[False]:g} where black"
         for is_white, value in values.items():
-            told = self._contradiction_of_earlier(is_white, value)
+            told = self._complaint_against_earlier(is_white, value)
             wrong = wrong or (None if told is None else f"where it should be {_colour_in_words(is_white)} {told}")
         if wrong is not None:
             return f"sheet {name!r} contradicts its pattern: {wrong}"
@@ -90,15 +90,17 @@ class SheetCheck:
             self._read[is_white].append(value)
         return None
 
-    def places_to_check(self, name: str, allowed: Callable[[FloatArray], BoolArray]) -> dict[bool, tuple[float, float]]:
-        """Choose the places at which to check a sheet: one over uniform white (True), one over uniform black (False).
+    def white_and_black_places(
+        self, name: str, allowed: Callable[[FloatArray], BoolArray]
+    ) -> dict[bool, tuple[float, float]]:
+        """Choose where to check a sheet: one reachable place over uniform white (True), one over uniform black (False).
 
         Parameters
         ----------
         name
             The pattern.
         allowed
-            Function that returns which places, (n, 2) in the plan's frame, are reachable.
+            Function that returns the mask, (n,), of reachable places, (n, 2), in the plan's frame.
         """
         rows = np.flatnonzero(self._plan.pattern == self._plan.pattern_names.index(name))
         there = np.unique(np.stack([self._plan.x_mm[rows], self._plan.y_mm[rows]], axis=-1), axis=0)
@@ -107,7 +109,7 @@ class SheetCheck:
         candidates = candidates[allowed(candidates)]
         if not len(candidates):
             return {}
-        found = shades_at_places(self._plan.patterns[name], candidates)
+        found = uniform_shades_at_places(self._plan.patterns[name], candidates)
         middle = there.mean(axis=0)
         out = {}
         for is_white in (True, False):
@@ -117,12 +119,12 @@ class SheetCheck:
                 out[is_white] = (x, y)
         return out
 
-    def _contradiction_of_earlier(self, is_white: bool, value: float) -> str | None:
+    def _complaint_against_earlier(self, is_white: bool, value: float) -> str | None:
         """Return a complaint if a reading over white or black contradicts earlier readings of the sheets, else None."""
         own, other = self._read[is_white], self._read[not is_white]
         if own and other:
             level, opposite = float(np.median(own)), float(np.median(other))
-            if abs(value - level) > max(_OFF * abs(opposite - level), self._least_difference(level, opposite)):
+            if abs(value - level) > max(_OFF * abs(opposite - level), self._least_contrast(level, opposite)):
                 colour, other_colour = _colour_in_words(is_white), _colour_in_words(not is_white)
                 return f"reads {value:g}; {colour} read {level:g} so far, {other_colour} {opposite:g}"
         elif len(own) >= _FEWEST:
@@ -131,16 +133,16 @@ class SheetCheck:
                 return f"reads {value:g}; {_colour_in_words(is_white)} read {level:g} so far"
         elif other and self._bright:
             opposite = float(np.median(other))
-            if (value - opposite) * (1 if is_white else -1) < self._least_difference(value, opposite):
+            if (value - opposite) * (1 if is_white else -1) < self._least_contrast(value, opposite):
                 return f"reads {value:g}, where {_colour_in_words(not is_white)} read {opposite:g}"
         return None
 
-    def _least_difference(self, *levels: float) -> float:
+    def _least_contrast(self, *levels: float) -> float:
         return _SHARE * (self._range if math.isfinite(self._range) else max(abs(level) for level in levels))
 
 
-def shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
-    """Return the uniform shade below the sensor at each place, (n, 2): 1 white, 0 black, NaN mixed or grey; (n,)."""
+def uniform_shades_at_places(pattern: Pattern, places_mm: FloatArray) -> FloatArray:
+    """Return the shade, (n,), seen by the sensor at each place, (n, 2): 1 all white, 0 all black, NaN grey or mixed."""
     seen = (places_mm[:, None, :] + _AROUND_MM).reshape(-1, 2)
     albedo = region_of(pattern).albedo(seen)[0].reshape(len(places_mm), -1)
     low, high = albedo.min(axis=1), albedo.max(axis=1)

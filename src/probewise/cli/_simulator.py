@@ -33,7 +33,7 @@ def refuse_sensor_options(arguments: argparse.Namespace, *names: str) -> None:
             raise ParameterError(option, str(value), "none with --simulator, which replaces it")
 
 
-def read_tables(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
+def read_joined_table(simulator: Simulator, paths: Sequence[Path]) -> tuple[RunTable, tuple[str, ...]]:
     """Read and join tables of one system; also return notes on their columns.
 
     Raises FileError if one cannot be read, lacks a column that the simulator names, or has unusable content,

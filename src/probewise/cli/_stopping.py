@@ -32,14 +32,14 @@ class Stopped(KeyboardInterrupt):
         return 128 + self.number
 
 
-class _StopRequest:
-    """The last request to stop: its signal number, None if there is none, and its time."""
+class _LastStopRequest:
+    """State: number and time of the signal that asked the command to stop; None if there was none."""
 
     number: int | None = None
     at_s: float = 0.0
 
 
-_request = _StopRequest()
+_request = _LastStopRequest()
 
 
 @contextlib.contextmanager
@@ -59,7 +59,7 @@ def stoppable() -> Iterator[None]:
     except Stopped:
         raise
     except BaseException as error:
-        if (asked := _stop_request_in(error)) is None:
+        if (asked := _stopped_behind(error)) is None:
             raise
         raise asked from error
     finally:
@@ -76,7 +76,7 @@ def raise_if_stopped() -> None:
 
 @contextlib.contextmanager
 def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) -> Iterator[None]:
-    """Add to the final message of a run that a signal or a lost connection ends what is kept on disk.
+    """Add what is kept on disk to the final message, if a signal or a lost connection ends the block.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def reporting_what_is_kept(kept: Callable[[], str], *, results: bool = False) ->
     try:
         yield
     except BaseException as error:
-        if (asked := _stop_request_in(error)) is not None:
+        if (asked := _stopped_behind(error)) is not None:
             raise Stopped(asked.number, _text_of_what_is_kept(kept)) from error
         if isinstance(error, LinkError):
             raise LinkError(f"{error}; {_text_of_what_is_kept(kept)}") from error
@@ -106,8 +106,8 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
     raise Stopped(_request.number)
 
 
-def _stop_request_in(error: BaseException) -> Stopped | None:
-    """Return the stop request that caused an exception, or None."""
+def _stopped_behind(error: BaseException) -> Stopped | None:
+    """Return the `Stopped` behind an exception, after a signal or Ctrl-C; None for any other exception."""
     if isinstance(error, Stopped):
         return error
     if _request.number is not None:

@@ -13,15 +13,15 @@ from probewise.cli._arm import (
     ARMS,
     SCENE,
     add_geometry,
-    confirm_lowering,
+    enable_confirmed_lowering,
     geometry_of,
     open_brick,
-    open_nxt,
+    open_nxt_arm,
     parse_arm,
     parse_place,
     prompter,
     prompter_for_answer,
-    warn_of_clearance,
+    warn_if_clearance_doubtful,
 )
 from probewise.cli._common import (
     DEFAULT_SEED,
@@ -31,16 +31,16 @@ from probewise.cli._common import (
     add_count,
     add_path,
     add_quiet,
-    message_of_kept_results,
+    message_to_resume,
     parse_path,
     positive_int,
-    positive_number,
+    positive_number_parser,
     print_result,
     print_warning,
     seed_number,
 )
-from probewise.cli._output import check_out_file
-from probewise.cli._plans import for_lego_arm, for_own_instrument, without_measured_covariates
+from probewise.cli._output import checked_output_file
+from probewise.cli._plans import plan_for_lego_arm, plan_for_own_instrument, without_measured_covariates
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
@@ -100,14 +100,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     fit.add_argument(
         "--block-mm",
-        type=positive_number("mm"),
+        type=positive_number_parser("mm"),
         default=BLOCK_MM,
         metavar="MM",
         help=f"height of the block on a mark (default {BLOCK_MM:g}: three LEGO bricks and a smooth tile)",
     )
     fit.add_argument(
         "--touch-mm",
-        type=positive_number("mm"),
+        type=positive_number_parser("mm"),
         default=TOUCH_MM,
         metavar="MM",
         help=f"accuracy of a mark, sd of place and height (default {TOUCH_MM:g})",
@@ -202,12 +202,12 @@ def _add_arm(parser: argparse.ArgumentParser, arms: str | None = None) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run one task."""
+    """Run one task; return the exit status."""
     TASKS[arguments.task](arguments, geometry_of(arguments))
     return 0
 
 
-def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
     from probewise.arm.geometry import JOINTS
@@ -215,8 +215,8 @@ def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.report.plots import png, reach_map
     from probewise.report.plots.apparatus import arm_lengths
 
-    out = None if arguments.out is None else check_out_file(arguments.out)
-    drawing = None if arguments.drawing is None else check_out_file(arguments.drawing)
+    out = None if arguments.out is None else checked_output_file(arguments.out)
+    drawing = None if arguments.drawing is None else checked_output_file(arguments.drawing)
     port = None if arguments.arm is None else _nxt_port(arguments.arm)
     x_mm, y_mm = (np.linspace(0.0, length, n) for length, n in zip(geometry.field_mm, (131, 65), strict=True))
     places = np.stack(np.meshgrid(x_mm, y_mm), axis=-1).reshape(-1, 2)
@@ -250,11 +250,11 @@ def _check_arm(arguments: argparse.Namespace, geometry: Geometry) -> None:
         write_bytes_atomically(drawing, png(arm_lengths(geometry)))
         print_result(f"drawn        {drawing}", quiet=arguments.quiet)
     if port is not None:
-        _check_brick(port, geometry)
+        _report_brick_state(port, geometry)
 
 
-def _check_brick(port: str, geometry: Geometry) -> None:
-    """Report the brick's name, firmware and battery, and check that it is ready; nothing moves."""
+def _report_brick_state(port: str, geometry: Geometry) -> None:
+    """Print the brick's name, firmware, battery and light; raise LinkError if a program runs on it. Nothing moves."""
     from probewise.arm import in_lego_units
 
     with open_brick(port) as brick:
@@ -271,7 +271,7 @@ def _check_brick(port: str, geometry: Geometry) -> None:
             raise LinkError(f"the program {program} runs on the brick and may move the motors; stop it on the brick")
 
 
-def _jog_joints(arguments: argparse.Namespace, geometry: Geometry) -> None:
+def _jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm.geometry import JOINTS
 
     match arguments.where:
@@ -280,10 +280,10 @@ def _jog_joints(arguments: argparse.Namespace, geometry: Geometry) -> None:
             if arguments.steps and not arguments.down:
                 raise ParameterError("--steps", True, "with --down: the sensor is lowered in steps")
             if arguments.down and not arguments.dry_run and not arguments.steps:
-                warn_of_clearance(geometry)
+                warn_if_clearance_doubtful(geometry)
             with _open_lego_arm(arguments, geometry) as arm:
                 if arguments.steps and not arguments.dry_run:
-                    confirm_lowering(arm)
+                    enable_confirmed_lowering(arm)
                 (arm.go_down if arguments.down else arm.go_over)(x_mm, y_mm)
                 _print_position(arm, quiet=arguments.quiet)
                 if arguments.down:
@@ -322,7 +322,7 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.recordings import write_text_atomically
 
     source = arguments.geometry or shipped_geometry()
-    out = check_out_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
+    out = checked_output_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
     if arguments.dry_run:
         raise ParameterError("--dry-run", True, "none with fit-geometry: a person directs its moves")
     if arguments.arm is None and arguments.marks is None:
@@ -331,7 +331,7 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
         )
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
     if arguments.arm is not None:
-        _touch_marks(arguments, geometry, check_out_file(kept))
+        _touch_and_save_marks(arguments, geometry, checked_output_file(kept))
     turned, marks = read_marks(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
     print_result(fitted.summary(), quiet=arguments.quiet)
@@ -341,8 +341,8 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
     print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
 
 
-def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
-    """Bring the sensor to one mark after another, and save each at once."""
+def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
+    """Bring the sensor to one mark after another as a person directs; save each at once to the file `kept`."""
     from probewise.arm import LegoArm
     from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
     from probewise.arm.marks import places_of_marks
@@ -363,14 +363,12 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
     instrument, bench = _open_instrument(arguments, geometry)
     assert isinstance(instrument, LegoArm)
 
-    def kept_so_far() -> str:
+    def kept_message() -> str:
         return (
-            message_of_kept_results(kept, len(taken), "mark", arguments, "--resume")
-            if kept.exists()
-            else "no mark was kept"
+            message_to_resume(kept, len(taken), "mark", arguments, "--resume") if kept.exists() else "no mark was kept"
         )
 
-    with reporting_what_is_kept(kept_so_far), instrument as arm:
+    with reporting_what_is_kept(kept_message), instrument as arm:
         answer = prompter_for_answer(arm)
         ask = answer if bench is None else bench.answer_at_mark
         tell = partial(print_result, quiet=bench is not None)
@@ -389,8 +387,8 @@ def _touch_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) 
                 print_result(f"mark {number} kept: {kept}", quiet=arguments.quiet)
 
 
-def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    """Measure by the light how high the sensor hangs at each place, relative to the first."""
+def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry) -> None:
+    """Compare by the light over white how high the sensor hangs at each place with the first; print the differences."""
     import numpy as np
 
     from probewise.arm import LegoArm, require_reach
@@ -415,7 +413,7 @@ def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
         if bench is None:
             _prompter(arguments, arm)("lay white matt paper, the same everywhere, over the field, or under each place")
 
-        def light_at(place: tuple[float, float], height_mm: float) -> HeightReading:
+        def height_reading_at(place: tuple[float, float], height_mm: float) -> HeightReading:
             arm.go_down(*place, height_mm)
             values = np.array([arm.brightness() for _ in range(arguments.readings)])
             error = max(float(values.std()), _STEP_OF_LIGHT) / math.sqrt(arguments.readings)
@@ -423,13 +421,13 @@ def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
         arm.go_over(*places[0])
         lowest_mm = geometry.read_height_mm
-        curve = [light_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
+        curve = [height_reading_at(places[0], lowest_mm + _APART_MM * k) for k in range(_HEIGHTS)]
         lights = []
         for place in places[1:]:
-            lights.append(light_at(place, lowest_mm))
+            lights.append(height_reading_at(place, lowest_mm))
             if not arguments.dry_run:
                 found = check_heights(curve, lights)
-                print_result(_height_in_words(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
+                print_result(_height_error_in_words(place, found.off_mm[-1], found.sd_mm[-1]), quiet=arguments.quiet)
     if arguments.dry_run:
         return
     print_result(
@@ -444,12 +442,13 @@ def _measure_heights(arguments: argparse.Namespace, geometry: Geometry) -> None:
         worst = int(np.argmax(np.abs(found.off_mm / found.sd_mm)))
         print_warning(
             f"the light contradicts the heights (p = {found.p_value:.1g}), most at "
-            f"{_height_in_words(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the same "
-            "everywhere? Then bring the sensor to marks there and fit the geometry again (probewise arm fit-geometry)"
+            f"{_height_error_in_words(places[1 + worst], found.off_mm[worst], found.sd_mm[worst])}; is the paper the "
+            "same everywhere? Then bring the sensor to marks there and fit the geometry again "
+            "(probewise arm fit-geometry)"
         )
 
 
-def _height_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
+def _height_error_in_words(place_mm: tuple[float, float], off_mm: float, sd_mm: float) -> str:
     side = "higher" if off_mm > 0 else "lower"
     x_mm, y_mm = place_mm
     return f"({x_mm:g}, {y_mm:g}) mm: it hangs {abs(off_mm):.1f} ± {sd_mm:.1f} mm {side} than its counters say"
@@ -500,29 +499,29 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.recordings import paper_plan, read_plan, read_recording, write_recording
 
     named = arguments.plan == PAPER
-    out = check_out_file(arguments.out, *([] if named else [Path(arguments.plan)]))
+    out = checked_output_file(arguments.out, *([] if named else [Path(arguments.plan)]))
     own = _is_own_instrument(arguments)
     asked = paper_plan() if named else read_plan(arguments.plan)
     if own:
-        plan = for_own_instrument(asked, unit=arguments.unit, range_=arguments.range, step=arguments.step)
+        plan = plan_for_own_instrument(asked, unit=arguments.unit, range_=arguments.range, step=arguments.step)
     elif arguments.sensor is not None:
-        plan = _simulated_sensor(asked, arguments.sensor)
+        plan = _plan_for_simulated_sensor(asked, arguments.sensor)
     else:
         _refuse_options(arguments, "the LEGO arm: it is known", "unit", "range", "step")
-        plan = for_lego_arm(asked, geometry)
+        plan = plan_for_lego_arm(asked, geometry)
     width, height = (0.0, 0.0) if own else geometry.field_mm
     origin = (width / 2, height / 2) if arguments.origin_mm is None else parse_place("--origin-mm", arguments.origin_mm)
     taken = _earlier_readings(out, plan, resume=arguments.resume, dry=arguments.dry_run)
     start_s = taken[-1].time_s if taken else 0.0
 
-    def kept() -> str:
+    def kept_message() -> str:
         if not out.exists():
             return "nothing was read"
-        return message_of_kept_results(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
+        return message_to_resume(out, len(read_recording(out)), "reading", arguments, "--resume", of=len(plan))
 
     instrument, bench = _open_instrument(arguments, geometry, start_s=start_s, n_taken=len(taken))
     _warn_and_confirm_lowering(arguments, instrument, geometry)
-    with reporting_what_is_kept(kept), instrument as arm:
+    with reporting_what_is_kept(kept_message), instrument as arm:
         check = SheetCheck(plan, white_is_bright=not own)
         by_person = bench is None and not arguments.dry_run
         ask: Callable[[Request], None] = (
@@ -542,7 +541,7 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         with progress_shown(quiet=arguments.quiet, beat=False) as progress:
             progress("readings", len(taken), len(plan))
             for reading in readings:
-                wrong = check.check_reading(len(taken), reading.value)
+                wrong = check.complaint_about_reading(len(taken), reading.value)
                 if wrong is not None and not arguments.dry_run:
                     print_warning(f"{wrong}; is the right sheet there, the right way round?")
                 taken.append(reading)
@@ -553,8 +552,8 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
         print_result(f"{len(taken)} readings: {out}", quiet=arguments.quiet)
 
 
-def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
-    """Return the plan with the instrumentation of a simulated arm's sensor."""
+def _plan_for_simulated_sensor(plan: Plan, sensor: Path) -> Plan:
+    """Return the plan with the instrumentation of a sensor.json, and without measured covariates."""
     import dataclasses
 
     from probewise.calibration import read_sensor
@@ -563,7 +562,10 @@ def _simulated_sensor(plan: Plan, sensor: Path) -> Plan:
 
 
 def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list[Reading]:
-    """Return the readings of an earlier session, which must match the plan's first rows; none in a dry run."""
+    """Return the readings of an earlier session; none in a dry run, or without `resume`.
+
+    Raises FileError if they do not match the plan's first rows, or the file exists without `resume`.
+    """
     import numpy as np
 
     from probewise.arm import readings_of
@@ -595,7 +597,7 @@ def _open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s
         raise CommandError(
             "--arm is missing: name the brick, such as --arm nxt:/dev/rfcomm0; or --dry-run prints the moves only"
         )
-    return open_nxt(_nxt_port(arguments.arm), geometry, start_s=start_s)
+    return open_nxt_arm(_nxt_port(arguments.arm), geometry, start_s=start_s)
 
 
 def _open_instrument(
@@ -606,7 +608,7 @@ def _open_instrument(
     n_taken: int = 0,
     scene: str = SCENE,
 ) -> tuple[LegoArm | OwnInstrument | SimulatedArm, Bench | None]:
-    """Open the arm for a task that every arm can do, with a simulated bench if it has one."""
+    """Open the arm for a task that every arm can do; return it with its simulated bench, None for a real arm."""
     chosen = None if arguments.arm is None else parse_arm(arguments.arm)
     if chosen is None or chosen.kind == "nxt":
         _refuse_options(arguments, "a real arm", "sensor", "scene", "seed")
@@ -615,10 +617,10 @@ def _open_instrument(
         raise ParameterError("--dry-run", True, f"none with {arguments.arm}: it is for the LEGO arm")
     if chosen.kind == "file":
         _refuse_options(arguments, arguments.arm, "geometry", "sensor", "scene", "seed")
-    from probewise.cli._bench import open_arm
+    from probewise.cli._bench import open_arm_and_bench
 
     seed = DEFAULT_SEED if arguments.seed is None else arguments.seed
-    opened = open_arm(
+    opened = open_arm_and_bench(
         chosen,
         geometry,
         arguments.geometry,
@@ -648,9 +650,9 @@ def _warn_and_confirm_lowering(
         or not isinstance(instrument, LegoArm)
     ):
         return
-    warn_of_clearance(geometry)
+    warn_if_clearance_doubtful(geometry)
     if chosen.kind == "nxt" and geometry.accuracy is None and sys.stdin is not None and sys.stdin.isatty():
-        confirm_lowering(instrument)
+        enable_confirmed_lowering(instrument)
 
 
 def _refuse_options(arguments: argparse.Namespace, what: str, *names: str) -> None:
@@ -690,11 +692,11 @@ def _print_position(arm: LegoArm, *, quiet: bool) -> None:
 
 
 TASKS: dict[str, Callable[[argparse.Namespace, Geometry], None]] = {
-    "check": _check_arm,
-    "jog": _jog_joints,
+    "check": _report_geometry_and_reach,
+    "jog": _jog_joint_or_sensor,
     "fit-geometry": _fit_geometry,
     "home": _bring_home,
-    "heights": _measure_heights,
+    "heights": _compare_heights_by_light,
     "read": _read_sensor,
     "scan": _scan_line,
     "record": _record_plan,

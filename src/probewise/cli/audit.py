@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_path, add_quiet, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import check_out_directory, staged_output
+from probewise.cli._output import checked_output_directory, staged_output
 from probewise.cli._simulator import add_simulator, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.recordings import read_plan
 
     refuse_journal(arguments.plan)
-    out = None if arguments.out is None else check_out_directory(arguments.out)
+    out = None if arguments.out is None else checked_output_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
         if arguments.simulator is not None:
             audit = _audit_simulator(arguments, progress)
@@ -72,15 +72,15 @@ def _write_results(audit: PlanAudit, out: Path, plan: Path) -> list[str]:
     from probewise.recordings import write_plan
     from probewise.report import audit as report
 
-    drawn = report.figures(audit)
+    drawn = report.encoded_figures(audit)
     cures = (CURE_PLAN, Path(CURE_PLAN).with_suffix(".json").name)
     with staged_output(out, inputs=(plan, plan.with_suffix(".json")), outdated=cures) as stage:
         stage.write_json("audit.json", audit_json(audit))
         stage.write_figures(drawn)
-        stage.write("report.html", report.write_page(audit, drawn, source=plan.name))
+        stage.write("report.html", report.page_html(audit, drawn, source=plan.name))
         if audit.cure_plan is not None:
             write_plan(audit.cure_plan, stage / CURE_PLAN)
-    return stage.notes
+    return stage.notes_on_renamed_inputs
 
 
 VERB = Verb("audit", "List, before any data, the effects that a plan cannot detect or tell apart.", add_arguments, run)

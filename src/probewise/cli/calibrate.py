@@ -5,9 +5,17 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
-from probewise.cli._common import Verb, add_common, add_count, add_out_directory, parse_path, positive_int, print_result
+from probewise.cli._common import (
+    Verb,
+    add_count,
+    add_out_directory,
+    add_seed_and_quiet,
+    parse_path,
+    positive_int,
+    print_result,
+)
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import check_out_directory, staged_output
+from probewise.cli._output import checked_output_directory, staged_output
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
@@ -57,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="when nested sampling ends with --method paper: at a change of log evidence below 1e-8 (default), or "
         "where the log evidence can rise by 0.05 at most",
     )
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -73,7 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.nested_stop is not None and arguments.method != "paper":
         raise ParameterError("--nested-stop", arguments.nested_stop, "only with --method paper")
     refuse_journal(arguments.recording)
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
         recording = read_recording(arguments.recording, progress=progress)
         orders = tuple(sorted(set(arguments.orders)))
@@ -90,11 +98,11 @@ def run(arguments: argparse.Namespace) -> int:
         )
         prediction = predict(result.sensor, recording, progress=progress)
         progress("drawing the figures")
-        drawn = report.figures(result, recording, prediction)
+        drawn = report.encoded_figures(result, recording, prediction)
         with staged_output(out) as stage:
             write_sensor(result.sensor, stage / "sensor.json")
             stage.write_figures(drawn)
-            stage.write("report.html", report.write_page(result, recording, prediction, drawn, seed=arguments.seed))
+            stage.write("report.html", report.page_html(result, recording, prediction, drawn, seed=arguments.seed))
     for note in recording.notes:
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)

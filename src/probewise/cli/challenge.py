@@ -6,9 +6,16 @@ import argparse
 import shlex
 from functools import partial
 
-from probewise.cli._common import CommandError, Verb, add_common, add_count, add_out_directory, print_result
-from probewise.cli._executor import add_executor, campaign_running, message_of_kept_campaign
-from probewise.cli._output import check_out_directory, staged_output
+from probewise.cli._common import (
+    CommandError,
+    Verb,
+    add_count,
+    add_out_directory,
+    add_seed_and_quiet,
+    print_result,
+)
+from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
+from probewise.cli._output import checked_output_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 
 
@@ -34,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=1,
     )
     add_executor(parser)
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -46,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.systems and arguments.rounds > 1:
         raise CommandError("--rounds is for the light sensor; a table of --systems takes no further readings")
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     out.mkdir(parents=True, exist_ok=True)
     work, scored, of = run_case, score, ""
     if arguments.systems:
@@ -54,8 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.rounds > 1:
         work, scored, of = RunCaseInRounds(arguments.rounds), score_rounds, f"{arguments.rounds} rounds"
     cases = out / "cases.jsonl"
-    kept = partial(message_of_kept_campaign, cases, "case", arguments)
-    with campaign_running(cases, "case", arguments) as (executor, progress):
+    kept = partial(message_to_resume_campaign, cases, "case", arguments)
+    with executor_and_progress(cases, "case", arguments) as (executor, progress):
         results = run_challenge(
             arguments.cases,
             seed=arguments.seed,
@@ -75,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
         stage.write("table.csv", report.table_csv(rows))
-        stage.write("report.html", report.write_page(results, rows, command=command, systems=arguments.systems))
+        stage.write("report.html", report.page_html(results, rows, command=command, systems=arguments.systems))
     print_result(report.summary_sentence(rows, len(results)), quiet=arguments.quiet)
     print_result(f"seed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

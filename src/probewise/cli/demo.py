@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from probewise.cli._common import Verb, add_common, add_out_directory, print_result
-from probewise.cli._output import Stage, check_out_directory, staged_output
+from probewise.cli._common import Verb, add_out_directory, add_seed_and_quiet, print_result
+from probewise.cli._output import StagingDirectory, checked_output_directory, staged_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--full", action="store_true", help="compare one to four Gaussians with 300 live points, as in the paper"
     )
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, ...]:
-    """Run all steps, and return the lines to print."""
+    """Calibrate, search and diagnose, write all files, and return the lines to print."""
     import json
     import time
 
@@ -66,7 +66,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
 
     started = time.monotonic()
     seed = arguments.seed
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     truth = hidden_circle(seed)
     with worker_pool(2) as pool:
         progress("calibrating and diagnosing", 0, 8)
@@ -75,7 +75,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         sensor = calibration.sensor
         doubting = [pool.submit(search_with_a_fault, sensor, trust, truth, seed) for trust in TRUSTS.values()]
         starting = [pool.submit(search_from_circle, sensor, model, truth, seed) for model in MODELS]
-        searching = [pool.submit(_search, sensor, model, truth, seed) for model in MODELS]
+        searching = [pool.submit(_search_from_empty_field, sensor, model, truth, seed) for model in MODELS]
         parts: tuple[Future[Any], ...] = (diagnosing, *doubting, *starting, *searching)
         for done, future in enumerate(parts, start=1):
             progress("searching and diagnosing", done, 8)
@@ -89,7 +89,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     searches = with_true_circle(sensor, zip(names, runs, strict=True), truth)
     started_alike = with_true_circle(sensor, zip(names, alike, strict=True), truth)
     doubted = with_true_circle(sensor, zip(TRUSTS, (future.result() for future in doubting), strict=True), truth)
-    drawn = report.figures(
+    drawn = report.encoded_figures(
         calibration,
         recording,
         prediction=prediction,
@@ -97,19 +97,19 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         started_alike=started_alike,
         geometry=read_geometry(shipped_geometry()),
     )
-    drawn |= report.diagnosis_figures(diagnosis) | doubt_report.figures(doubted)
+    drawn |= report.encoded_diagnosis_figures(diagnosis) | doubt_report.encoded_figures(doubted)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)
-    witnesses = diagnosis_report.figures(diagnosis)
-    diagnosis_page = diagnosis_report.write_page(diagnosis, witnesses, source="concealed.csv", seed=seed)
+    witnesses = diagnosis_report.encoded_figures(diagnosis)
+    diagnosis_page = diagnosis_report.page_html(diagnosis, witnesses, source="concealed.csv", seed=seed)
     seconds = time.monotonic() - started
     with staged_output(out) as stage:
         write_sensor(sensor, stage / "sensor.json")
         stage.write_figures(drawn)
         (stage / "diagnosis").mkdir()
         *_, rng = diagnose_verb.generators_of_diagnosis(seed)
-        diagnose_verb.write_results(diagnosis, witnesses, Stage(stage / "diagnosis"), rng=rng)
+        diagnose_verb.write_results(diagnosis, witnesses, StagingDirectory(stage / "diagnosis"), rng=rng)
         stage.write("diagnosis/report.html", diagnosis_page)
-        page = report.write_page(
+        page = report.page_html(
             calibration,
             recording,
             prediction=prediction,
@@ -124,7 +124,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
             seconds=seconds,
         )
         stage.write("report.html", page)
-        answers = report.main_findings(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
+        answers = report.main_findings_by_key(started_alike, diagnosis, doubted, concealed=concealed, seed=seed)
         stage.write("answers.json", json.dumps(answers, indent=1, ensure_ascii=False) + "\n")
     return (
         *report.comparison_lines(searches),
@@ -139,7 +139,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
 def with_true_circle(
     sensor: FittedSensor, runs: Iterable[tuple[str, Exploration]], truth: tuple[float, ...]
 ) -> list[RobotSearch]:
-    """Combine each run, with its robot's name, with the true circle."""
+    """Return a `RobotSearch` for each run: with its robot's name, the true circle, and the sensor's levels."""
     import numpy as np
 
     from probewise.report.robot_search import RobotSearch
@@ -160,7 +160,7 @@ def circle_on_field() -> Circle:
 
 
 def hidden_circle(seed: int) -> tuple[float, ...]:
-    """Draw the hidden circle: x, y, radius in mm."""
+    """Draw the hidden circle from the prior: x, y, radius in mm."""
     import numpy as np
 
     drawn = circle_on_field().prior.from_unit_cube(np.random.default_rng([seed, 0]).random((1, 3)))[0]
@@ -182,8 +182,10 @@ def _calibrate_shipped(seed: int, full: bool, pool: Executor) -> Calibration:
     )
 
 
-def _search(sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int) -> tuple[Exploration, list[bytes]]:
-    """Search for the circle from an empty field; return the run and a picture of each step."""
+def _search_from_empty_field(
+    sensor: FittedSensor, model: Model, truth: tuple[float, ...], seed: int
+) -> tuple[Exploration, list[bytes]]:
+    """Search for the circle without a first reading on it; return the run and a PNG of each step."""
     import numpy as np
 
     from probewise.experiment import arm_over, experiment_for, run, surface_of
@@ -233,12 +235,12 @@ def search_from_circle(sensor: FittedSensor, model: Model, truth: tuple[float, .
     experiment = experiment_for(
         sensor, circle_on_field(), field, model=model, n_live=N_LIVE_ROBOT, utility=ReadingEntropy()
     )
-    first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
+    first, surface = pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world_behind("paper"), surface, field, seed=seed) as arm:
         return run_from_place(first, arm, experiment, rng=np.random.default_rng([seed, 6]), max_readings=MAX_READINGS)
 
 
-def place_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
+def pose_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
     """Draw the pose of the first reading, uniformly within the circle; it is the same for all robots compared."""
     import numpy as np
 
@@ -251,7 +253,10 @@ def place_within_circle(truth: tuple[float, ...], seed: int) -> Pose:
 
 
 def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, ...], seed: int) -> Exploration:
-    """Search for the circle, from a first reading on it, with a sensor that saturates; its model leaves that out."""
+    """Search for the circle, from a first reading on it, with a sensor that saturates; its model leaves that out.
+
+    `trust` is the robot's prior probability that the model leaves nothing out.
+    """
     from dataclasses import replace
 
     import numpy as np
@@ -265,7 +270,7 @@ def search_with_a_fault(sensor: FittedSensor, trust: float, truth: tuple[float, 
     field = Field()
     experiment = experiment_for(sensor, circle_on_field(), field, n_live=N_LIVE_ROBOT, trust=trust)
     world = replace(world_behind("paper"), concealed=(Saturation(SATURATION),))
-    first, surface = place_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
+    first, surface = pose_within_circle(truth, seed), surface_of("circle", np.array(truth), field)
     with arm_over(world, surface, field, seed=seed) as arm:
         return run_from_place(
             first, arm, experiment, rng=np.random.default_rng([seed, 7]), max_readings=MAX_READINGS_DOUBT

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_common, add_out_directory, add_path, parse_path, print_result
+from probewise.cli._common import Verb, add_out_directory, add_path, add_seed_and_quiet, parse_path, print_result
 from probewise.cli._diagnose_system import diagnose_simulator
-from probewise.cli._journal import is_journal, journal_recording, journal_sensor
-from probewise.cli._output import Stage, check_out_directory, staged_output
+from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
+from probewise.cli._output import StagingDirectory, checked_output_directory, staged_output
 from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
 
@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "the Laplace approximation by more than a nat and its own error (says first how long it may take)",
     )
     add_out_directory(parser)
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.diagnosis import SensorAndShape, audit_recorded, diagnose, join, weigh_thoroughly
     from probewise.report import diagnosis as report
 
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     with progress_shown(quiet=arguments.quiet) as progress:
         recordings, sensor, shape = _read_inputs(arguments, progress=progress)
         diagnosis_rng, nested_rng, files_rng = generators_of_diagnosis(arguments.seed)
@@ -86,13 +86,13 @@ def run(arguments: argparse.Namespace) -> int:
         progress("auditing the plan")
         audit = None if null is not None else audit_recorded(diagnosis, sensor=sensor)
         progress("drawing the figures")
-        drawn = report.figures(diagnosis)
+        drawn = report.encoded_figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
-        with staged_output(out, inputs=_files_to_keep(arguments, out), outdated=OF_ONE_RUN) as stage:
+        with staged_output(out, inputs=_files_not_to_replace(arguments, out), outdated=OF_ONE_RUN) as stage:
             write_results(diagnosis, drawn, stage, rng=files_rng)
-            page = report.write_page(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
+            page = report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
             stage.write("report.html", page)
-    for note in (*joined.notes, *stage.notes):
+    for note in (*joined.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{diagnosis.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0
@@ -101,13 +101,13 @@ def run(arguments: argparse.Namespace) -> int:
 def _read_inputs(
     arguments: argparse.Namespace, *, progress: Progress
 ) -> tuple[list[Recording], FittedSensor | None, Shape | None]:
-    """Read the recordings and journals, the sensor, and the shape of a journal's run, if there is one."""
+    """Return the recordings, the sensor (None if none is given), and the hypothesised shape of a journal, else None."""
     from probewise.calibration import read_sensor
     from probewise.recordings import read_recording
 
     journals = [path for path in arguments.recordings if is_journal(path)]
     if arguments.sensor is None and journals:
-        arguments.sensor = journal_sensor(journals[0])
+        arguments.sensor = find_journal_sensor_file(journals[0])
     if arguments.sensor is None:
         return [read_recording(path, progress=progress) for path in arguments.recordings], None, None
     if len(journals) > 1:
@@ -115,7 +115,7 @@ def _read_inputs(
     sensor, recordings, shape = read_sensor(arguments.sensor), [], None
     for path in arguments.recordings:
         if path in journals:
-            recording, shape = journal_recording(path, sensor)
+            recording, shape = journal_recording_and_shape(path, sensor)
         else:
             recording = read_recording(path, progress=progress)
         recordings.append(recording)
@@ -129,7 +129,7 @@ def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
     return np.random.default_rng(seed).spawn(3)
 
 
-def _files_to_keep(arguments: argparse.Namespace, out: Path) -> list[Path]:
+def _files_not_to_replace(arguments: argparse.Namespace, out: Path) -> list[Path]:
     """List files that results must not replace: inputs, and an earlier next plan with readings filled in."""
     from probewise.diagnosis import NEXT_PLAN
 
@@ -141,7 +141,9 @@ def _files_to_keep(arguments: argparse.Namespace, out: Path) -> list[Path]:
     return [path for csv in read for path in (csv, csv.with_suffix(".json"))]
 
 
-def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: Stage, *, rng: np.random.Generator) -> None:
+def write_results(
+    diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagingDirectory, *, rng: np.random.Generator
+) -> None:
     """Write diagnosis.json, both sensor models, the next plan and the figures, but not the report."""
     from probewise.calibration import write_sensor
     from probewise.diagnosis import NEXT_PLAN, diagnosis_json

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import SCENE
-from probewise.cli._common import Verb, add_common, add_path, parse_path, print_result
-from probewise.cli._output import check_out_file
+from probewise.cli._common import Verb, add_path, add_seed_and_quiet, parse_path, print_result
+from probewise.cli._output import checked_output_file
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import LinkError, ParameterError
 
@@ -62,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_path(parser, "--link", "PATH", "a symbolic link to keep on the device, also after a disconnection")
     parser.add_argument("--log", type=parse_path, metavar="FILE", help="write every telegram and fault to a file")
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -70,14 +70,14 @@ def run(arguments: argparse.Namespace) -> int:
     if not hasattr(os, "openpty"):
         raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
 
-    from probewise.cli._bench import world_of
+    from probewise.cli._bench import world_and_instrumentation
     from probewise.emulator import Faults, parse_scene, read_geometry, set_up_bench, shipped_geometry
     from probewise.emulator.pty import Terminal, serve
 
     geometry = read_geometry(shipped_geometry() if arguments.geometry is None else arguments.geometry)
     surface = parse_scene(arguments.scene)
     faults = Faults.parse(arguments.fault)
-    world, _ = world_of(arguments.sensor)
+    world, _ = world_and_instrumentation(arguments.sensor)
     with _telegram_log(arguments.log) as trace, Terminal(arguments.link) as terminal:
         bench = set_up_bench(
             geometry,
@@ -96,20 +96,23 @@ def run(arguments: argparse.Namespace) -> int:
             quiet=arguments.quiet,
         )
         with reporting_what_is_kept(lambda: "the device is gone"):
-            serve(terminal, bench.radio, time.monotonic, on_move=print_result, meanwhile=_Listener(bench).listen)
+            serve(terminal, bench.radio, time.monotonic, on_move=print_result, meanwhile=_TypedCommands(bench).poll)
     print_result(f"the brick went to sleep after {arguments.sleep} minutes without KEEPALIVE", quiet=arguments.quiet)
     return 0
 
 
-class _Listener:
-    """Executes typed commands (a scene, `turn DEGREES`, `where`); warns if the sensor is below the table top."""
+class _TypedCommands:
+    """The typed commands of the bench (a scene, `turn DEGREES`, `where`), and a watch on the sensor's height."""
 
     def __init__(self, bench: Bench) -> None:
         self._bench, self._typed, self._is_heard = bench, b"", sys.stdin is not None
         self._is_in_table = False
 
-    def listen(self) -> None:
-        """Read typed input without waiting; from a terminal only in the foreground, as job control requires."""
+    def poll(self) -> None:
+        """Execute the lines typed so far, without waiting; report if the sensor has gone through the table or come out.
+
+        From a terminal it reads only in the foreground, as job control requires.
+        """
         stand = self._bench.arm.sensor_pose()
         if (stand.height_mm < 0) is not self._is_in_table:
             self._is_in_table = stand.height_mm < 0
@@ -134,7 +137,7 @@ class _Listener:
 
 
 def _position_in_words(stand: SensorPose) -> str:
-    """Describe the sensor's position."""
+    """Write the sensor's place and height in mm."""
     return f"sensor at ({stand.x_mm:.1f}, {stand.y_mm:.1f}) mm, {stand.height_mm:.1f} mm above the table"
 
 
@@ -154,12 +157,12 @@ def _telegram_log(path: Path | None) -> Iterator[Trace]:
         yield ignore_trace
         return
     began_s = time.monotonic()
-    with check_out_file(path).open("w", encoding="utf-8", buffering=1) as file:
+    with checked_output_file(path).open("w", encoding="utf-8", buffering=1) as file:
 
-        def note(now_s: float, event: str, text: str) -> None:
+        def write_line(now_s: float, event: str, text: str) -> None:
             file.write(f"{now_s - began_s:10.3f} {event} {text}\n")
 
-        yield note
+        yield write_line
 
 
 VERB = Verb("emulate-nxt", "Emulate a LEGO brick with the arm, behind a serial device.", add_arguments, run)

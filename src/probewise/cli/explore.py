@@ -11,24 +11,24 @@ from typing import TYPE_CHECKING
 
 from probewise.cli._arm import (
     ARMS,
-    ReportingInstrument,
+    InstrumentWithCallbacks,
     add_geometry,
-    require_declared,
-    warn_of_clearance,
-    warn_of_place_sd,
+    require_turns_and_lifts,
+    warn_if_clearance_doubtful,
+    warn_if_place_sd_large,
 )
 from probewise.cli._common import (
     Verb,
-    add_common,
     add_count,
     add_out_directory,
     add_path,
-    message_of_kept_results,
+    add_seed_and_quiet,
+    message_to_resume,
     parse_path,
     positive_int,
     print_result,
 )
-from probewise.cli._output import check_out_directory, staged_output
+from probewise.cli._output import checked_output_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError
 from probewise.verbs import MAX_READINGS, METHOD, MODEL, SHAPE, UTILITY
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from probewise.experiment import Exploration, Journal, Step
 
 
-class _ShapeNames:
-    """Names of all shapes, looked up only when asked for: building the parser must not import numpy."""
+class _LazyShapeNames:
+    """The names of all shapes, imported only when asked for: building the parser must not import numpy."""
 
     def __iter__(self) -> Iterator[str]:
         from probewise.scene import SHAPES
@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--shape",
         nargs="+",
-        choices=_ShapeNames(),
+        choices=_LazyShapeNames(),
         default=[SHAPE],
         metavar="SHAPE",
         help=f"possible shapes on the field, one or several of %(choices)s (default {SHAPE})",
@@ -151,11 +151,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="numbers of repeated readings to choose from, such as 1,2,4",
     )
     parser.add_argument("--resume", action="store_true", help="resume from the journal in DIR")
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, infer, inquire; keep a journal and a picture of every step."""
+    """Let the robot search; keep a journal and a picture of every step; write the report; return the exit status."""
     from contextlib import closing
 
     from probewise import experiment as posing
@@ -165,34 +165,34 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.cli._explore_pictures import Pictures
     from probewise.experiment import Exploration, explore, read_journal, shadow_run
 
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     inputs = checked_inputs(arguments)
     journal = out / "journal.jsonl"
     before = _journal_so_far(journal, resume=arguments.resume)
     site = open_arm_and_truth(arguments, inputs, () if before is None else before.readings)
     print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     if inputs.geometry is not None and inputs.arm.may_differ_from_geometry:
-        warn_of_clearance(inputs.geometry)
-        warn_of_place_sd(inputs.geometry, inputs.experiment.stop_sd_mm)
+        warn_if_clearance_doubtful(inputs.geometry)
+        warn_if_place_sd_large(inputs.geometry, inputs.experiment.stop_sd_mm)
     pictures = Pictures(out, inputs, arguments.live, site.outline_mm)
     steps = pictures.steps
 
-    def kept() -> str:
+    def kept_message() -> str:
         if not journal.exists():
             return "nothing was read"
-        return message_of_kept_results(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
+        return message_to_resume(journal, len(read_journal(journal).entries), "reading", arguments, "--resume")
 
-    def tell(doing: str) -> None:
+    def report_activity(doing: str) -> None:
         believed = f"; widest sd {steps[-1].largest_sd_mm:.1f} mm" if steps else ""
         progress("exploring", note=f"reading {len(steps) + 1}, {doing}{believed}")
 
     with (
-        reporting_what_is_kept(kept),
+        reporting_what_is_kept(kept_message),
         progress_shown(quiet=arguments.quiet) as progress,
-        ReportingInstrument(
+        InstrumentWithCallbacks(
             site.arm,
-            lambda pose: tell(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
-            lambda reading: tell(f"thinking about {reading.value:g}"),
+            lambda pose: report_activity(f"moving to ({pose.x_mm:.0f}, {pose.y_mm:.0f}) mm"),
+            lambda reading: report_activity(f"thinking about {reading.value:g}"),
         ) as reporting,
         closing(
             explore(
@@ -209,17 +209,17 @@ def run(arguments: argparse.Namespace) -> int:
             )
         ) as own,
     ):
-        require_declared(site.arm, arguments.orientations, arguments.heights)
+        require_turns_and_lifts(site.arm, arguments.orientations, arguments.heights)
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
             under = posing.ArmOverGrid.from_instrument(site.arm, inputs.other.grid)
             pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
-            pictures.add(step, shadow)
+            pictures.draw_and_write(step, shadow)
     result = Exploration(inputs.experiment, tuple(steps))
     drawing = progress_shown(quiet=arguments.quiet)
-    with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
+    with reporting_what_is_kept(kept_message, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
         pictures.write_results(stage, result, seed=arguments.seed, known=site.known)
     for line in _closing_lines(result, inputs, site, journal):
@@ -229,7 +229,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _closing_lines(result: Exploration, inputs: Inputs, site: ArmAndTruth, journal: Path) -> Iterator[str]:
-    """Yield the closing lines: the shape found, errors that its sds leave out, and probable faults of the sensor."""
+    """Yield the closing lines: the shape found, what its sds leave out, probable sensor faults, and errors if known."""
     from probewise import experiment as posing
     from probewise.report import exploration as report
 

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import CommandError, Verb, add_common, add_out_directory, parse_path, print_result
-from probewise.cli._output import check_out_directory, staged_output
-from probewise.cli._simulator import add_simulator, read_tables
+from probewise.cli._common import (
+    CommandError,
+    Verb,
+    add_out_directory,
+    add_seed_and_quiet,
+    parse_path,
+    print_result,
+)
+from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._simulator import add_simulator, read_joined_table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -16,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_simulator(parser, replaces="")
     add_out_directory(parser)
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -30,22 +37,22 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.simulator is None:
         raise CommandError("--simulator FILE.py is missing; to fit a light sensor, use probewise calibrate")
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     simulator = read_simulator(arguments.simulator)
-    table, notes = read_tables(simulator, arguments.tables)
+    table, notes = read_joined_table(simulator, arguments.tables)
     source = ", ".join(path.name for path in arguments.tables)
     with progress_shown(quiet=arguments.quiet) as progress:
         rng = np.random.default_rng(arguments.seed)
         fitted = fit_simulator(simulator, table, source=source, notes=notes, rng=rng, progress=progress)
         progress("drawing the figures")
-        drawn = report.figures(fitted)
+        drawn = report.encoded_figures(fitted)
     with staged_output(out, inputs=[*arguments.tables, arguments.simulator]) as stage:
         stage.write_json("fit.json", fit_json(fitted))
         write_fitted_system(fitted.fitted, stage / "fitted.json")
         stage.write("samples.csv", samples_csv(fitted.fitted))
         stage.write_figures(drawn)
-        stage.write("report.html", report.write_page(fitted, drawn, seed=arguments.seed))
-    for note in (*notes, *stage.notes):
+        stage.write("report.html", report.page_html(fitted, drawn, seed=arguments.seed))
+    for note in (*notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{fitted.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

@@ -13,16 +13,16 @@ from probewise.cli._arm import ARMS, ArmName, add_geometry, geometry_of, parse_a
 from probewise.cli._common import (
     CommandError,
     Verb,
-    add_common,
     add_count,
     add_out_directory,
     add_path,
-    message_of_kept_results,
-    positive_number,
+    add_seed_and_quiet,
+    message_to_resume,
+    positive_number_parser,
     print_result,
 )
-from probewise.cli._output import check_out_directory, staged_output
-from probewise.cli._plans import for_lego_arm, for_own_instrument, read_or_shipped_plan
+from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._plans import plan_for_lego_arm, plan_for_own_instrument, read_or_shipped_plan
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
@@ -69,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_count(parser, "--readings", "largest number of readings beyond the first plan (default 400)", default=400)
     parser.add_argument(
         "--minutes",
-        type=positive_number("minutes"),
+        type=positive_number_parser("minutes"),
         default=math.inf,
         metavar="M",
         help="largest number of minutes beyond the first plan (default: no limit)",
@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="no person turns or exchanges sheets: take only readings over the sheet in place",
     )
     parser.add_argument("--resume", action="store_true", help="resume from the rounds in DIR")
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report import diagnosis as of_a_diagnosis
     from probewise.report import investigation as report
 
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     chosen = parse_arm(arguments.arm)
     if arguments.truth is not None and chosen.kind != "simulated":
         raise ParameterError("--truth", arguments.truth, f"none with {arguments.arm}: it is for the simulated arm")
@@ -127,15 +127,15 @@ def run(arguments: argparse.Namespace) -> int:
     }
     folder = RoundsFolder(out / "rounds", settings, resume=arguments.resume)
 
-    def kept() -> str:
-        return message_of_kept_results(folder.path, folder.n_readings, "reading", arguments, "--resume")
+    def kept_message() -> str:
+        return message_to_resume(folder.path, folder.n_readings, "reading", arguments, "--resume")
 
     print_result(f"seed {arguments.seed}", quiet=arguments.quiet)
     rounds = []
     with contextlib.ExitStack() as stack:
-        stack.enter_context(reporting_what_is_kept(kept))
+        stack.enter_context(reporting_what_is_kept(kept_message))
         if world is None:
-            take = stack.enter_context(_opened_take(arguments, chosen, folder, seed=noise))
+            take = stack.enter_context(_opened_plan_runner(arguments, chosen, folder, seed=noise))
         else:
             take = SimulatedRecorder(world, noise)
         progress = stack.enter_context(progress_shown(quiet=arguments.quiet))
@@ -154,17 +154,17 @@ def run(arguments: argparse.Namespace) -> int:
     diagnosis = found.last.diagnosis
     drawing = progress_shown(quiet=arguments.quiet)
     with (
-        reporting_what_is_kept(kept, results=True),
+        reporting_what_is_kept(kept_message, results=True),
         drawing as progress,
         staged_output(out, outdated=OF_ONE_RUN) as stage,
     ):
         progress("drawing the report")
-        drawn = of_a_diagnosis.figures(diagnosis)
+        drawn = of_a_diagnosis.encoded_figures(diagnosis)
         write_results(diagnosis, drawn, stage, rng=np.random.default_rng(files_seed))
         write_recording(join([each.recording for each in rounds]), stage / "recording.csv")
         stage.write("by_round.png", report.probabilities_png(found))
         concealed = None if world is None else tuple(effect.name for effect in world.concealed)
-        page = report.write_page(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
+        page = report.page_html(found, drawn, source=arguments.arm, seed=arguments.seed, concealed=concealed)
         stage.write("report.html", page)
     print_result(found.summary(), quiet=arguments.quiet)
     if concealed is not None:
@@ -174,7 +174,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
-    """Read the first plan, adapted to the chosen arm."""
+    """Read the first plan and adapt it to the chosen arm; raise ParameterError if --no-hands cannot carry it out."""
     plan = read_or_shipped_plan(arguments.plan)
     if chosen.kind == "simulated":
         return plan
@@ -182,27 +182,29 @@ def _first_plan(arguments: argparse.Namespace, chosen: ArmName) -> Plan:
         raise ParameterError(
             "--no-hands", True, f"a plan over one pattern; {arguments.plan} has several, which a person must exchange"
         )
-    return for_own_instrument(plan) if chosen.kind == "file" else for_lego_arm(plan, geometry_of(arguments))
+    return plan_for_own_instrument(plan) if chosen.kind == "file" else plan_for_lego_arm(plan, geometry_of(arguments))
 
 
 @contextlib.contextmanager
-def _opened_take(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int) -> Iterator[Take]:
-    """Yield a function that carries out plans with an opened arm; a person or a simulated bench lays the sheets."""
+def _opened_plan_runner(
+    arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int
+) -> Iterator[Take]:
+    """Open an arm; yield the function that takes a plan's readings with it. A person or the bench lays the sheets."""
     from probewise.arm import Request, carry_out
-    from probewise.cli._bench import open_arm
+    from probewise.cli._bench import open_arm_and_bench
 
     geometry = geometry_of(arguments)
     width, height = (0.0, 0.0) if chosen.kind == "file" else geometry.field_mm
     origin = (width / 2, height / 2)
     if arguments.origin_mm is not None:
         origin = parse_place("--origin-mm", arguments.origin_mm)
-    opened, bench = open_arm(
+    opened, bench = open_arm_and_bench(
         chosen, geometry, arguments.geometry, seed=seed, start_s=folder.last_time_s, n_taken=folder.n_readings
     )
     with opened as arm:
         by_hand, laid = prompter(arm), list[str]()
 
-        def take(number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
+        def take_readings(number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
             def ask(request: Request) -> None:
                 if bench is not None:
                     bench.carry_out_request(plan.patterns, origin, request)
@@ -214,11 +216,11 @@ def _opened_take(arguments: argparse.Namespace, chosen: ArmName, folder: RoundsF
 
             return carry_out(arm, plan, origin_mm=origin, ask=ask, first=len(taken))
 
-        yield take
+        yield take_readings
 
 
 def _shipped_world_with_effects(truth: str | None, rng: np.random.Generator) -> World:
-    """Build the world of the shipped recordings, with the effects to conceal."""
+    """Build the world of the shipped recordings with the effects in `truth` concealed; None: one drawn effect."""
     from dataclasses import replace
 
     from probewise.investigation import parse_concealed

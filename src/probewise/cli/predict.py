@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from probewise.cli._common import Verb, add_common, add_path, parse_path, print_result
+from probewise.cli._common import Verb, add_path, add_seed_and_quiet, parse_path, print_result
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import check_out_file
+from probewise.cli._output import checked_output_file
 from probewise.cli._simulator import add_simulator
 
 
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_path(parser, "plan", "PLAN.csv", "plan or recording, its JSON beside it; with --simulator any table")
     parser.add_argument("--out", type=parse_path, required=True, metavar="P.csv", help="where the prediction goes")
     add_simulator(parser)
-    add_common(parser)
+    add_seed_and_quiet(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.calibration import predict, read_sensor
     from probewise.recordings import read_plan_and_readings, write_prediction
 
-    out = check_out_file(arguments.out, arguments.sensor, arguments.plan)
+    out = checked_output_file(arguments.out, arguments.sensor, arguments.plan)
     with progress_shown(quiet=arguments.quiet) as progress:
         sensor = read_sensor(arguments.sensor)
         plan, readings = read_plan_and_readings(arguments.plan, progress=progress)
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _predict_by_simulator(arguments: argparse.Namespace) -> int:
-    """Predict every row of a table with a simulator, as fitted or repaired."""
+    """Predict every row of a table with a user's simulator, fitted or repaired; return the exit status."""
     import numpy as np
 
     from probewise._progress import progress_shown
@@ -59,7 +59,7 @@ def _predict_by_simulator(arguments: argparse.Namespace) -> int:
         write_system_prediction,
     )
 
-    out = check_out_file(arguments.out, arguments.sensor, arguments.plan, arguments.simulator)
+    out = checked_output_file(arguments.out, arguments.sensor, arguments.plan, arguments.simulator)
     simulator = read_simulator(arguments.simulator)
     fitted = read_fitted_system(arguments.sensor, simulator)
     table = read_run_table(arguments.plan, time=simulator.time, run=simulator.run)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from probewise.cli._arm import add_geometry, geometry_of
 from probewise.cli._common import CommandError, Verb, add_quiet, parse_path, print_result
-from probewise.cli._output import check_out_file
+from probewise.cli._output import checked_output_file
 from probewise.errors import ParameterError
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.paper not in PAPERS_MM:
         raise ParameterError("--paper", arguments.paper, " or ".join(PAPERS_MM))
     named = Path(arguments.what)
-    out = check_out_file(arguments.out, *([named] if named.is_file() else []))
+    out = checked_output_file(arguments.out, *([named] if named.is_file() else []))
     sheets = _sheets_to_draw(arguments)
     drawn = sheets_pdf(sheets, paper=arguments.paper, title=f"probewise sheets: {named.name}")
     write_bytes_atomically(out, drawn)

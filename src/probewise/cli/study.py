@@ -8,8 +8,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, print_result
-from probewise.cli._executor import add_executor, campaign_running, message_of_kept_campaign
-from probewise.cli._output import check_out_directory, staged_output
+from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
+from probewise.cli._output import checked_output_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise.report import study as report
     from probewise.study import run_study
 
-    out = check_out_directory(arguments.out)
+    out = checked_output_directory(arguments.out)
     if arguments.concealed:
         return _run_concealed(arguments, out)
     for name in ("seed", "size", "clean"):
@@ -82,8 +82,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise ParameterError("--circles", arguments.circles, "2 or more: one circle gives no standard error")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "trials.jsonl"
-    kept = partial(message_of_kept_campaign, trials, "run", arguments)
-    with campaign_running(trials, "run", arguments) as (executor, progress):
+    kept = partial(message_to_resume_campaign, trials, "run", arguments)
+    with executor_and_progress(trials, "run", arguments) as (executor, progress):
         study = run_study(
             numbers, path=trials, max_readings=arguments.max_readings, executor=executor, progress=progress
         )
@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     with reporting_what_is_kept(kept, results=True), drawing as progress, staged_output(out) as stage:
         progress("drawing the report")
         stage.write("table.csv", report.table_csv(study))
-        stage.write("report.html", report.write_page(study, command=_command_line(arguments)))
+        stage.write("report.html", report.page_html(study, command=_command_line(arguments)))
     print_result(report.summary_sentence(study), quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
@@ -108,7 +108,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
         raise ParameterError(others[0], "given", "none with --concealed, which has its own rows")
     out.mkdir(parents=True, exist_ok=True)
     trials = out / "concealed.jsonl"
-    with campaign_running(trials, "run", arguments) as (executor, progress):
+    with executor_and_progress(trials, "run", arguments) as (executor, progress):
         found = run_concealed(
             arguments.circles,
             path=trials,
@@ -123,7 +123,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     rows = concealed_rows(found)
     with staged_output(out) as stage:
         stage.write("concealed.csv", csv_text_of_rows(table[0], (row.values() for row in table)))
-        stage.write("report.html", report.write_page(rows, command=_concealed_command(arguments)))
+        stage.write("report.html", report.page_html(rows, command=_concealed_command(arguments)))
     print_result(report.summary_sentence(rows), quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
     return 0

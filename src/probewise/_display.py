@@ -15,7 +15,7 @@ _waiting: list[Callable[[], object]] = []
 
 
 def before_first_display(load: Callable[[], object]) -> None:
-    """Call `load` once, when a value is first displayed, so that plotting is imported only when needed."""
+    """Register `load`, to be called once when a value is first displayed: plotting is imported only then."""
     _waiting.append(load)
 
 

@@ -28,7 +28,7 @@ _WITHOUT = "{desc} [{elapsed}]{postfix}"
 
 @contextlib.contextmanager
 def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Iterator[Progress]:
-    """Yield a progress display that appears once the work has taken two seconds.
+    """Yield a progress function whose display appears once the work has taken two seconds.
 
     Parameters
     ----------
@@ -43,14 +43,14 @@ def progress_shown(*, quiet: bool, beat: bool = True, lines: bool = True) -> Ite
     if quiet or not (looked_at or lines):
         yield silent
         return
-    shown = _Bars() if looked_at else _TextProgress()
+    shown = _StageBars() if looked_at else _TextProgress()
     stopped = threading.Event()
 
-    def keep_beating() -> None:
+    def refresh_until_stopped() -> None:
         while not stopped.wait(_BEAT_S):
             shown.refresh()
 
-    heart = threading.Thread(target=keep_beating, daemon=True)
+    heart = threading.Thread(target=refresh_until_stopped, daemon=True)
     if beat:
         heart.start()
     ended = False
@@ -82,7 +82,10 @@ def progress_or_bar(progress: bool | Progress) -> Iterator[Progress]:
 
 
 def sampler_progress(progress: Progress) -> Callable[[int | str, RoundSummary | TemperatureSummary], None]:
-    """Adapt a progress function to reports of nested sampling and SMC runs, by a name or a number of Gaussians."""
+    """Return a function that passes the reports of nested sampling and SMC runs to a progress function.
+
+    It takes the name of a run, or its number of Gaussians, and the sampler's summary.
+    """
 
     def tell(what: int | str, state: RoundSummary | TemperatureSummary) -> None:
         stage = what if isinstance(what, str) else f"{what} Gaussian{'s' if what > 1 else ''}"
@@ -104,8 +107,8 @@ class _LastReport(NamedTuple):
     note: str
 
 
-class _Bars:
-    """One bar per stage; bars of stages longer than two seconds stay visible."""
+class _StageBars:
+    """A progress function that shows one bar per stage; bars of stages longer than two seconds stay visible."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -154,7 +157,7 @@ class _Bars:
 
 
 class _TextProgress:
-    """Lines of text on standard error: after two seconds, after five more, then at growing intervals."""
+    """Lines of text on standard error: after two seconds, then every five, after 100 seconds at growing intervals."""
 
     def __init__(self) -> None:
         self._began = self._last = time.monotonic()

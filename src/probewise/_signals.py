@@ -19,7 +19,7 @@ SAME_S: Final = 1.0
 
 @contextlib.contextmanager
 def defer_signals() -> Iterator[None]:
-    """Defer signals that end the program until the block ends; a repeated signal acts at once.
+    """Defer signals that end the program until the block ends; another one more than a second later acts at once.
 
     For blocks that must not be interrupted: stopping motors, putting files in place. Outside the main
     thread, which alone receives signals, it does nothing.
@@ -31,7 +31,7 @@ def defer_signals() -> Iterator[None]:
     handlers = {number: handler for number, handler in handlers.items() if handler not in (None, signal.SIG_IGN)}
     first: tuple[int, float] | None = None
 
-    def note(number: int, frame: FrameType | None) -> None:
+    def remember_signal(number: int, frame: FrameType | None) -> None:
         nonlocal first
         now_s = time.monotonic()
         if first is None:
@@ -48,7 +48,7 @@ def defer_signals() -> Iterator[None]:
 
     try:
         for number in handlers:
-            signal.signal(number, note)
+            signal.signal(number, remember_signal)
         yield
     finally:
         heard = first

@@ -25,4 +25,4 @@ class Progress(Protocol):
 
 
 def silent(stage: str, done: int = 0, total: int = 0, note: str = "") -> None:
-    """Ignore the report."""
+    """Ignore the report: a `Progress` that shows nothing."""

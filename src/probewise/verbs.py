@@ -269,6 +269,8 @@ def explore(
     ------
     ParameterError
         If an argument has the wrong type, or a truth is given together with an arm.
+    FileError
+        If the journal cannot be read or written, or is of another run.
     NotConvergedError
         If no hypothesis could have given the readings.
 
@@ -349,7 +351,7 @@ def explore(
     with instrument, progress_or_bar(progress) as told:
         told("taking the first readings")
 
-        def show(step: Step) -> None:
+        def report_step(step: Step) -> None:
             believed = f"widest sd {step.largest_sd_mm:.1f} mm, {step.bits:.1f} bits"
             told(f"reading {step.number} of at most {max_readings}", note=believed)
 
@@ -359,7 +361,7 @@ def explore(
             rng=streams.run,
             max_readings=max_readings,
             journal=path if before is None else before,
-            progress=show,
+            progress=report_step,
             hidden=hidden,
             about=about,
         )
@@ -374,7 +376,10 @@ def _naive_levels(
     has_arm: bool,
     rng: np.random.Generator,
 ) -> Naive | None:
-    """Take the levels of the paper's naive model from a recording, or from readings of a simulated sensor."""
+    """Return the levels of the paper's naive model, from a recording or the simulated sensor; None if it is not used.
+
+    Raises ParameterError if `levels` is missing with an arm, or given without that model.
+    """
     from probewise import experiment as posing
     from probewise.errors import ParameterError
 

@@ -10,7 +10,7 @@ import pytest
 from nested_sampling import hard, problems
 
 from probewise.nested import NestedResult
-from probewise.nested.ascent import climb_to_top, start_from_live_points
+from probewise.nested.ascent import climb_to_top, gaussian_of_last_live_points
 from probewise.nested.evaluate import Evaluator
 from probewise.nested.missing import find_missed_hills
 from probewise.nested.sampler import run_once
@@ -44,9 +44,9 @@ def on_an_arm() -> NestedResult:
 def climbed_height(run: NestedResult, problem: problems.Known | Cross) -> tuple[float, int]:
     evaluate = Evaluator(problem)
     top = climb_to_top(
-        start_from_live_points(run, evaluate), evaluate, max_calls=run.n_calls, rng=np.random.default_rng(2)
+        gaussian_of_last_live_points(run, evaluate), evaluate, max_calls=run.n_calls, rng=np.random.default_rng(2)
     )
-    return top.height, evaluate.n_calls
+    return top.highest_log_likelihood, evaluate.n_calls
 
 
 @pytest.mark.parametrize("name", ["Gaussian 4-D", "Rosenbrock 2-D"])

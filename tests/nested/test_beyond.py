@@ -10,7 +10,7 @@ import pytest
 from nested_sampling import hard, problems
 
 from probewise.nested import check
-from probewise.nested.hills import Hill, log_evidence_of_unmet_hills
+from probewise.nested.hills import HillEstimate, log_evidence_of_unmet_hills
 from probewise.nested.missing import MissedHills, find_missed_hills
 from probewise.nested.moves import SliceMove
 from probewise.nested.sampler import least_live, run_once
@@ -52,7 +52,7 @@ def test_a_peak_that_holds_much_of_the_evidence_is_a_doubt(
     known = problems.problem("Gaussian 4-D")
     run = run_once(known, rng=np.random.default_rng(1), n_live=100)
     hill = SimpleNamespace(log_z=run.log_z + above_it, is_met_by=lambda _: False)
-    missing = MissedHills((), (cast(Hill, hill),), 77)
+    missing = MissedHills((), (cast(HillEstimate, hill),), 77)
     monkeypatch.setattr(check, "find_missed_hills", lambda *_, **__: missing)
     result = check.check_and_repeat(
         run,

@@ -58,14 +58,14 @@ def test_the_move_leaves_the_uniform_distribution_above_a_bound(move):
     problem, rng = Crescent(), np.random.default_rng(4)
     evaluate, bound = Evaluator(problem), Bound(-1.0, 0.0)
     exact = evaluate(rng.random((60_000, 2)), rng)
-    exact = exact.take(bound.admits(exact.log_likelihood, exact.label))
+    exact = exact.take(bound.mask_above(exact.log_likelihood, exact.label))
     live = exact.take(slice(0, 200))
     ends = []
     for _ in range(15):
         start = live.take(rng.permutation(200)[:100])
         new, tally = move.draw(start, bound, live.u, evaluate, rng)
         move = move.adapted(tally)
-        assert bound.admits(new.log_likelihood, new.label).all()
+        assert bound.mask_above(new.log_likelihood, new.label).all()
         ends.append(new.u)
     found = np.concatenate(ends)
     for of in (lambda u: np.hypot(u[:, 0] - 0.5, u[:, 1] - 0.1), lambda u: np.arctan2(u[:, 1] - 0.1, u[:, 0] - 0.5)):
@@ -126,7 +126,7 @@ def test_where_kernels_are_wasteful_chains_take_over():
     live = evaluate(u, rng)
     bound = Bound(-1.0, 0.5)
     new, tally = KernelMove().draw(live.take(slice(0, 50)), bound, live.u, evaluate, rng)
-    assert bound.admits(new.log_likelihood, new.label).all()
+    assert bound.mask_above(new.log_likelihood, new.label).all()
     assert tally.n_evaluated > 50 * 16
     assert (new.u != live.u[:50]).any(axis=1).mean() > 0.9
 

@@ -167,7 +167,7 @@ def test_agreement_by_hand(terraces: list[NestedResult]) -> None:
     found = agreement_of([one, two])
     assert found.chi_square == pytest.approx(1.0 / 0.25)
     assert found.p_value == pytest.approx(math.erfc(2.0 / math.sqrt(2)))
-    assert found.scatter == pytest.approx(math.sqrt(0.5))
+    assert found.log_z_sd == pytest.approx(math.sqrt(0.5))
     assert found.n_runs == 2
 
 

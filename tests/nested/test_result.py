@@ -151,4 +151,4 @@ def test_the_summary_names_what_matters(result: NestedResult) -> None:
 def test_a_result_cannot_be_changed(result: NestedResult) -> None:
     with pytest.raises(ValueError, match="read-only"):
         result.theta[0, 0] = 1.0
-    assert result.best() == pytest.approx(result.theta[np.argmax(result.log_likelihood)])
+    assert result.maximum_likelihood_theta() == pytest.approx(result.theta[np.argmax(result.log_likelihood)])

@@ -27,7 +27,7 @@ from probewise.nested import (
 from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.clusters import Clusters, find_clusters
 from probewise.nested.evidence import insertion_p_value, integrate
-from probewise.nested.sampler import step
+from probewise.nested.sampler import replace_worst_live_points
 from probewise.priors import Empty
 
 # A right sampler is further off than this many of its own errors less than once in 10 000 runs.
@@ -103,7 +103,7 @@ def test_one_step_by_hand_counts_the_shrinkage(rng: np.random.Generator) -> None
     evaluate = Evaluator(problems.Known(problem, lambda t: t[:, 0], 0.0))
     u = np.array([[0.1], [0.5], [0.3], [0.9], [0.7]])
     live = LivePoints(Points(u, u, np.zeros(5), u[:, 0], np.zeros(5)), BirthRecords.of_prior_draws(5), 0.0)
-    after, dead, _ = step(live, PriorRejection(1.0), evaluate, n_replaced=2, rng=rng)
+    after, dead, _ = replace_worst_live_points(live, PriorRejection(1.0), evaluate, n_replaced=2, rng=rng)
     assert dead.points.theta[:, 0].tolist() == [0.1, 0.3]
     assert dead.n_at_death.tolist() == [5, 4]
     assert after.log_volume == pytest.approx(-1 / 5 - 1 / 4)
@@ -135,7 +135,7 @@ def test_slice_chains_leave_the_uniform_distribution_alone(
     evaluate = Evaluator(problems.Known(problems.box(2, 0, 1), function, 0.0))
     bound = Bound(1.0, 0.25)
     points = evaluate(rng.random((12_000, 2)), rng)
-    points = points.take(bound.admits(points.log_likelihood, points.label))
+    points = points.take(bound.mask_above(points.log_likelihood, points.label))
     ends = []
     for k in range(10):
         start = points.take(slice(300 * k, 300 * k + 300))
@@ -161,7 +161,7 @@ def test_slice_chains_leave_the_uniform_distribution_alone(
 
 def test_a_cluster_is_measured_without_the_start_of_the_chain_that_uses_it(rng: np.random.Generator) -> None:
     points = rng.standard_normal((60, 4)) @ rng.standard_normal((4, 4))
-    without = Clusters.from_groups([points]).leave_one_out(points[:3], np.zeros(3, dtype=int))
+    without = Clusters.from_groups([points]).home_clusters_without_each_point(points[:3], np.zeros(3, dtype=int))
     for i in range(3):
         rest = np.delete(points, i, axis=0)
         assert without.mean[i] == pytest.approx(rest.mean(axis=0))

@@ -9,7 +9,7 @@ from probewise.nested.dead_points import DeadPoints
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.dynamic import Goal, intensified
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
-from probewise.nested.genealogy import chain_memory
+from probewise.nested.genealogy import chain_memory, relative_lineage_variance
 from probewise.nested.importance import Weighted, pareto_k, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
@@ -20,7 +20,7 @@ from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
 from probewise.nested.run_slow import run_slow
-from probewise.nested.sampler import LIVE_PER_PARAM, least_live, step
+from probewise.nested.sampler import LIVE_PER_PARAM, least_live, replace_worst_live_points, step
 from probewise.nested.stop import (
     NESTED_STOP,
     EvidenceChange,
@@ -71,7 +71,9 @@ __all__ = [
     "pareto_k",
     "pose",
     "refine",
+    "relative_lineage_variance",
     "repartitioned",
+    "replace_worst_live_points",
     "run",
     "run_slow",
     "step",

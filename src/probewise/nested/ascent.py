@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray
 from probewise.nested.evaluate import Evaluator, Points
 from probewise.nested.repartition import principal_root, root_of_covariance
 from probewise.nested.result import NestedResult
-from probewise.nested.space import is_within
+from probewise.nested.space import within_bounds_mask
 
 _PER_PARAM, _LEAST_DRAWS = 10, 60  # draws of a generation
 _BEST, _FEWEST_BEST = 0.25, 2  # of them
@@ -28,13 +28,12 @@ _AS_DRAWN = 0.2  # nats between the best draws of the distribution that is retur
 
 
 @dataclass(frozen=True, eq=False)
-class Top:
-    """A place on a peak: its highest point, and a normal distribution of `centre` (n_params,) and `root`.
+class GaussianAtPeak:
+    """A normal distribution at a peak of the likelihood, and the `highest` point known there: start or end of a climb.
 
-    `met`: the highest point met on the way there, maybe on another peak.
-
-    `root` is a root of the covariance, (n_params, n_params); at a rounded top that `climb_to_top` has found, the best
-    quarter of draws lies within 0.2 nats. All in the sampling coordinates.
+    `centre` is its mean, (n_params,), and `root` a root of its covariance, (n_params, n_params), in the sampling
+    coordinates. At a rounded top that `climb_to_top` has found, the best quarter of draws lies within 0.2 nats.
+    `met`: the highest point met on the climb, maybe on another peak; None before one.
     """
 
     highest: Points
@@ -43,15 +42,15 @@ class Top:
     met: Points | None = None
 
     @property
-    def height(self) -> float:
+    def highest_log_likelihood(self) -> float:
         """Log likelihood of the highest point."""
         return float(self.highest.log_likelihood[0])
 
 
 def climb_to_top(
-    start: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator, known: float = -math.inf
-) -> Top:
-    """Climb from a normal distribution to the top of a peak.
+    start: GaussianAtPeak, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator, known: float = -math.inf
+) -> GaussianAtPeak:
+    """Climb from a normal distribution to the top of a peak; return the distribution about the top.
 
     It ends where the best draws are level, or before it would exceed `max_calls` evaluations, which `evaluate` counts.
     Only draws above the log likelihood `known` are followed: those below it may belong to another peak.
@@ -65,8 +64,8 @@ def climb_to_top(
         if spread < _LEVEL or evaluate.n_calls + n_draws > most:
             break
         tried = centre + rng.standard_normal((n_draws, n_params)) @ root_of_covariance(covariance).T
-        drawn = evaluate(tried[is_within(evaluate.space, tried)], rng)
-        best = drawn.take(drawn.order()[::-1][:n_best])
+        drawn = evaluate(tried[within_bounds_mask(evaluate.space, tried)], rng)
+        best = drawn.take(drawn.rows_by_rising_likelihood()[::-1][:n_best])
         best = best.take(best.log_likelihood > known)
         if len(best) < _FEWEST_BEST:
             covariance = _BEST * covariance
@@ -79,11 +78,11 @@ def climb_to_top(
         met = max(met, highest, key=lambda one: float(one.log_likelihood[0]))
     # About a rounded top heights spread as the covariance.
     wider = _AS_DRAWN / spread if 0 < spread < _AS_DRAWN else 1.0
-    return Top(highest, centre, root_of_covariance(wider * covariance), met)
+    return GaussianAtPeak(highest, centre, root_of_covariance(wider * covariance), met)
 
 
-def start_from_live_points(run: NestedResult, evaluate: Evaluator) -> Top:
-    """Return the start of a climb: the highest of a run's last live points, their mean, a root of their covariance."""
+def gaussian_of_last_live_points(run: NestedResult, evaluate: Evaluator) -> GaussianAtPeak:
+    """Return the start of a climb: mean and covariance of a run's last live points, and the highest of them."""
     last = slice(-run.n_live, None)
     live = evaluate.points_from_known_values(run.theta[last], run.log_likelihood[last], run.label[last])
-    return Top(live.take(live.order()[-1:]), live.u.mean(axis=0), principal_root(live.u))
+    return GaussianAtPeak(live.take(live.rows_by_rising_likelihood()[-1:]), live.u.mean(axis=0), principal_root(live.u))

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from probewise.nested.ascent import Top, climb_to_top
+from probewise.nested.ascent import GaussianAtPeak, climb_to_top
 from probewise.nested.evaluate import Evaluator, Points
 from probewise.nested.result import NestedResult
-from probewise.nested.space import is_within
+from probewise.nested.space import within_bounds_mask
 
 _HIGHER = 0.2  # nats by which a draw lies above the known top, so that it belongs to another peak
 _SCALES = (1.5, 1.2, 0.95)  # of the draws, in sds at the top
@@ -23,9 +23,9 @@ _MOST_PEAKS = 5
 
 
 def find_higher_peaks(
-    run: NestedResult, top: Top, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
-) -> list[Top]:
-    """Return the tops of higher peaks than the one on which a run ended.
+    run: NestedResult, top: GaussianAtPeak, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
+) -> list[GaussianAtPeak]:
+    """Look for peaks higher than the one on which a run ended; return the top of each, the highest last.
 
     Parameters
     ----------
@@ -45,21 +45,25 @@ def find_higher_peaks(
     n_draws = int(min(wanted, min(max_calls, _MOST_SHARE * run.n_calls) / len(_SCALES)))
     if n_draws < run.n_live:
         return []
-    peaks = list[Top]()
+    peaks = list[GaussianAtPeak]()
     # Of several peaks of about one height the climb took one, and the run knows the others.
-    known = max(top.height, float(run.log_likelihood.max()))
+    known = max(top.highest_log_likelihood, float(run.log_likelihood.max()))
     scale = np.repeat(_SCALES, n_draws)[:, None]
     tried = top.centre + scale * rng.standard_normal((scale.size, n_params)) @ top.root.T
-    drawn = evaluate(tried[is_within(evaluate.space, tried)], rng)
+    drawn = evaluate(tried[within_bounds_mask(evaluate.space, tried)], rng)
     if top.met is not None:
         drawn = Points.join(drawn, top.met)
     for _ in range(_MOST_PEAKS):
-        best = drawn.take(drawn.order()[-1:])
+        best = drawn.take(drawn.rows_by_rising_likelihood()[-1:])
         if not len(best) or not best.log_likelihood[0] > known + _HIGHER:
             break
         peak = climb_to_top(
-            Top(best, best.u[0], top.root), evaluate, max_calls=most - evaluate.n_calls, rng=rng, known=known + _HIGHER
+            GaussianAtPeak(best, best.u[0], top.root),
+            evaluate,
+            max_calls=most - evaluate.n_calls,
+            rng=rng,
+            known=known + _HIGHER,
         )
         peaks.append(peak)
-        known = max(known, peak.height)
+        known = max(known, peak.highest_log_likelihood)
     return peaks

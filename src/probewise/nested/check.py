@@ -25,9 +25,9 @@ from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
-from probewise.nested.hills import Hill, log_evidence_of_unmet_hills
+from probewise.nested.hills import HillEstimate, log_evidence_of_unmet_hills
 from probewise.nested.hops import HoppingMove
-from probewise.nested.missing import DISAGREE, MissedHills, find_missed_hills, rise_in_errors
+from probewise.nested.missing import DISAGREE, MissedHills, find_missed_hills, log_z_rise_in_errors
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, repartitioned, split_into_clusters
 from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible_draws
@@ -80,8 +80,11 @@ class _EvidenceRoute:
         """The chains, after hops where there are `modes`."""
         return self.chain if self.modes is None else HoppingMove(self.chain, self.modes)
 
-    def is_confirmed_by(self, found: NestedResult) -> bool:
-        """Return whether a run of this route has the expected mean log likelihood: its information plus log Z."""
+    def has_expected_mean_likelihood(self, found: NestedResult) -> bool:
+        """Return whether a run of this route has the expected mean log likelihood, its information plus log Z.
+
+        True where the route expects none.
+        """
         return self.expected is None or abs(found.information + found.log_z - self.expected) < _SAME_MEAN
 
     @property
@@ -127,31 +130,32 @@ class _SecondEstimate:
     curved: bool
 
     @property
-    def log_z(self) -> tuple[float, float]:
+    def log_z_and_error(self) -> tuple[float, float]:
         """Weighted mean of the runs' log Z and its error."""
-        return weighted_mean([a.log_z for a in self.runs], [a.log_z_error for a in self.runs])
+        return weighted_mean_and_error([a.log_z for a in self.runs], [a.log_z_error for a in self.runs])
 
     @property
     def n_calls(self) -> int:
+        """Likelihood evaluations of its runs together."""
         return sum(each.n_calls for each in self.runs)
 
-    def distance_in_errors(self, run: NestedResult) -> float:
+    def signed_distance_in_errors(self, run: NestedResult) -> float:
         """Return a run's log Z minus this one, in combined standard errors; negative if it is below."""
-        log_z, error = self.log_z
+        log_z, error = self.log_z_and_error
         return (run.log_z - log_z) / max(math.hypot(run.log_z_error, error), 1e-12)
 
     def disagrees_or_is_doubtful(self, run: NestedResult, most: float) -> bool:
         """Return whether a run is more than `most` errors away, or this estimate is itself doubtful."""
-        return abs(self.distance_in_errors(run)) > most or bool(self.runs[-1].warnings)
+        return abs(self.signed_distance_in_errors(run)) > most or bool(self.runs[-1].warnings)
 
-    def is_too_low_on_curve(self, first: NestedResult, longer: NestedResult) -> bool:
+    def misses_part_of_curved_posterior(self, first: NestedResult, longer: NestedResult) -> bool:
         """Return whether this estimate is too low: the posterior is curved, and two runs that agree lie above it.
 
         Along a curve the prior of a second pass is thin where the posterior is not, so it can miss a part. Chains of
         `longer` are twice as long: if those of `first` were too short, the two would differ.
         """
-        below = min(self.distance_in_errors(run) for run in (first, longer))
-        alike = abs(_SecondEstimate(self.route, (longer,), self.curved).distance_in_errors(first)) < _ALIKE
+        below = min(self.signed_distance_in_errors(run) for run in (first, longer))
+        alike = abs(_SecondEstimate(self.route, (longer,), self.curved).signed_distance_in_errors(first)) < _ALIKE
         return self.curved and below > _APART and alike and not first.warnings
 
 
@@ -198,7 +202,7 @@ def check_and_repeat(
         missing = find_missed_hills(first, problem, max_calls=budget.calls_left, rng=rng)
         budget.spent += missing.n_calls
         modes = None
-        if rise_in_errors(first, log_evidence_of_unmet_hills(missing.lost, first)) > _MATTERS:
+        if log_z_rise_in_errors(first, log_evidence_of_unmet_hills(missing.lost, first)) > _MATTERS:
             modes = _clusters_of_met_and_lost_modes(first, missing.lost, problem, rng)
             chain = move if isinstance(move, SliceMove) else SliceMove()
             again = budget.run_route(_EvidenceRoute(problem, first.n_live, chain, "the run with hops", modes=modes))
@@ -207,7 +211,7 @@ def check_and_repeat(
                 more = find_missed_hills(now, problem, max_calls=budget.calls_left, rng=rng, lost=missing.lost)
                 budget.spent += more.n_calls
                 missing = replace(more, n_calls=missing.n_calls + more.n_calls)
-        route, second = _estimate_again(now, problem, move, least_live, budget)
+        route, second = _route_and_second_estimate(now, problem, move, least_live, budget)
         if second is None:
             # An estimate that should cost a fifth of the run and does not end is itself a sign of trouble.
             notes = (
@@ -216,7 +220,7 @@ def check_and_repeat(
             )
         else:
             if second.disagrees_or_is_doubtful(now, _APART):
-                second = _with_run_of_more_live_points(second, now, first, budget)
+                second = _second_estimate_with_more_live_points(second, now, first, budget)
             n_check = second.n_calls + missing.n_calls
             if second.disagrees_or_is_doubtful(now, DISAGREE):
                 again = budget.run_route(
@@ -224,7 +228,7 @@ def check_and_repeat(
                         problem, now.n_live, _slice_move_of_longer_chains(move), "the run again", modes=modes
                     )
                 )
-                now, second = _agreeing_run_and_estimate(second, now, again)
+                now, second = _choose_agreeing_run_and_estimate(second, now, again)
             now = _with_check_stored(now, second, n_check)
     except NotConvergedError as error:
         # A second estimate may evaluate hypotheses that the first run never met.
@@ -233,7 +237,7 @@ def check_and_repeat(
 
 
 def _clusters_of_met_and_lost_modes(
-    first: NestedResult, lost: Iterable[Hill], problem: Samplable, rng: np.random.Generator
+    first: NestedResult, lost: Iterable[HillEstimate], problem: Samplable, rng: np.random.Generator
 ) -> Clusters:
     """Return the clusters of a run's posterior and the modes it lost, in the sampling coordinates."""
     space = space_of(problem.prior, getattr(problem, "periodic", ()))
@@ -241,21 +245,24 @@ def _clusters_of_met_and_lost_modes(
     return Clusters.from_groups([*met, *(space.enter(hill.theta) for hill in lost)])
 
 
-def _estimate_again(
+def _route_and_second_estimate(
     now: NestedResult, problem: Samplable, move: Move, least_live: int, budget: _CallBudget
 ) -> tuple[_EvidenceRoute, _SecondEstimate | None]:
-    """Estimate the evidence by the first route that is confirmed, else by the last; None if that did not end."""
+    """Estimate the evidence by the first route that is confirmed, else by the last.
+
+    Returns that route and the estimate; None for the estimate if the route did not end.
+    """
     curved, second = False, None
     for route in _routes_to_second_estimate(now, problem, move, least_live, budget.rng):
         found = budget.run_route(route)
         second = None if found is None else _SecondEstimate(route, (found,), curved)
-        if found is not None and route.is_confirmed_by(found):
+        if found is not None and route.has_expected_mean_likelihood(found):
             break
         curved = route.expected is not None
     return route, second
 
 
-def _with_run_of_more_live_points(
+def _second_estimate_with_more_live_points(
     second: _SecondEstimate, now: NestedResult, first: NestedResult, budget: _CallBudget
 ) -> _SecondEstimate:
     """Add a run with more live points, at most as many as the first run has, to a second estimate.
@@ -273,7 +280,7 @@ def _with_run_of_more_live_points(
     return replace(second, runs=(found,) if second.runs[0].warnings else (*second.runs, found))
 
 
-def _agreeing_run_and_estimate(
+def _choose_agreeing_run_and_estimate(
     second: _SecondEstimate, now: NestedResult, again: NestedResult | None
 ) -> tuple[NestedResult, _SecondEstimate]:
     """Return the run and the second estimate that agree, given a repetition of the run with longer chains.
@@ -284,7 +291,7 @@ def _agreeing_run_and_estimate(
         return now, second
     if not second.disagrees_or_is_doubtful(again, DISAGREE):
         return again, second
-    if second.is_too_low_on_curve(now, again):
+    if second.misses_part_of_curved_posterior(now, again):
         shorter = replace(second.route, name="the same run with shorter chains")
         return again, _SecondEstimate(shorter, (now,), second.curved)
     return now, second
@@ -353,7 +360,7 @@ def _slice_move_of_longer_chains(move: Move) -> SliceMove:
     )
 
 
-def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
+def weighted_mean_and_error(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple[float, float]:
     """Return the inverse-variance weighted mean of independent estimates of log Z, and its error."""
     weight: FloatArray = np.maximum(log_z_error, 1e-12) ** -2.0
     return float(weight @ np.asarray(log_z) / weight.sum()), float(weight.sum() ** -0.5)
@@ -361,7 +368,7 @@ def weighted_mean(log_z: Sequence[float], log_z_error: Sequence[float]) -> tuple
 
 def _with_check_stored(now: NestedResult, second: _SecondEstimate, n_check: int) -> NestedResult:
     """Store the check in the result, with a warning where the estimates disagree."""
-    (log_z, error), distance, name = second.log_z, second.distance_in_errors(now), second.route.name
+    (log_z, error), distance, name = second.log_z_and_error, second.signed_distance_in_errors(now), second.route.name
     warnings = now.warnings
     if abs(distance) > DISAGREE:
         warnings = (

@@ -52,7 +52,7 @@ class BirthRecords:
 
     @classmethod
     def join(cls, *parts: BirthRecords) -> BirthRecords:
-        """Concatenate."""
+        """Concatenate records."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
@@ -134,7 +134,10 @@ def _value_as_text(value: object) -> str:
 
 @dataclass
 class CheckpointFile:
-    """Save a run to `path` atomically, and resume it."""
+    """The checkpoint file of a run: the run's state is written to `path` atomically, and read to resume the run.
+
+    `every_s`: least seconds between savings; `settings`: what a resumed run must share, from `settings_of_run`.
+    """
 
     path: Path
     every_s: float
@@ -198,7 +201,7 @@ class CheckpointFile:
         return buffer.getvalue()
 
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> RunState | None:
-        """Read the file and restore the generator's state; None where there is no file.
+        """Read the state of the run and set `rng` and the count of `evaluate` to it; None where there is no file.
 
         Raises
         ------

@@ -14,7 +14,7 @@ _N_REFINEMENTS = 4
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Clusters by mean and covariance; space is divided between them.
+    """Clusters of points, by mean and covariance; `assign` divides all space between them.
 
     `mean` (n_clusters, n_params); `root` the Cholesky factors of the covariances and `inverse_root`
     their inverses, (n_clusters, n_params, n_params); `log_det` of the factors and `size` in points, (n_clusters,).
@@ -59,8 +59,8 @@ class Clusters:
         pairs = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
         return Clusters(*map(np.concatenate, pairs))
 
-    def leave_one_out(self, u: FloatArray, home: IntArray) -> Clusters:
-        """Return for each point the mean and covariance of its cluster without the point itself.
+    def home_clusters_without_each_point(self, u: FloatArray, home: IntArray) -> Clusters:
+        """Compute for each point the cluster that it belongs to, without the point itself.
 
         Parameters
         ----------
@@ -129,7 +129,7 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
     axes = np.concatenate([z, z @ vectors / np.sqrt(np.maximum(values, flattest))], axis=1)
     # Two equal modes make the kurtosis small, a small mode beside a large one makes it large.
     fourth = (axes**4).mean(axis=0)
-    whole = n * _covariance_log_det(points)
+    whole = n * _covariance_root_log_det(points)
     n_more = 1 + n_params * (n_params + 3) / 2
     best, halves = n_more + 0.15 * n + 10.0, None
     for axis in {int(np.argmin(fourth)), int(np.argmax(fourth))}:
@@ -148,7 +148,7 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
             continue
         a, b = points[~side], points[side]
         entropy = n_one * np.log(n_one / n) + (n - n_one) * np.log(1 - n_one / n)
-        gain = whole - len(a) * _covariance_log_det(a) - len(b) * _covariance_log_det(b) + entropy
+        gain = whole - len(a) * _covariance_root_log_det(a) - len(b) * _covariance_root_log_det(b) + entropy
         if gain > best:
             best, halves = float(gain), (a, b)
     return halves
@@ -169,5 +169,6 @@ def _covariance_root(points: FloatArray) -> FloatArray:
     return np.linalg.cholesky(covariance + np.diag(ridge))
 
 
-def _covariance_log_det(points: FloatArray) -> float:
+def _covariance_root_log_det(points: FloatArray) -> float:
+    """Log determinant of the root of the covariance: half of that of the covariance."""
     return float(np.log(np.diag(_covariance_root(points))).sum())

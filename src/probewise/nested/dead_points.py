@@ -16,7 +16,7 @@ PER_POINT = ("log_likelihood", "label", "log_weight", "log_birth", "birth_label"
 COUNTS = ("parent", "n_at_death")
 
 
-def require_length(name: str, values: FloatArray | IntArray, n: int, one: str) -> FloatArray | IntArray:
+def checked_array_of_length(name: str, values: FloatArray | IntArray, n: int, one: str) -> FloatArray | IntArray:
     """Return an array after checking that it has shape (n,); `name` and `one`, what a row is, are for the message.
 
     Raises
@@ -75,7 +75,7 @@ class DeadPoints(WeightedSamples):
             self._store_read_only(name, frozen_int(getattr(self, name)))
 
     def _store_read_only(self, name: str, values: FloatArray | IntArray) -> None:
-        object.__setattr__(self, name, require_length(name, values, self.n_dead, "row of theta"))
+        object.__setattr__(self, name, checked_array_of_length(name, values, self.n_dead, "row of theta"))
 
     @property
     def n_dead(self) -> int:
@@ -117,6 +117,8 @@ class DeadPoints(WeightedSamples):
             total = part if total is None else total + part
         return np.zeros(0) if total is None else total
 
-    def best(self) -> FloatArray:
-        """Parameters of the greatest likelihood, (n_params,)."""
+    def maximum_likelihood_theta(self) -> FloatArray:
+        """Return the parameters of the sample with the greatest likelihood, (n_params,)."""
         return np.asarray(self.theta[int(np.argmax(self.log_likelihood))])
+
+    best = maximum_likelihood_theta  # its earlier name

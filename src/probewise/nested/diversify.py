@@ -84,7 +84,7 @@ def diversify(
     prior_sd = prior.from_unit_cube(rng.random((_N_PRIOR_DRAWS, n_params))).std(axis=0)
     now = start.copy()
     n_accepted = 0
-    for displacement, threshold in _proposed_displacements(start, prior_sd, n_steps, rng):
+    for displacement, threshold in _displacements_and_log_thresholds(start, prior_sd, n_steps, rng):
         proposed = now + displacement
         proposed_height = prior.log_prob(proposed)
         # The likelihood is not evaluated outside the prior, where a model may be undefined.
@@ -102,7 +102,7 @@ def diversify(
     return now, DiversifyTally(n_steps, evaluate.n_calls, n_accepted / (n_steps * n_samples), n_distinct, mixing)
 
 
-def _proposed_displacements(
+def _displacements_and_log_thresholds(
     cloud: FloatArray, prior_sd: FloatArray, n_steps: int, rng: np.random.Generator
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Yield for every step the proposed displacements, (n_samples, n_params), and log uniform numbers, (n_samples,)."""

@@ -26,7 +26,7 @@ from probewise.nested.evidence import DOUBTFUL_P_VALUE, insertion_p_value, integ
 from probewise.nested.merging import JoinedRecord, combined_p_value, generator_states_of
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.result import NestedResult, software_versions
-from probewise.nested.sampler import generator_state_as_json, least_live, move_at_volume, step
+from probewise.nested.sampler import generator_state_as_json, least_live, move_at_volume, replace_worst_live_points
 
 Goal: TypeAlias = Literal["posterior", "evidence"]
 
@@ -115,7 +115,7 @@ class _Thread:
 
 
 def _require_complete_run_of(result: NestedResult, evaluate: Evaluator) -> None:
-    """Raise ParameterError unless a run is complete and of this problem."""
+    """Raise unless a run is complete and of this problem: ShapeError for other parameters, else ParameterError."""
     if evaluate.names != result.names:
         raise ShapeError(f"the problem has the parameters {evaluate.names}; allowed: those of the run, {result.names}")
     if not result.names:
@@ -173,18 +173,18 @@ def _draw_thread(
     dead, ranks, counts = list[tuple[Points, BirthRecords]](), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     n_replaced, cost = n_live // 2, tally.n_evaluated
     while True:
-        worst = live.points.order()[n_replaced - 1]
+        worst = live.points.rows_by_rising_likelihood()[n_replaced - 1]
         reached = (float(live.points.log_likelihood[worst]), float(live.points.label[worst])) >= end
         if reached or (max_calls is not None and evaluate.n_calls + 2 * cost > max_calls):
             break
         now = move_at_volume(moving, live.log_volume)
-        live, gone, tally = step(live, now, evaluate, n_replaced=n_replaced, rng=rng)
+        live, gone, tally = replace_worst_live_points(live, now, evaluate, n_replaced=n_replaced, rng=rng)
         cost = tally.n_evaluated
         moving = moving.adapted(tally) if now is moving else moving
         dead.append((gone.points, gone.births))
         ranks.append(gone.rank)
         counts.append(gone.n_ranked)
-    order = live.points.order()
+    order = live.points.rows_by_rising_likelihood()
     dead.append((live.points.take(order), live.births.take(order)))
     points, births = Points.join(*(points for points, _ in dead)), BirthRecords.join(*(born for _, born in dead))
     began = np.where(births.ident < n_live, started[np.minimum(births.ident, n_live - 1)], -1)
@@ -192,7 +192,7 @@ def _draw_thread(
 
 
 def _rows_alive_after(result: NestedResult, row: int) -> IntArray:
-    """Rows of the points alive just after the death of a row."""
+    """Return the rows of the points alive just after the death of row `row`, (n_alive,)."""
     level = (result.log_likelihood[row], result.label[row])
     born = (result.log_birth < level[0]) | ((result.log_birth == level[0]) & (result.birth_label <= level[1]))
     return np.flatnonzero(born & (np.arange(result.n_dead) > row))
@@ -224,7 +224,7 @@ def _join_thread_to_run(
         log_start=result.log_start,
         log_start_error=result.log_start_error,
     )
-    error = evidence.error(result.memory)
+    error = evidence.log_z_error(result.memory)
     check = result.check
     if check is not None:
         apart = (evidence.log_z - check.log_z) / max(math.hypot(error, check.log_z_error), 1e-12)

@@ -69,9 +69,11 @@ class Points:
         self.log_density[rows], self.label[rows] = points.log_density[which], points.label[which]
         self.log_likelihood[rows] = points.log_likelihood[which]
 
-    def order(self) -> IntArray:
+    def rows_by_rising_likelihood(self) -> IntArray:
         """Return the row numbers from the least to the greatest log likelihood, ties by label, (n,)."""
         return np.lexsort((self.label, self.log_likelihood))
+
+    order = rows_by_rising_likelihood  # its earlier name
 
     @staticmethod
     def empty(n_params: int) -> Points:
@@ -101,15 +103,17 @@ class Bound:
     log_likelihood: float
     label: float
 
-    def admits(self, log_likelihood: FloatArray, label: FloatArray) -> BoolArray:
-        """Mark the points above the bound; both arguments (n,)."""
+    def mask_above(self, log_likelihood: FloatArray, label: FloatArray) -> BoolArray:
+        """Return a mask of the points above the bound; all arrays are (n,)."""
         tie = (log_likelihood == self.log_likelihood) & (label > self.label)
         return np.asarray((log_likelihood > self.log_likelihood) | tie)
+
+    admits = mask_above  # its earlier name
 
 
 @dataclass
 class Evaluator:
-    """Evaluate and count points; errors name the parameters at which the likelihood failed.
+    """Evaluates the likelihood of points and counts them in `n_calls`; errors name the parameters at which it failed.
 
     With an `executor` (any `concurrent.futures.Executor`) a batch is split into `n_parts` parts; the
     problem must then be picklable. Results come back in order, so the run does not depend on the executor
@@ -131,7 +135,7 @@ class Evaluator:
         self.space = space_of(self.problem.prior, getattr(self.problem, "periodic", ()))
 
     def draw_from_prior(self, n: int, rng: np.random.Generator) -> Points:
-        """Draw from the prior and evaluate."""
+        """Draw `n` points from the prior and evaluate them."""
         return self(self.space.draw(n, rng=rng), rng)
 
     from_prior = draw_from_prior  # its earlier name
@@ -172,7 +176,10 @@ class Evaluator:
     weigh = evaluate_mapped  # its earlier name
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
-        """Evaluate the likelihood of hypotheses, (n, n_params) -> (n,), with the checks described above."""
+        """Evaluate and count the likelihood of hypotheses, (n, n_params) -> (n,).
+
+        Raises NotConvergedError where `__call__` does.
+        """
         if not len(theta):
             return np.empty(0)  # a likelihood need not take an empty batch
         shared = self.executor is not None and len(theta) > 1
@@ -185,7 +192,7 @@ class Evaluator:
             raise NotConvergedError(self._failure_message(error, parts[len(answers)])) from error
         # Concatenation copies: a likelihood may return the same array every time.
         values = np.concatenate(
-            [self._require_log_likelihoods(a, part) for a, part in zip(answers, parts, strict=True)]
+            [self._checked_log_likelihoods(a, part) for a, part in zip(answers, parts, strict=True)]
         )
         fine = values < np.inf
         if not fine.all():
@@ -213,7 +220,7 @@ class Evaluator:
             for part in parts:
                 yield self.problem.log_likelihood(part.copy())
 
-    def _require_log_likelihoods(self, answer: object, theta: FloatArray) -> FloatArray:
+    def _checked_log_likelihoods(self, answer: object, theta: FloatArray) -> FloatArray:
         """Convert the likelihood's answer to (n,) floats; NotConvergedError for masked, complex or misshapen ones."""
         if isinstance(answer, np.ma.MaskedArray) and (n_masked := int(np.ma.getmaskarray(answer).sum())):
             raise NotConvergedError(
@@ -252,13 +259,13 @@ class Evaluator:
                 "functions and classes at the top level of a module, without lambdas; or take a ThreadPoolExecutor"
             )
         # A hypothesis that killed its worker could kill this process too.
-        culprit = None if isinstance(error, BrokenExecutor) else self._failing_row(theta)
+        culprit = None if isinstance(error, BrokenExecutor) else self._find_failing_hypothesis(theta)
         if culprit is not None:
             return f"the likelihood raised {why}; at {self._parameters_as_text(culprit)}"
         batch = f"it is given a batch theta of shape {theta.shape}, one hypothesis per row"
         return f"the likelihood raised {why}; {batch}; {self._first_hypothesis_as_text(theta)}"
 
-    def _failing_row(self, theta: FloatArray) -> FloatArray | None:
+    def _find_failing_hypothesis(self, theta: FloatArray) -> FloatArray | None:
         """Find by bisection a hypothesis that fails by itself; None where only the batch as a whole fails."""
         while len(theta) > 1:
             half = len(theta) // 2

@@ -32,8 +32,11 @@ class Evidence:
     log_weight: FloatArray
     n_eff: float
 
-    def error(self, memory: float) -> float:
-        """Return the standard error of log Z for correlated chains, `memory` from `probewise.nested.chain_memory`."""
+    def log_z_error(self, memory: float) -> float:
+        """Return the standard error of log Z, where correlated chains multiply its variance from shrinkage by `memory`.
+
+        `memory` comes from `probewise.nested.relative_lineage_variance`.
+        """
         return math.hypot(math.sqrt(memory) * self.spread, self.log_start_error)
 
 
@@ -132,9 +135,13 @@ def insertion_p_value(rank: IntArray, n_below_or_above: IntArray, *, rng: np.ran
     rank
         Number of live points worse than the new one, (n_inserted,).
     n_below_or_above
-        Number of points alive at insertion, m, (n_inserted,).
+        Number of points alive at insertion, m, without the new one, (n_inserted,).
     rng
         Source of randomness, for jittering the discrete ranks.
+
+    Returns
+    -------
+    The p value; 1 for fewer than 20 points.
     """
     if len(rank) < 20:
         return 1.0

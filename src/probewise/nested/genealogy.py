@@ -20,7 +20,9 @@ _MOST_WINDOWS = 32
 _LEAST_LAG = 4
 
 
-def chain_memory(parent: IntArray, birth_row: IntArray, n_at_death: IntArray, log_weight: FloatArray) -> float:
+def relative_lineage_variance(
+    parent: IntArray, birth_row: IntArray, n_at_death: IntArray, log_weight: FloatArray
+) -> float:
     """Estimate the variance of log Z relative to a run whose new points are independent draws, 1 or more.
 
     Every point that dies after a given time descends from one of the n points alive then. Let s be the shares of these
@@ -50,8 +52,11 @@ def chain_memory(parent: IntArray, birth_row: IntArray, n_at_death: IntArray, lo
     n_rounds = len(ends) - 1
     if n_rounds // 4 < _LEAST_LAG:
         return 1.0
-    half, quarter = (genealogy.memory_of_windows(ends, n_rounds // part) for part in (2, 4))
+    half, quarter = (genealogy.relative_variance_from_windows(ends, n_rounds // part) for part in (2, 4))
     return max(1.0, 1.5 * half - 0.5 * quarter)
+
+
+chain_memory = relative_lineage_variance  # its earlier name
 
 
 class _Genealogy:
@@ -67,8 +72,8 @@ class _Genealogy:
         n_alive = n_at_death[np.minimum(self._births + 1, len(n_at_death) - 1)]
         self._chance = np.concatenate([[0.0], np.cumsum(2.0 * (self._left[self._births + 1] / n_alive) ** 2)])
 
-    def memory_of_windows(self, ends: IntArray, lag: int) -> float:
-        """Estimate the variance ratio from windows of `lag` rounds."""
+    def relative_variance_from_windows(self, ends: IntArray, lag: int) -> float:
+        """Estimate the ratio of variances from windows of `lag` rounds, of which `ends` are the last rows."""
         starts = np.unique(np.linspace(0, len(ends) - 1 - lag, _MOST_WINDOWS).astype(int))
         windows = [self._excess_and_shrinkage_variance(ends[i], ends[i + lag]) for i in starts]
         excess, own = np.array(windows).sum(axis=0)

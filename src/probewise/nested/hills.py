@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.nested.ascent import Top
+from probewise.nested.ascent import GaussianAtPeak
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.importance import HeldOutSamples, Posterior, Weighted, draw_and_weigh
@@ -33,8 +33,8 @@ _MET = 0.5  # of the evidence of a hill: with more, the run has met it
 
 
 @dataclass(frozen=True, eq=False)
-class Hill:
-    """A hill of the posterior and the log of its evidence.
+class HillEstimate:
+    """A hill of the posterior, that is a mode and its surroundings, with samples and the log of its evidence.
 
     `theta`: samples of it, (n, n_params). The ellipsoid of `shape`, a single cluster in coordinates of `space`, holds
     most of it within `radius` sds.
@@ -47,8 +47,8 @@ class Hill:
     radius: float
 
     @classmethod
-    def from_draws(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> Hill:
-        """Make a hill of weighted draws on it."""
+    def from_draws(cls, drawn: Weighted, space: Space, rng: np.random.Generator) -> HillEstimate:
+        """Make the estimate from weighted draws on a hill."""
         theta = drawn.samples(_N_SAMPLES, rng=rng)
         x = space.enter(theta)
         shape = Clusters.from_groups([x])
@@ -66,7 +66,7 @@ def _distance_in_sds(x: FloatArray, shape: Clusters) -> FloatArray:
     return np.asarray(np.linalg.norm((x - shape.mean[0]) @ shape.inverse_root[0].T, axis=1))
 
 
-def log_evidence_of_unmet_hills(hills: Iterable[Hill], run: Posterior) -> float:
+def log_evidence_of_unmet_hills(hills: Iterable[HillEstimate], run: Posterior) -> float:
     """Return the log of the joint evidence of those hills that a run has not met; -inf where it met all."""
     return float(logsumexp([-math.inf, *(hill.log_z for hill in hills if not hill.is_met_by(run))]))
 
@@ -80,15 +80,18 @@ def calls_for_hill_evidence(n_params: int) -> float:
     return 2.5 * _n_points_on_hill(n_params) * max(n_params, _FEWEST_STEPS) * SliceMove().target
 
 
-def draw_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> Points:
-    """Draw points uniformly from the upper part of a hill, whose covariance is that of a whole normal hill."""
+def draw_uniformly_near_hilltop(top: GaussianAtPeak, evaluate: Evaluator, rng: np.random.Generator) -> Points:
+    """Draw points uniformly from where the log likelihood is within (n_params + 2) / 2 of a hill's highest.
+
+    On a normal hill these points have the covariance of the whole hill.
+    """
     n_params = top.root.shape[0]
     n = _n_points_on_hill(n_params)
     below = (n_params + 2) / 2
     move = SliceMove(hops=0)
     live = top.highest.u + rng.standard_normal((n, n_params)) @ top.root.T
     starts = top.highest.take(np.zeros(n, dtype=np.int64))
-    highest, log_volume = top.height, -math.inf
+    highest, log_volume = top.highest_log_likelihood, -math.inf
     for _ in range(_ROUNDS):
         drawn, _ = move.draw(starts, Bound(highest - below, 1.0), live, evaluate, rng)
         last, log_volume = log_volume, float(np.linalg.slogdet(principal_root(drawn.u))[1])
@@ -102,7 +105,7 @@ def draw_from_hill(top: Top, evaluate: Evaluator, rng: np.random.Generator) -> P
     return drawn
 
 
-def estimate_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> Hill | None:
+def estimate_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator) -> HillEstimate | None:
     """Compute a hill's evidence by draws from a Student t about points on it; None where no Student t fits.
 
     Where there are too few effective samples, the Student t is fitted anew to the weighted draws.
@@ -115,7 +118,7 @@ def estimate_hill(settled: Points, evaluate: Evaluator, rng: np.random.Generator
         proposal = single_student_t(mean, _WIDER**2 * covariance)
         drawn = draw_and_weigh(proposal, 0.0, HeldOutSamples.empty(), space, evaluate, n_draws=n_draws, rng=rng)
         if drawn.n_eff > enough:
-            return Hill.from_draws(drawn, space, rng)
+            return HillEstimate.from_draws(drawn, space, rng)
         if not drawn.n_eff > 1:
             return None
         # A power of the weights that leaves enough of them for a covariance.

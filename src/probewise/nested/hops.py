@@ -10,14 +10,14 @@ from probewise._arrays import FloatArray
 from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.moves import SliceMove, Tally
-from probewise.nested.space import is_within
+from probewise.nested.space import within_bounds_mask
 
 _HOPS = 3
 
 
 @dataclass(frozen=True, eq=False)
 class HoppingMove:
-    """Hops between modes, then the chains of `chains`.
+    """A move that hops between modes, then runs the chains of `chains`.
 
     A hop takes a point to its counterpart in another mode, by the affine map between their covariances, and is accepted
     with the ratio of their volumes (see `SliceMove`). `SliceMove` knows only the modes in which there are enough live
@@ -46,14 +46,14 @@ class HoppingMove:
         goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
         u, log_growth = modes.map_between(now.u, home, goal)
         # The way back must be the same map.
-        able = is_within(space, u) & (modes.assign(u) == goal)
+        able = within_bounds_mask(space, u) & (modes.assign(u) == goal)
         level = now.log_density - log_growth - rng.standard_exponential(len(home))
         rows = able.nonzero()[0]
         theta, log_density = space.leave(u[rows])
         dense = (log_density >= level[rows]).nonzero()[0]
         rows = rows[dense]
         tried = evaluate.evaluate_mapped(u[rows], theta[dense], log_density[dense], rng)
-        won = bound.admits(tried.log_likelihood, tried.label).nonzero()[0]
+        won = bound.mask_above(tried.log_likelihood, tried.label).nonzero()[0]
         now.put(rows[won], tried, won)
 
     def adapted(self, tally: Tally) -> HoppingMove:

@@ -134,7 +134,7 @@ Posterior: TypeAlias = NestedResult | Weighted
 
 
 def inherited_doubts(found: Weighted, result: Posterior) -> tuple[str, ...]:
-    """Return the doubts about the refined result, and one if it differs by more than the errors allow."""
+    """Return the doubts about `result`, which `found` refines, and one for each log Z of it that disagrees."""
     if isinstance(result, Weighted):
         return result.doubts
     routes = [("the run", result.log_z, result.log_z_error)]

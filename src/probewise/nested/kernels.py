@@ -28,9 +28,9 @@ _MOST_KERNELS = 100
 class Kernels:
     """A kernel density of Gaussians about points: half of the mass with sd `width`, half with a third of it.
 
-    `centre_rows` are the points whitened by their covariance, (n_kernels, n_params); `width` is in
-    that frame. The wide kernels lead to other modes and into corners without points, the narrow ones
-    follow a thin or curved region.
+    `centre_rows` are the points whitened by their `mean` and the Cholesky `root` of their covariance, (n_kernels,
+    n_params); `width` is in that frame. The wide kernels lead to other modes and into corners without points, the
+    narrow ones follow a thin or curved region.
     """
 
     mean: FloatArray
@@ -63,9 +63,9 @@ class Kernels:
         """Natural log of the density up to a constant, (n, n_params) -> (n,)."""
         white = np.linalg.solve(self.root, (points - self.mean).T).T / (math.sqrt(2) * self.width)
         blocks = np.array_split(white, max(1, -(-len(white) // _DENSITY_BLOCK)))
-        return np.concatenate([self._log_density(block) for block in blocks])
+        return np.concatenate([self._log_density_of_block(block) for block in blocks])
 
-    def _log_density(self, white: FloatArray) -> FloatArray:
+    def _log_density_of_block(self, white: FloatArray) -> FloatArray:
         # Single precision (1e-5, enough for a proposal) halves the time of the exponentials.
         centres = (self.centre_rows / (math.sqrt(2) * self.width)).astype(np.float32)
         rows = white.astype(np.float32)
@@ -82,7 +82,7 @@ class Kernels:
 
 @dataclass(frozen=True)
 class KernelMove:
-    """Draw above a bound with independent proposals from kernels about the live points.
+    """A move that draws above a bound by independent proposals from kernels about the live points.
 
     Every chain starts at a live point and accepts or rejects its proposals in turn, so the uniform
     density above the bound is left invariant; with `moves` accepted on average it forgets its start.
@@ -130,7 +130,7 @@ class KernelMove:
         parts = [evaluate(u[rows], rng) for rows in np.array_split(inside, max(1, -(-inside.size // _BLOCK)))]
         tried = Points.join(*parts)
         log_target[inside] += tried.log_density
-        admitted[inside] = bound.admits(tried.log_likelihood, tried.label)
+        admitted[inside] = bound.mask_above(tried.log_likelihood, tried.label)
         log_odds = np.log(rng.random((self.n_proposals, n_chains)))
         last = _accept_in_turn(admitted, log_target, start.log_density - kernels.log_density(start.u), log_odds)
         where = np.empty(n_tries, dtype=np.int64)

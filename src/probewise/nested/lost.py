@@ -12,11 +12,11 @@ from __future__ import annotations
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.nested.ascent import Top
+from probewise.nested.ascent import GaussianAtPeak
 from probewise.nested.evaluate import Evaluator, Points
 from probewise.nested.repartition import principal_root
 from probewise.nested.result import NestedResult
-from probewise.nested.space import Space, is_within
+from probewise.nested.space import Space, within_bounds_mask
 
 _SHARE = 1 / 20  # of the run's evaluations, for the first lines
 _FEWEST_STEPS = 6
@@ -38,15 +38,18 @@ def _n_early_dead_points(run: NestedResult) -> int:
     return int(np.searchsorted(np.cumsum(run.weight), _BULK))
 
 
-def sds_of_next_dead_points(run: NestedResult, space: Space) -> FloatArray:
-    """Sds of the next 600 points to die after the first tenth of the mass, in coordinates of the space, (n_params,)."""
+def sds_after_early_dead_points(run: NestedResult, space: Space) -> FloatArray:
+    """Compute the sds of the 600 points that die next after the early ones, in coordinates of the space, (n_params,).
+
+    Early dead points are those that hold the first tenth of the posterior's mass.
+    """
     last = _n_early_dead_points(run)
     return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
 
 
 def tops_from_early_points(
     first: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
-) -> list[Top]:
+) -> list[GaussianAtPeak]:
     """Climb from early dead points that a dip separates from the posterior; return the tops that are high and apart.
 
     At most `max_calls` evaluations, counted by `evaluate`, are used for lines to the posterior, and some for climbs.
@@ -62,8 +65,8 @@ def tops_from_early_points(
     samples = np.unique(first.rows(_N_KNOWN, rng=rng))
     known = evaluate.points_from_known_values(first.theta[samples], first.log_likelihood[samples], first.label[samples])
     u = evaluate.space.enter(first.theta[: last + _BLOCK])
-    scale = sds_of_next_dead_points(first, evaluate.space)
-    apart = np.flatnonzero(are_beyond_dip(start, known, scale, 1, evaluate, rng))
+    scale = sds_after_early_dead_points(first, evaluate.space)
+    apart = np.flatnonzero(separated_by_dip_mask(start, known, scale, 1, evaluate, rng))
     if not apart.size:
         return []
     chosen = apart[_rows_far_apart(start.u[apart] / scale, start.log_likelihood[apart])]
@@ -72,8 +75,8 @@ def tops_from_early_points(
     # Of the evidence below a level a lost mode holds no more than its share of live points there.
     enough = first.log_likelihood[last] - _FROM_TOP * n_params
     high = np.flatnonzero(now.log_likelihood > enough)
-    high = high[are_beyond_dip(now.take(high), known, scale, _NEAREST, evaluate, rng)]
-    return [Top(now.take(slice(k, k + 1)), now.u[k], scales[k] * roots[k]) for k in high]
+    high = high[separated_by_dip_mask(now.take(high), known, scale, _NEAREST, evaluate, rng)]
+    return [GaussianAtPeak(now.take(slice(k, k + 1)), now.u[k], scales[k] * roots[k]) for k in high]
 
 
 def _climb_along_random_lines(
@@ -94,7 +97,7 @@ def _climb_along_random_lines(
         for _ in range(_TRIES):
             t = low[climbing] + (high - low)[climbing] * rng.random(climbing.size)
             u = now.u[climbing] + t[:, None] * line[climbing]
-            inside = is_within(space, u).nonzero()[0]
+            inside = within_bounds_mask(space, u).nonzero()[0]
             tried = evaluate(u[inside], rng)
             higher = (tried.log_likelihood > now.log_likelihood[climbing[inside]]).nonzero()[0]
             now.put(climbing[inside[higher]], tried, higher)
@@ -106,10 +109,10 @@ def _climb_along_random_lines(
     return now, scale
 
 
-def are_beyond_dip(
+def separated_by_dip_mask(
     points: Points, known: Points, scale: FloatArray, n_nearest: int, evaluate: Evaluator, rng: np.random.Generator
 ) -> BoolArray:
-    """Mark the points, (n,), with a dip of the likelihood on the straight line to each of their nearest known points.
+    """Return a mask, (n,), of points with a dip of the likelihood on the straight line to each of their nearest known.
 
     `scale`, (n_params,), is the unit of distance along each coordinate. The evaluations on the lines are counted.
     """

@@ -13,7 +13,7 @@ from scipy.special import chdtrc
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested.check import weighted_mean
+from probewise.nested.check import weighted_mean_and_error
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
 from probewise.nested.missing import DISAGREE
 from probewise.nested.result import Agreement, Check, NestedResult, software_versions
@@ -52,7 +52,7 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         complete record of births and deaths.
     """
     parts = tuple(results)
-    seeds = _require_mergeable(parts)
+    seeds = _seed_states_of_mergeable_runs(parts)
     record = JoinedRecord.from_records([(r.log_likelihood, r.label, r.log_birth, r.birth_label) for r in parts])
     first = np.cumsum([0, *(r.n_dead for r in parts[:-1])])
     parent = np.concatenate([np.where(r.parent >= 0, r.parent + n, -1) for r, n in zip(parts, first, strict=True)])
@@ -63,9 +63,9 @@ def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> Neste
         record.log_likelihood, record.n_at_death, rng=rng, log_start=log_start, log_start_error=log_start_error
     )
     agreement = agreement_of(parts)
-    check = _joined_checks(parts, evidence.log_z, evidence.error(remembered))
+    check = _joined_checks(parts, evidence.log_z, evidence.log_z_error(remembered))
     p_value = combined_p_value([r.insertion_p_value for r in parts])
-    error, doubts = _error_and_doubts(agreement, check, p_value, evidence.log_z, evidence.error(remembered))
+    error, doubts = _error_and_doubts(agreement, check, p_value, evidence.log_z, evidence.log_z_error(remembered))
     for doubt in doubts:
         warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     inherited = [f"run {i} of {len(parts)}: {note}" for i, r in enumerate(parts, start=1) for note in r.warnings]
@@ -112,7 +112,7 @@ def _error_and_doubts(
             f"{max(agreement.log_z):.2f} (p = {agreement.p_value:.1g}): some missed a part of the posterior; "
             "the error is widened to their scatter; use more n_live or longer chains"
         )
-        error = max(error, agreement.scatter)
+        error = max(error, agreement.log_z_sd)
     if p_value < DOUBTFUL_P_VALUE:
         doubts.append(f"insertion ranks of the runs together are not uniform (p = {p_value:.1g})")
     if check is not None and abs(check.distance) > DISAGREE:
@@ -200,14 +200,14 @@ def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) ->
     checks = [r.check for r in parts if r.check is not None]
     if len(checks) < len(parts):
         return None
-    mean, mean_error = weighted_mean([c.log_z for c in checks], [c.log_z_error for c in checks])
+    mean, mean_error = weighted_mean_and_error([c.log_z for c in checks], [c.log_z_error for c in checks])
     route = checks[0].route if len({c.route for c in checks}) == 1 else "the runs' second routes"
     distance = (log_z - mean) / max(math.hypot(error, mean_error), 1e-12)
     return Check(route, mean, mean_error, distance, sum(c.n_calls for c in checks))
 
 
-def _require_mergeable(parts: Sequence[NestedResult]) -> list[object]:
-    """Raise ParameterError for runs that cannot be merged; return the seed states of all runs."""
+def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object]:
+    """Return the seed states of all runs; raise ParameterError if the runs cannot be merged."""
     if len(parts) < 2:
         raise ParameterError("results", f"{len(parts)} runs", "two runs or more")
     names = parts[0].names

@@ -15,18 +15,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise.nested.ascent import Top, climb_to_top, start_from_live_points
+from probewise.nested.ascent import GaussianAtPeak, climb_to_top, gaussian_of_last_live_points
 from probewise.nested.beyond import find_higher_peaks
 from probewise.nested.evaluate import Evaluator, Points, Samplable
 from probewise.nested.hills import (
-    Hill,
+    HillEstimate,
     calls_for_hill_evidence,
-    draw_from_hill,
+    draw_uniformly_near_hilltop,
     estimate_hill,
     log_evidence_of_unmet_hills,
 )
 from probewise.nested.importance import Posterior
-from probewise.nested.lost import are_beyond_dip, sds_of_next_dead_points, tops_from_early_points
+from probewise.nested.lost import sds_after_early_dead_points, separated_by_dip_mask, tops_from_early_points
 from probewise.nested.result import NestedResult
 
 DISAGREE = 2.5
@@ -46,20 +46,20 @@ class MissedHills:
     `n_calls`: evaluations that were used to look for them.
     """
 
-    lost: tuple[Hill, ...] = ()
-    above: tuple[Hill, ...] = ()
+    lost: tuple[HillEstimate, ...] = ()
+    above: tuple[HillEstimate, ...] = ()
     n_calls: int = 0
 
     def doubts(self, run: Posterior) -> tuple[str, ...]:
         """Return a doubt in words for each kind of hill that would change log Z and that `run` has not met."""
         lost, above = (log_evidence_of_unmet_hills(hills, run) for hills in (self.lost, self.above))
         mine, notes = f"this run's {run.log_z:.2f} ± {run.log_z_error:.2f}", list[str]()
-        if rise_in_errors(run, lost) > _MISSING:
+        if log_z_rise_in_errors(run, lost) > _MISSING:
             notes.append(
                 f"a part of the posterior that the live points have lost has a log Z of about {lost:.2f}, {mine}; "
                 "use more n_live or a greater max_cost"
             )
-        if rise_in_errors(run, above) > DISAGREE:
+        if log_z_rise_in_errors(run, above) > DISAGREE:
             notes.append(
                 f"a narrow peak that no live point met lies above the run's end: its log Z is about {above:.1f}, "
                 f"{mine}; use more n_live or a prior about the peak"
@@ -67,7 +67,7 @@ class MissedHills:
         return tuple(notes)
 
 
-def rise_in_errors(run: Posterior, log_z: float) -> float:
+def log_z_rise_in_errors(run: Posterior, log_z: float) -> float:
     """Return by how many of its errors a run's log Z would rise with a part of log evidence `log_z` that it missed."""
     return (float(np.logaddexp(run.log_z, log_z)) - run.log_z) / max(run.log_z_error, 1e-12)
 
@@ -78,7 +78,7 @@ def find_missed_hills(
     *,
     max_calls: float,
     rng: np.random.Generator,
-    lost: tuple[Hill, ...] | None = None,
+    lost: tuple[HillEstimate, ...] | None = None,
 ) -> MissedHills:
     """Look for parts of the posterior that a run has missed; nothing is found for a prior without an inverse.
 
@@ -105,10 +105,12 @@ def find_missed_hills(
     def calls_left(share: float = math.inf) -> int:
         return int(min(max_calls - evaluate.n_calls, share * run.n_calls))
 
-    top = climb_to_top(start_from_live_points(run, evaluate), evaluate, max_calls=calls_left(_ASCENT_SHARE), rng=rng)
+    top = climb_to_top(
+        gaussian_of_last_live_points(run, evaluate), evaluate, max_calls=calls_left(_ASCENT_SHARE), rng=rng
+    )
     if lost is None:
         tops = tops_from_early_points(run, evaluate, max_calls=calls_left(), rng=rng)
-        if top.height > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
+        if top.highest_log_likelihood > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
             tops.append(top)
         lost = _hills_not_met(tops, run, evaluate, max_calls=calls_left(_WEIGHING_SHARE), rng=rng)
     peaks = find_higher_peaks(run, top, evaluate, max_calls=calls_left(), rng=rng)
@@ -117,17 +119,17 @@ def find_missed_hills(
 
 
 def _hills_not_met(
-    tops: Iterable[Top], run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
-) -> tuple[Hill, ...]:
+    tops: Iterable[GaussianAtPeak], run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
+) -> tuple[HillEstimate, ...]:
     """Weigh the hills below these tops, each once and the highest first; return those that a run has not met."""
-    hills, most = list[Hill](), evaluate.n_calls + max_calls
-    rest = sorted(tops, key=lambda top: top.height)
-    scale = sds_of_next_dead_points(run, evaluate.space)
+    hills, most = list[HillEstimate](), evaluate.n_calls + max_calls
+    rest = sorted(tops, key=lambda top: top.highest_log_likelihood)
+    scale = sds_after_early_dead_points(run, evaluate.space)
     while rest and evaluate.n_calls + calls_for_hill_evidence(len(run.names)) < most:
-        settled = draw_from_hill(rest.pop(), evaluate, rng)
+        settled = draw_uniformly_near_hilltop(rest.pop(), evaluate, rng)
         if rest:
             points = Points.join(*(top.highest for top in rest))
-            apart = are_beyond_dip(points, settled, scale, 1, evaluate, rng)
+            apart = separated_by_dip_mask(points, settled, scale, 1, evaluate, rng)
             rest = [top for top, is_apart in zip(rest, apart, strict=True) if is_apart]
         hill = estimate_hill(settled, evaluate, rng)
         hills += [] if hill is None or hill.is_met_by(run) else [hill]

@@ -45,7 +45,7 @@ def _fit_components(
     off = x - centre
     whole = (off * weight[:, None]).T @ off / weight.sum()
     whole_root = _cholesky_factors(whole[None])[0]
-    share, mean, root = _kmeans_start(x, weight, centre, whole_root, n_components, rng)
+    share, mean, root = _initial_components_by_kmeans(x, weight, centre, whole_root, n_components, rng)
     # A component borrows one sample's worth of the whole's covariance, scaled to a component's volume.
     borrowed = whole * n_components ** (-2.0 / n_params)
     for _ in range(n_iterations):
@@ -86,7 +86,7 @@ def _cholesky_factors(covariance: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.cholesky(covariance + ridge[:, :, None] * np.eye(covariance.shape[1])))
 
 
-def _kmeans_start(
+def _initial_components_by_kmeans(
     x: FloatArray,
     weight: FloatArray,
     middle: FloatArray,
@@ -94,7 +94,10 @@ def _kmeans_start(
     n_components: int,
     rng: np.random.Generator,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Start from k-means++ (Arthur & Vassilvitskii 2007): shares (k,), means (k, n_params), roots of covariances."""
+    """Return components from k-means++ (Arthur & Vassilvitskii 2007) to start from.
+
+    Shares (k,), means (k, n_params) and roots of covariances (k, n_params, n_params).
+    """
     if n_components == 1:
         return np.ones(1), middle[None], whole_root[None]
     white = (x - middle) @ np.linalg.inv(whole_root).T

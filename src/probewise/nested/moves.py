@@ -36,7 +36,7 @@ class Tally:
 
 
 class Move(Protocol):
-    """Draw new points above a bound."""
+    """A way to draw new points above a likelihood bound."""
 
     def draw(
         self, start: Points, bound: Bound, live: FloatArray, evaluate: Evaluator, rng: np.random.Generator
@@ -69,7 +69,7 @@ class Move(Protocol):
 
 @dataclass(frozen=True)
 class PriorRejection:
-    """Draw from the whole prior until enough points lie above the bound: exact, but costly for a small volume.
+    """A move that draws from the whole prior until enough points lie above the bound: exact; costly in a small volume.
 
     `volume` estimates the share of the prior above the bound; it only sets the batch size.
     """
@@ -84,7 +84,7 @@ class PriorRejection:
         while found < wanted:
             batch = int(1.1 * (wanted - found) / self.volume) + 1
             tried = evaluate.draw_from_prior(batch, rng)
-            kept = tried.take(bound.admits(tried.log_likelihood, tried.label))
+            kept = tried.take(bound.mask_above(tried.log_likelihood, tried.label))
             parts.append(kept)
             found += len(kept)
             n_evaluated += batch
@@ -97,7 +97,7 @@ class PriorRejection:
 
 @dataclass(frozen=True)
 class SliceMove:
-    """Walk chains of slice-sampling steps (Neal 2003), all chains advancing together.
+    """A move by chains of slice-sampling steps (Neal 2003), all chains advancing together.
 
     A step draws a line through the chain's point, a bracket of fixed width placed at random about
     the point, and candidates within it; a rejected candidate becomes the bracket's new end. There is
@@ -174,7 +174,7 @@ class SliceMove:
         n_steps = n_lines + n_hops
         kind = self._kinds_of_steps(n_chains, n_steps, n_hops, rng)
         frames = _random_orthonormal_directions(kind == _FRAME, n_params, rng)
-        axis = _axes_in_random_order(n_chains, n_steps, n_params, rng)
+        axis = _axis_numbers_in_random_order(n_chains, n_steps, n_params, rng)
         now = start.copy()
         home = clusters.assign(now.u)
         metrics = _ClusterMetrics.from_clusters(clusters, start.u, home, live)
@@ -254,7 +254,7 @@ class SliceMove:
                 ok[:] = False
             if pending.size:
                 tried = evaluate.evaluate_mapped(candidate.take(pending, axis=0), theta, log_density, rng)
-                ok[pending] = bound.admits(tried.log_likelihood, tried.label)
+                ok[pending] = bound.mask_above(tried.log_likelihood, tried.label)
                 n_evaluated += pending.size
             n_needed, delivered = _count_candidates_used(ok.reshape(-1, n_ahead))
             won = delivered.nonzero()[0]
@@ -333,7 +333,7 @@ def _random_orthonormal_directions(needed: BoolArray, n_params: int, rng: np.ran
     return frames.reshape(n_chains, first.size * n_params, n_params)
 
 
-def _axes_in_random_order(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
+def _axis_numbers_in_random_order(n_chains: int, n_steps: int, n_params: int, rng: np.random.Generator) -> IntArray:
     """Draw axes, (n_chains, n_steps), in random order without repetition until all were used."""
     n_turns = -(-n_steps // n_params)
     return np.argsort(rng.random((n_chains, n_turns, n_params)), axis=2).reshape(n_chains, -1)[:, :n_steps]
@@ -365,7 +365,7 @@ class _ClusterMetrics:
         )
         # A start that is not a live point is in no cluster.
         own_home = np.where(same.any(axis=1), home, -1)
-        each = clusters.followed_by(clusters.leave_one_out(u, home))
+        each = clusters.followed_by(clusters.home_clusters_without_each_point(u, home))
         conditional = 1.0 / np.sqrt((each.inverse_root**2).sum(axis=1))
         return cls(
             each,

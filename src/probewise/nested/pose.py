@@ -146,14 +146,14 @@ def pose(
         If an argument has the wrong type, or names and prior do not match.
     """
     require_callable("log_likelihood", log_likelihood, "a function of a point, such as lambda x: -0.5 * (x**2).sum()")
-    named = _named_prior(prior, names, vectorized)
+    named = _as_named_prior(prior, names, vectorized)
     unknown = [name for name in periodic if name not in named.names]
     if isinstance(periodic, str) or unknown:
         raise ParameterError("periodic", periodic, f"names among {named.names}")
     return Posed(log_likelihood, named, vectorized, pass_dict, tuple(periodic))
 
 
-def _named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
+def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
     """Convert a prior in any of its forms to one with names."""
     if isinstance(names, str):
         raise ParameterError("names", names, "a list of names: names=['x', 'y']")

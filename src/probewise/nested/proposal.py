@@ -54,9 +54,9 @@ class Proposal:
     def log_density(self, x: FloatArray) -> FloatArray:
         """Natural log of the density, (n, n_params) -> (n,)."""
         blocks = np.array_split(x, max(1, -(-len(x) // _BLOCK)))
-        return np.concatenate([self._log_density(block) for block in blocks])
+        return np.concatenate([self._log_density_of_block(block) for block in blocks])
 
-    def _log_density(self, x: FloatArray) -> FloatArray:
+    def _log_density_of_block(self, x: FloatArray) -> FloatArray:
         n_params, nu = x.shape[1], DEGREES_OF_FREEDOM
         constant = gammaln((nu + n_params) / 2) - gammaln(nu / 2) - 0.5 * n_params * math.log(nu * math.pi)
         parts = []
@@ -73,7 +73,7 @@ def mixture_of_proposals(proposals: Sequence[Proposal], share: Sequence[float]) 
     """Combine proposals into a mixture with these shares, which need not be normalised."""
     total = math.fsum(share)
     return Proposal(
-        _joined_clusters([p.clusters for p in proposals]),
+        _concatenated_clusters([p.clusters for p in proposals]),
         tuple(centres for p in proposals for centres in p.centres),
         tuple(width for p in proposals for width in p.width),
         np.concatenate([s / total * p.share for p, s in zip(proposals, share, strict=True)]),
@@ -102,10 +102,10 @@ def find_disconnected_clusters(x: FloatArray) -> Clusters:
     if len(large) < 2:
         return find_clusters(x)
     home = Clusters.from_groups([x[piece == k] for k in large]).assign(x)
-    return _joined_clusters([find_clusters(x[home == k]) for k in range(len(large))])
+    return _concatenated_clusters([find_clusters(x[home == k]) for k in range(len(large))])
 
 
-def _joined_clusters(parts: Sequence[Clusters]) -> Clusters:
+def _concatenated_clusters(parts: Sequence[Clusters]) -> Clusters:
     return Clusters(
         np.concatenate([c.mean for c in parts]),
         np.concatenate([c.root for c in parts]),

@@ -52,10 +52,12 @@ class _StudentMixture:
 
     @cached_property
     def inverse_root(self) -> FloatArray:
+        """Inverses of the roots, (n_parts, n_params, n_params)."""
         return np.asarray(np.linalg.inv(self.root))
 
     @cached_property
     def log_volume(self) -> FloatArray:
+        """Log absolute determinants of the roots, (n_parts,)."""
         return np.asarray(np.linalg.slogdet(self.root)[1])
 
     def to_axes(self, x: FloatArray, part: int) -> FloatArray:
@@ -78,7 +80,7 @@ class _StudentMixture:
 
     @staticmethod
     def from_groups(groups: Sequence[FloatArray], widening: float) -> _StudentMixture:
-        """Compute mean and principal axes of groups of points, each (n, n_params)."""
+        """Make a part of each group of points, (n, n_params): its share, mean, and principal axes times `widening`."""
         n = np.array([len(group) for group in groups])
         root = np.stack([principal_root(group, widening) for group in groups])
         return _StudentMixture(n / n.sum(), np.stack([group.mean(axis=0) for group in groups]), root)
@@ -112,6 +114,7 @@ class _PriorNearPosterior:
         return self
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw `n` points of this prior in the coordinates of chains, (n, n_params)."""
         part = rng.choice(len(self.parts), size=n, p=self.parts.share)
         e = rng.standard_t(_DEGREES_OF_FREEDOM, (n, len(self.names)))
         return self.whole.to_axes(self.parts.from_axes(e, part), 0)

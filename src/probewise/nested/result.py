@@ -20,7 +20,7 @@ from probewise._kinds import require_path
 from probewise._version import __version__
 from probewise.errors import FileError
 from probewise.nested import conversions
-from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, require_length
+from probewise.nested.dead_points import COUNTS, PER_POINT, DeadPoints, checked_array_of_length
 from probewise.recordings.atomic import write_bytes_atomically
 
 _FORMAT = "nested-result/4"
@@ -65,9 +65,11 @@ class Agreement:
         return len(self.log_z)
 
     @property
-    def scatter(self) -> float:
+    def log_z_sd(self) -> float:
         """Standard deviation of ln Z between the runs."""
         return float(np.std(self.log_z, ddof=1))
+
+    scatter = log_z_sd  # its earlier name
 
 
 @dataclass(frozen=True)
@@ -131,7 +133,7 @@ class NestedResult(DeadPoints):
         Natural log of the evidence, and its standard error: from simulated shrinkages, times the root of `memory`.
     memory
         Lineage variance: variance of log Z relative to independent points, 1 or more; see
-        `probewise.nested.chain_memory`.
+        `probewise.nested.relative_lineage_variance`.
     information
         Kullback-Leibler divergence of posterior from prior, nats.
     n_eff
@@ -180,7 +182,7 @@ class NestedResult(DeadPoints):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in _PER_INSERTION:
-            values = require_length(
+            values = checked_array_of_length(
                 name, frozen_int(getattr(self, name)), np.size(self.insertion_rank), "inserted point"
             )
             object.__setattr__(self, name, values)

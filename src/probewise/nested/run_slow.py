@@ -250,7 +250,7 @@ def _draw_at_rising_powers(
         n_eff = n_effective(log_weight)
         n_last += power >= 1.0
         if n_last and (n_eff >= _ENOUGH * wanted or n_last > _MOST_LAST):
-            kept = kept or [_fit_defensive_mixture(draws.x, log_weight, rng)]
+            kept = kept or [_fit_mixture_with_wider_component(draws.x, log_weight, rng)]
             defensive = mixture_of_proposals(kept, [1.0] * len(kept))
             return _WeightedDraws(draws.x, log_weight - float(logsumexp(log_weight)), min(least, n_eff), defensive)
         if evaluate.n_calls + n_draws > max_calls:
@@ -260,7 +260,7 @@ def _draw_at_rising_powers(
             draws.evaluate_and_add(space.draw(n_draws, rng=rng), None)
             continue
         least = min(least, n_eff)
-        proposal = _fit_defensive_mixture(draws.x, log_weight, rng)
+        proposal = _fit_mixture_with_wider_component(draws.x, log_weight, rng)
         if _FROM_POWER <= power < 1.0:
             kept.append(proposal)
         draws.evaluate_and_add(proposal.draw(n_draws, rng=rng), proposal)
@@ -286,12 +286,12 @@ class _DrawsOfAllSources:
         possible = np.isfinite(log_density)
         if possible.any():
             log_likelihood[possible] = self._evaluate.log_likelihood(theta[possible])
-        added = [_log_source_density(one, x, log_density) for one in self._sources]
+        added = [_log_density_of_source(one, x, log_density) for one in self._sources]
         self.x = np.concatenate([self.x, x])
         self._log_density = np.concatenate([self._log_density, log_density])
         self._log_likelihood = np.concatenate([self._log_likelihood, log_likelihood])
         known = np.concatenate([self._log_q, np.array(added).reshape(len(added), len(x)).T])
-        self._log_q = np.column_stack([known, _log_source_density(source, self.x, self._log_density)])
+        self._log_q = np.column_stack([known, _log_density_of_source(source, self.x, self._log_density)])
         self._sources.append(source)
         self._size.append(len(x))
 
@@ -304,23 +304,24 @@ class _DrawsOfAllSources:
         alive = np.flatnonzero(np.isfinite(self._log_likelihood))
         base = self._log_density[alive] - logsumexp(self._log_q[alive] + log_share, axis=1)
 
-        def at(log_power: float) -> FloatArray:
+        def log_weights_at(log_power: float) -> FloatArray:
+            """Return the log weights at a power of the likelihood, (n,); -inf where it is zero."""
             out = np.full(len(self.x), -np.inf)
             out[alive] = base + math.exp(log_power) * self._log_likelihood[alive]
             return out
 
-        if n_effective(at(0.0)) >= wanted:
-            return 1.0, at(0.0)
-        low, _ = power_bracket(at, _LEAST_LOG_POWER, 0.0, wanted=wanted, n_steps=_BISECTIONS)
-        return math.exp(low), at(low)
+        if n_effective(log_weights_at(0.0)) >= wanted:
+            return 1.0, log_weights_at(0.0)
+        low, _ = power_bracket(log_weights_at, _LEAST_LOG_POWER, 0.0, wanted=wanted, n_steps=_BISECTIONS)
+        return math.exp(low), log_weights_at(low)
 
 
-def _log_source_density(source: Proposal | None, x: FloatArray, log_density: FloatArray) -> FloatArray:
+def _log_density_of_source(source: Proposal | None, x: FloatArray, log_density: FloatArray) -> FloatArray:
     """Log density of a source at draws `x`, (n,); for None that of the prior, `log_density`."""
     return log_density if source is None else source.log_density(x)
 
 
-def _fit_defensive_mixture(x: FloatArray, log_weight: FloatArray, rng: np.random.Generator) -> Proposal:
+def _fit_mixture_with_wider_component(x: FloatArray, log_weight: FloatArray, rng: np.random.Generator) -> Proposal:
     """Fit a mixture to weighted draws, and one component wider than all of them."""
     # Weights are cut at their mean times sqrt(n) (Ionides 2008), lest one draw take the fit.
     alive = np.flatnonzero(np.isfinite(log_weight))

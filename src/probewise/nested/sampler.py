@@ -27,7 +27,7 @@ from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.checkpoint import BirthRecords, CheckpointFile, DeadOfRound, LivePoints, RunState, settings_of_run
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
-from probewise.nested.genealogy import chain_memory
+from probewise.nested.genealogy import relative_lineage_variance
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.result import (
     NestedResult,
@@ -50,7 +50,7 @@ _MIXING = 10
 
 
 def least_live(n_params: int) -> int:
-    """Least number of live points for a problem."""
+    """Return the least number of live points for a problem: two per parameter, 10 at least."""
     return max(LIVE_PER_PARAM * n_params, 10)
 
 
@@ -60,16 +60,18 @@ def move_at_volume(move: Move, log_volume: float) -> Move:
     return move if volume <= _PRIOR_VOLUME else PriorRejection(volume)
 
 
-def step(
+def replace_worst_live_points(
     live: LivePoints, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
 ) -> tuple[LivePoints, DeadOfRound, Tally]:
-    """Replace the `n_replaced` worst points by new ones above the best of them.
+    """Replace the `n_replaced` worst live points by new ones above the best of them.
+
+    Returns the new live points, the dead ones, and the statistics of the move.
 
     The points die one after another, so the volume shrinks by Beta(n, 1), Beta(n - 1, 1), ..., which is
     counted exactly; their successors are drawn together.
     """
     n_live = len(live.points)
-    order = live.points.order()
+    order = live.points.rows_by_rising_likelihood()
     doomed, spared = order[:n_replaced], order[n_replaced:]
     last = doomed[-1]
     bound = Bound(float(live.points.log_likelihood[last]), float(live.points.label[last]))
@@ -79,7 +81,7 @@ def step(
     new, tally = move.draw(start, bound, survivors.u, evaluate, rng)
     points = Points.join(survivors, new)
     place = np.empty(n_live, dtype=np.int64)
-    place[points.order()] = np.arange(n_live)
+    place[points.rows_by_rising_likelihood()] = np.arange(n_live)
     worse = place[None, :] < place[len(spared) :, None]
     n_ranked = len(spared) + np.arange(n_replaced)
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
@@ -94,6 +96,9 @@ def step(
     )
     log_volume = float(log_volumes(n_at_death, live.log_volume)[-1])
     return LivePoints(points, BirthRecords.join(known, fresh), log_volume), dead, tally
+
+
+step = replace_worst_live_points  # its earlier name
 
 
 def run_once(
@@ -130,7 +135,7 @@ def run_once(
         n_workers = require_whole("n_workers", n_workers)
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
-    n_live, n_replaced = _require_counts(n_live, n_replaced, max_calls, n_params)
+    n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)
     rule = RemainingEvidence() if stop is None else stop
     seed_state = json.dumps(generator_state_as_json(rng.bit_generator.state))
     if n_params == 0:
@@ -143,7 +148,7 @@ def run_once(
             Path(checkpoint).parent.mkdir(parents=True, exist_ok=True)
         keeper = CheckpointFile(Path(checkpoint), checkpoint_every_s, settings)
     resumed = None if keeper is None else keeper.resume(evaluate, moving, rng)
-    now = _first_live_points(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
+    now = _initial_run_state(evaluate, moving, n_live, max_calls, rng) if resumed is None else resumed
     if keeper is not None and resumed is None:
         keeper.save_if_due(now)
     under_way = _RunUnderWay(evaluate, rng, n_live, n_replaced, rule, seed_state, keeper, now)
@@ -212,8 +217,10 @@ class _RunUnderWay:
         return self.finish(self.now.ended)
 
 
-def _require_counts(n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int) -> tuple[int, int]:
-    """Return the numbers of live points and of those replaced a round, or raise ParameterError."""
+def _checked_n_live_and_n_replaced(
+    n_live: int, n_replaced: int | None, max_calls: int | None, n_params: int
+) -> tuple[int, int]:
+    """Return the number of live points and that of those replaced per round, or raise ParameterError."""
     least = least_live(n_params)
     n_live = require_whole("n_live", n_live, least=None)
     if n_live < least:
@@ -236,7 +243,7 @@ def _require_options(
     executor: object,
     return_interrupted: object,
 ) -> None:
-    """Check the types of the options before anything is evaluated."""
+    """Raise ParameterError for an option of the wrong type, before anything is evaluated."""
     if stop is not None:
         require_callable("stop", stop, "a rule such as RemainingEvidence(dlogz=0.1), of probewise.nested, or None")
     if move is not None:
@@ -263,7 +270,7 @@ def _do_round(
     live, moving = now.live, now.moving
     move = move_at_volume(moving, live.log_volume)
     chains = move is moving
-    fresh, gone, tally = step(live, move, evaluate, n_replaced=n_replaced, rng=rng)
+    fresh, gone, tally = replace_worst_live_points(live, move, evaluate, n_replaced=n_replaced, rng=rng)
     edges = live.log_volume + np.concatenate([[0.0], -np.cumsum(1.0 / gone.n_at_death)])
     # Relative to the best likelihood: volumes would vanish in the rounding of a log likelihood such as -1e100.
     best = float(fresh.points.log_likelihood.max())
@@ -297,10 +304,10 @@ def _do_round(
     return after, state
 
 
-def _first_live_points(
+def _initial_run_state(
     evaluate: Evaluator, move: Move, n_live: int, max_calls: int | None, rng: np.random.Generator
 ) -> RunState:
-    """Draw the first live points from the part of the prior with nonzero likelihood.
+    """Draw the first live points from the part of the prior with nonzero likelihood; return the run's first state.
 
     Impossible hypotheses (zero likelihood) are counted and discarded; the initial volume is the share
     m / n of possible ones. Where these are rare, chains supply the missing live points, and go on until all have
@@ -354,7 +361,7 @@ def _final_result(
         notes = (*notes, few)
     if now.n_stuck > _STUCK_SHARE * n_dead:
         notes = (*notes, f"{now.n_stuck} of {n_dead} chains could not leave their start")
-    order = live.points.order()
+    order = live.points.rows_by_rising_likelihood()
     parts = [*(d.points for d in dead), live.points.take(order)]
     theta = np.concatenate([part.theta for part in parts])
     log_likelihood, label = (np.concatenate([getattr(p, name) for p in parts]) for name in ("log_likelihood", "label"))
@@ -365,7 +372,7 @@ def _final_result(
     births = BirthRecords.join(*(d.births for d in dead), live.births.take(order))
     parent = np.where(births.parent >= 0, np.argsort(births.ident)[births.parent], -1)
     born = birth_rows(log_likelihood, label, births.log_birth, births.birth_label)
-    remembered = chain_memory(parent, born, n_at_death, evidence.log_weight)
+    remembered = relative_lineage_variance(parent, born, n_at_death, evidence.log_weight)
     empty = np.empty(0, dtype=np.int64)
     rank = np.concatenate([empty, *(d.rank for d in dead)])
     n_ranked = np.concatenate([empty, *(d.n_ranked for d in dead)])
@@ -393,7 +400,7 @@ def _final_result(
         log_start=now.log_start,
         log_start_error=now.log_start_error,
         log_z=evidence.log_z,
-        log_z_error=evidence.error(remembered),
+        log_z_error=evidence.log_z_error(remembered),
         memory=remembered,
         information=evidence.information,
         n_eff=evidence.n_eff,

@@ -47,8 +47,8 @@ class Space(Protocol):
         ...
 
 
-def is_within(space: Space, u: FloatArray) -> BoolArray:
-    """Return whether coordinates (n, n_params) lie within the range of the space, (n,)."""
+def within_bounds_mask(space: Space, u: FloatArray) -> BoolArray:
+    """Return a mask of the coordinates, (n, n_params) -> (n,), that lie within the bounds of the space."""
     return np.asarray(((u > space.low) & (u < space.high)).all(axis=1))
 
 
@@ -130,6 +130,8 @@ class _Unbounded:
 
 @runtime_checkable
 class _HasCoordinates(Protocol):
+    """A prior with sampling coordinates of its own."""
+
     @property
     def coordinates(self) -> Coordinates: ...
 

@@ -39,7 +39,7 @@ StopRule: TypeAlias = Callable[[RoundSummary], "str | None"]
 
 @dataclass(frozen=True)
 class RemainingEvidence:
-    """Stop when the live points can raise log Z by less than `dlogz` (their contribution is added at the end)."""
+    """Stopping rule: the live points can raise log Z by less than `dlogz`; their contribution is added at the end."""
 
     dlogz: float = 0.05
 
@@ -59,7 +59,7 @@ _ON_PLATEAU = RemainingEvidence(0.05)
 
 @dataclass(frozen=True)
 class EvidenceChange:
-    """Stop when consecutive values of log Z differ by less than `tolerance`: the paper's rule, 1e-8.
+    """Stopping rule of the paper: consecutive values of log Z differ by less than `tolerance`, 1e-8.
 
     On a plateau there is nothing to climb to: once all live points have the same likelihood and can raise log Z by less
     than 0.05, the rule ends the run too. Further deaths would leave copies of a few points.

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from probewise import __version__
 from probewise.calibration import Calibration, calibrate, default_prior
-from probewise.calibration.coverage import Truth, draw_truth, interval_holds_truth, simulate_truth
+from probewise.calibration.coverage import TrueSensor, draw_truth, interval_holds_truth_by_quantity, simulate_truth
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import search_order
 from probewise.errors import DoubtfulResultWarning
@@ -39,13 +39,13 @@ def timed(
     *,
     quick: bool,
     orders: tuple[int, ...] = (1, 2, 3, 4),
-    truth: Truth | None = None,
+    truth: TrueSensor | None = None,
 ) -> dict[str, object]:
     """Calibrate; keep evidences, errors, evaluations, cpu seconds and, by the truth, which intervals hold it."""
     began = time.process_time()
     found: Calibration = calibrate(recording, orders=orders, quick=quick, rng=rng)
     cpu_s = round(time.process_time() - began, 1)
-    held = {} if truth is None else {"held": interval_holds_truth(truth, found.fits[0].sensor.samples)}
+    held = {} if truth is None else {"held": interval_holds_truth_by_quantity(truth, found.fits[0].sensor.samples)}
     return {
         "cpu_s": cpu_s,
         "log_z": [round(o.log_z, 3) for o in found.orders],

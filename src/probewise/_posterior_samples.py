@@ -49,7 +49,7 @@ def interval_table(rows: Sequence[tuple[str, float, tuple[float, float]]]) -> li
     ]
 
 
-def require_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
+def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str, ...]) -> tuple[FloatArray, FloatArray]:
     """Return read-only copies of samples (n_samples, n_params) and noise sds (n_samples,).
 
     Raises

@@ -273,22 +273,22 @@ class Joint:
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each part's coordinates by that part, both (n_samples, n_params)."""
         u = checked_columns(u, self.names)
-        return np.concatenate([p.from_unit_cube(c) for p, c in self._columns_of_parts(u)], axis=-1)
+        return np.concatenate([p.from_unit_cube(c) for p, c in self._parts_with_columns(u)], axis=-1)
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each part's parameters by that part, both (n_samples, n_params)."""
         theta = checked_columns(theta, self.names)
-        return np.concatenate([p.to_unit_cube(c) for p, c in self._columns_of_parts(theta)], axis=-1)
+        return np.concatenate([p.to_unit_cube(c) for p, c in self._parts_with_columns(theta)], axis=-1)
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""
         theta = checked_columns(theta, self.names)
         total = np.zeros(len(theta))
-        for part, columns in self._columns_of_parts(theta):
+        for part, columns in self._parts_with_columns(theta):
             total = total + part.log_prob(columns)
         return total
 
-    def _columns_of_parts(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
+    def _parts_with_columns(self, columns: FloatArray) -> list[tuple[Prior, FloatArray]]:
         """Return each part with its columns, (n_samples, n_params of the part)."""
         ends = np.cumsum([len(p.names) for p in self.parts])
         return [(p, columns[:, end - len(p.names) : end]) for p, end in zip(self.parts, ends, strict=True)]

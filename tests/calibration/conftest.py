@@ -7,7 +7,7 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, FittedSensor, calibrate, choose_pixel_mm, default_prior, mean_field
-from probewise.calibration.compensation import Compensation
+from probewise.calibration.compensation import CompensatedShapeProposal
 from probewise.calibration.order_problems import OrderProblems
 from probewise.recordings import Instrumentation, Recording, paper_plan
 from probewise.scene import KnownScene
@@ -71,8 +71,8 @@ def calibration(recording: Recording) -> Calibration:
 
 
 @pytest.fixture(scope="session")
-def make_compensation(recording: Recording) -> Callable[..., Compensation]:
-    def make(n: int, rng: np.random.Generator, *, n_pool: int = 4000, spread: float = 0.02) -> Compensation:
+def make_compensation(recording: Recording) -> Callable[..., CompensatedShapeProposal]:
+    def make(n: int, rng: np.random.Generator, *, n_pool: int = 4000, spread: float = 0.02) -> CompensatedShapeProposal:
         """Learn the answers of N - 1 Gaussians that are known to a share of themselves, more than where they are used.
 
         The less is left to know, the less they shift.
@@ -83,7 +83,7 @@ def make_compensation(recording: Recording) -> Callable[..., Compensation]:
         theta *= 1.0 + spread * rng.standard_normal(theta.shape)
         rest = below.coordinates.leave(below.coordinates.enter(theta))[0]
         problems = OrderProblems(recording, default_prior)
-        return Compensation.from_samples(
+        return CompensatedShapeProposal.from_samples(
             problems.problem(n - 1), below.coordinates, problems.problem(1), rest, rng=rng, n_pool=n_pool
         )
 

@@ -86,7 +86,7 @@ def test_the_order_that_missed_a_peak_and_those_above_are_searched(
     assert isinstance(made, SMCResult)
     low = OrderPosterior(replace(made, log_z_of_clouds=made.log_z_of_clouds - 90.0), None)
     monkeypatch.setattr(quick_fit, "missed_part_in_words", lambda *_, **__: "it lies elsewhere")
-    found = quick_fit._with_chosen_order_checked(
+    found = quick_fit._check_chosen_order_or_search_in_full(
         OrderProblems(recording, default_prior),
         {1: low, 2: vouched, 3: low},
         np.random.default_rng(0),

@@ -10,7 +10,13 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
-from probewise.calibration.coverage import Coverage, coverage, draw_truth, log_z_lead_of_one_gaussian, simulate_truth
+from probewise.calibration.coverage import (
+    Coverage,
+    coverage,
+    draw_truth,
+    simulate_log_z_lead_of_one_gaussian,
+    simulate_truth,
+)
 from probewise.calibration.deduplicated_model import DeduplicatedModel
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
@@ -159,7 +165,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
 @pytest.mark.slow
 def test_evidence_prefers_one_gaussian_where_there_is_one() -> None:
     rng = np.random.default_rng(20)
-    assert log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
+    assert simulate_log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=100)[0] > 0
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.calibration import default_prior
-from probewise.calibration.light_integral import LightIntegral, bridge_evidences
+from probewise.calibration.light_integral import LightIntegral, bridge_log_z_ratio
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.recordings import Recording
@@ -60,11 +60,11 @@ def test_a_bridge_finds_the_ratio_of_two_normal_densities() -> None:
         return np.asarray(2.5 - 0.5 * (x - 1.0) ** 2 + 0.5 * x**2)
 
     below, above = rng.standard_normal(20_000), 1.0 + rng.standard_normal((20_000, 1))
-    found, share = bridge_evidences(log_ratio(below), log_ratio(above))
+    found, share = bridge_log_z_ratio(log_ratio(below), log_ratio(above))
     assert found == pytest.approx(2.5, abs=0.04)
     assert share > 0.5
 
 
 def test_a_bridge_without_ground_says_so() -> None:
-    _, share = bridge_evidences(np.array([*np.full(99, -50.0), 0.0]), np.full((100, 1), 40.0))
+    _, share = bridge_log_z_ratio(np.array([*np.full(99, -50.0), 0.0]), np.full((100, 1), 40.0))
     assert share < 0.05

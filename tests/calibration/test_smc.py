@@ -10,12 +10,12 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SMCResult, TemperatureSummary, calibrate, default_prior
-from probewise.calibration.compensation import Compensation
+from probewise.calibration.compensation import CompensatedShapeProposal
+from probewise.calibration.faint_gaussian_reference import FaintGaussianReference
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import search_order
 from probewise.calibration.posterior_parts import FootprintPlaceAndSize
 from probewise.calibration.quick_fit import fit_orders_quickly
-from probewise.calibration.reference import FaintGaussianReference
 from probewise.calibration.smc import run_smc
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError
@@ -26,7 +26,7 @@ from probewise.recordings import Recording
 
 
 @pytest.fixture(scope="module")
-def compensation(make_compensation: Callable[..., Compensation]) -> Compensation:
+def compensation(make_compensation: Callable[..., CompensatedShapeProposal]) -> CompensatedShapeProposal:
     return make_compensation(2, np.random.default_rng(40), spread=1e-3)
 
 
@@ -37,7 +37,9 @@ class _Levels:
         return np.asarray(-0.5 * (((theta[:, -2] - 11.0) / 2.0) ** 2 + ((theta[:, -1] - 58.0) / 2.0) ** 2))
 
 
-def _climbed(recording: Recording, compensation: Compensation, seed: int) -> tuple[SMCResult, list[TemperatureSummary]]:
+def _climbed(
+    recording: Recording, compensation: CompensatedShapeProposal, seed: int
+) -> tuple[SMCResult, list[TemperatureSummary]]:
     rng = np.random.default_rng(seed)
     below, prior = default_prior(recording, 1), default_prior(recording, 2)
     rest = below.from_unit_cube(rng.random((400, 8)))
@@ -51,14 +53,16 @@ def _climbed(recording: Recording, compensation: Compensation, seed: int) -> tup
         log_z_below=np.full(8, -3.0),
         error_below=0.0,
         rng=rng,
-        space=FootprintPlaceAndSize((0.0, 0.0), 50.0).coordinates(prior, 1),
+        space=FootprintPlaceAndSize((0.0, 0.0), 50.0).whole_footprint_coordinates(prior, 1),
         n_steps=5,
         progress=rungs.append,
     )
     return found, rungs
 
 
-def test_a_climb_finds_no_gain_where_there_is_none(recording: Recording, compensation: Compensation) -> None:
+def test_a_climb_finds_no_gain_where_there_is_none(
+    recording: Recording, compensation: CompensatedShapeProposal
+) -> None:
     """The likelihood does not ask for the Gaussians: the evidence is that of the levels, times a part of the prior.
 
     The lighter of two uniform masses is below a tenth of the other. Four errors.
@@ -74,7 +78,7 @@ def test_a_climb_finds_no_gain_where_there_is_none(recording: Recording, compens
     assert found.samples(500, rng=np.random.default_rng(1)).shape == (500, 14)
 
 
-def test_moves_leave_the_posterior_as_it_is(recording: Recording, compensation: Compensation) -> None:
+def test_moves_leave_the_posterior_as_it_is(recording: Recording, compensation: CompensatedShapeProposal) -> None:
     """The levels stay normal, the Gaussians as in the prior: means within five errors of independent clouds."""
     found, _ = _climbed(recording, compensation, 42)
     prior = default_prior(recording, 2)
@@ -85,7 +89,9 @@ def test_moves_leave_the_posterior_as_it_is(recording: Recording, compensation: 
     assert (np.abs(clouds.mean(axis=0)) < 5 * clouds.std(axis=0, ddof=1) / np.sqrt(8)).all()
 
 
-def test_a_climb_that_clouds_disagree_on_is_doubtful(recording: Recording, compensation: Compensation) -> None:
+def test_a_climb_that_clouds_disagree_on_is_doubtful(
+    recording: Recording, compensation: CompensatedShapeProposal
+) -> None:
     found, _ = _climbed(recording, compensation, 43)
     apart = replace(found, log_z_of_clouds=np.array([5.0, *np.zeros(7)]))
     assert any("clouds are worth" in note for note in apart.warnings)

@@ -9,7 +9,7 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SSFPrior
-from probewise.calibration.shared_light import SharedLightDensity
+from probewise.calibration.all_bright_density import AllBrightDensity
 from probewise.calibration.whole_coordinates import FAINT, WholeFootprintCoordinates, count_bright
 from probewise.priors import LogUniform, Uniform
 
@@ -97,7 +97,7 @@ def test_a_sharing_density_keeps_the_whole_of_the_gaussians_below() -> None:
     asked, one = space(2, n_bright=2), space(1)
     rng = np.random.default_rng(5)
     below = one.enter(np.array([1.0, 0.5, 1.0, 0.05, 0.06, 0.01, 10.0, 60.0]) * (1 + 0.01 * rng.random((4000, 8))))
-    density = SharedLightDensity.from_samples_below(asked, below)
+    density = AllBrightDensity.from_samples_below(asked, below)
     theta = density.draw(np.empty((4000, 0)), rng=rng)
     possible = theta[np.isfinite(theta).all(axis=1)]
     assert len(possible) > 400

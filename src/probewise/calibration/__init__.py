@@ -6,7 +6,7 @@ and "studentT", the table of log evidences, and the weighted mean of sampled SSF
 
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments
 from probewise.calibration.fit import Calibration, OrderFit, calibrate
-from probewise.calibration.noise import ScanNoise, draw_sd, noise_by_scan, pooled_sd
+from probewise.calibration.noise import ScanNoise, draw_pooled_sd, draw_sd, noise_by_scan, pooled_sd
 from probewise.calibration.order_problems import problem_for
 from probewise.calibration.order_search import Found, OrderPosterior
 from probewise.calibration.prediction import predict
@@ -43,6 +43,7 @@ __all__ = [
     "calibrate",
     "choose_pixel_mm",
     "default_prior",
+    "draw_pooled_sd",
     "draw_sd",
     "mean_field",
     "mixture_moments",

@@ -17,7 +17,7 @@ from scipy.special import log_ndtr, logsumexp, ndtri_exp
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.calibration.coordinates import MomentCoordinates
-from probewise.calibration.gaussian_responses import SingleGaussianResponses, light_by_gaussian
+from probewise.calibration.gaussian_responses import SingleGaussianResponses, total_light_by_gaussian
 from probewise.calibration.whole_coordinates import WholeFootprintCoordinates
 from probewise.effects.density import log_mass_between
 from probewise.inference import SensorProblem, sd_floor
@@ -50,7 +50,7 @@ class CompensatingShift:
 
     @classmethod
     def concatenate(cls, parts: Sequence[CompensatingShift]) -> CompensatingShift:
-        """Concatenate shifts."""
+        """Concatenate the rows of several."""
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("shift", "mean", "sd")))
 
     def take(self, rows: IntArray) -> CompensatingShift:
@@ -66,26 +66,32 @@ class CompensatingShift:
     def log_bayes_factor(self, most: float) -> FloatArray:
         """Log of the mean likelihood over shares from 0 to `most`, over that without the added Gaussian, (n,)."""
         true_sd = self.sd / _WIDENED
-        low, high, _ = CompensatingShift(self.shift, self.mean, true_sd)._bounds_in_sds(np.full(len(self.mean), most))
+        low, high, _ = CompensatingShift(self.shift, self.mean, true_sd)._light_share_bounds_in_sds(
+            np.full(len(self.mean), most)
+        )
         log_mass = log_mass_between(low, high)
         return np.asarray(0.5 * (self.mean / true_sd) ** 2 + log_mass + np.log(true_sd / most) + _LOG_ROOT_2PI)
 
-    def draw_share(self, most: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Draw shares from 0 to `most`, both (n,)."""
-        low, high, mirrored = self._bounds_in_sds(most)
+    def draw_light_share(self, most: FloatArray, *, rng: np.random.Generator) -> FloatArray:
+        """Draw shares of the light from 0 to `most`, both (n,), from their truncated first-order posterior."""
+        low, high, mirrored = self._light_share_bounds_in_sds(most)
         at_low, at_high = log_ndtr(low), log_ndtr(high)
         # Both bounds are in the lower tail or about 0, so that logarithms keep their digits.
         z = ndtri_exp(at_high + np.log(rng.random(len(most)) * -np.expm1(at_low - at_high) + np.exp(at_low - at_high)))
         return np.asarray((self.mean + self.sd * np.where(mirrored, -z, z)).clip(1e-12 * most, most))
 
-    def log_share_density(self, share: FloatArray, most: FloatArray) -> FloatArray:
-        """Natural log of the density of `draw_share`, (n,)."""
-        low, high, _ = self._bounds_in_sds(most)
+    def log_light_share_density(self, share: FloatArray, most: FloatArray) -> FloatArray:
+        """Natural log of the density from which `draw_light_share` draws, at `share`, all (n,)."""
+        low, high, _ = self._light_share_bounds_in_sds(most)
         log_mass = log_mass_between(low, high)
         z = (share - self.mean) / self.sd
         return np.asarray(-0.5 * z * z - _LOG_ROOT_2PI - np.log(self.sd) - log_mass)
 
-    def _bounds_in_sds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    def _light_share_bounds_in_sds(self, most: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Bounds of the share, 0 and `most`, in sds from its mean, (n,) each; and the rows that are mirrored, (n,).
+
+        Where both bounds lie above the mean, they change places and signs.
+        """
         low, high = -self.mean / self.sd, (most - self.mean) / self.sd
         mirrored = low > 0
         return np.where(mirrored, -high, low), np.where(mirrored, -low, high), mirrored
@@ -158,7 +164,7 @@ class _LinearisedPosterior:
     def _compensating_shift_of_block(self, gaussian: FloatArray) -> CompensatingShift:
         if not len(gaussian):
             return CompensatingShift(np.empty((0, len(self.inverse))), np.empty(0), np.empty(0))
-        change = SingleGaussianResponses(self.alone).responses_to(gaussian) * self.bright
+        change = SingleGaussianResponses(self.alone).responses_to_gaussians(gaussian) * self.bright
         change -= self.dark
         told = np.einsum("ni,ni->n", change, change)
         both = change @ self.response
@@ -168,8 +174,8 @@ class _LinearisedPosterior:
 
 
 @dataclass(frozen=True, eq=False)
-class Compensation:
-    """Shapes (places and widths) of one Gaussian more, and how the other N - 1 Gaussians shift to compensate for it.
+class CompensatedShapeProposal:
+    """A proposal of one Gaussian more: its shape (place and widths), and how the other N - 1 shift to compensate.
 
     Shapes are drawn from a large pool of draws from the prior, by their first-order evidence; some by the prior alone.
 
@@ -206,11 +212,25 @@ class Compensation:
         *,
         rng: np.random.Generator,
         n_pool: int = _MOST_DRAWN,
-    ) -> Compensation:
-        """Linearise a problem of N - 1 Gaussians about its samples, (n, 6 N - 4); pool at most `n_pool` shapes."""
+    ) -> CompensatedShapeProposal:
+        """Linearise a problem of N - 1 Gaussians about its posterior samples, and draw at most `n_pool` shapes.
+
+        Parameters
+        ----------
+        below, alone
+            Problems of N - 1 Gaussians and of one, over one recording.
+        coordinates
+            Coordinates of N - 1 Gaussians.
+        theta
+            Posterior samples of `below`, (n, 6 N - 4).
+        rng
+            Source of randomness.
+        n_pool
+            Largest number of shapes; fewer are drawn if 4,000 of them are effective.
+        """
         linear = _LinearisedPosterior.from_samples(below, coordinates, alone, theta)
         prior = coordinates.prior
-        mass = light_by_gaussian(theta)
+        mass = total_light_by_gaussian(theta)
         most = float(np.mean(mass.min(axis=1) / (mass.sum(axis=1) + mass.min(axis=1))))
         pools: list[FloatArray] = []
         answers: list[CompensatingShift] = []

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.priors import Prior
 
 
-class MixtureDensity(Prior, Protocol):
+class MixturePrior(Prior, Protocol):
     """A prior of a mixture's parameters with what the coordinates need beside its density."""
 
     @property
@@ -43,7 +43,7 @@ class MomentCoordinates:
     readings do not depend on the labels, so N! equal modes become one and the evidence is unchanged.
     """
 
-    prior: MixtureDensity
+    prior: MixturePrior
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters to coordinates, both (n_samples, 6 N + 2)."""
@@ -71,7 +71,7 @@ class MomentCoordinates:
         """Map coordinates to parameters, (n_samples, 6 N + 2); also return the prior's log density, (n_samples,)."""
         n = self.prior.n_gaussians
         # One contiguous row per kind of coordinate, for speed.
-        g = np.ascontiguousarray(columns_by_kind(x))
+        g = np.ascontiguousarray(view_by_kind_and_gaussian(x))
         # A sampler may try extreme values, which must not overflow.
         log_variance = g[3:5].clip(-100.0, 100.0)
         log_first, log_ratio = g[0, 0].clip(-100.0, 50.0), g[0, 1:].clip(-100.0, 0.0)
@@ -92,7 +92,7 @@ class MomentCoordinates:
         out[1:3] = g[1:3]
         out[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
         theta = x.copy()
-        columns_by_kind(theta)[...] = out
+        view_by_kind_and_gaussian(theta)[...] = out
         # d(A, B, C) / d(log variances, arctanh r), d a / d log a, and the first centre from that of the whole.
         jacobian = log_a - 1.5 * both - 2.0 * log_rest
         log_density = self.prior.log_prob_by_kind(out, theta[:, -2], theta[:, -1])
@@ -104,7 +104,7 @@ class MomentCoordinates:
         return theta, np.where(usable, log_density, -np.inf)
 
 
-def columns_by_kind(columns: FloatArray) -> FloatArray:
+def view_by_kind_and_gaussian(columns: FloatArray) -> FloatArray:
     """View the Gaussians' parameters or coordinates, (n_samples, 6 N + 2), as (6 kinds, N, n_samples)."""
     return columns[:, :-2].reshape(len(columns), columns.shape[1] // 6, 6).transpose(2, 1, 0)
 

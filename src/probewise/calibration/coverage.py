@@ -31,11 +31,11 @@ from probewise.world import Blob, World, gaussian_spot
 
 __all__ = [
     "Coverage",
-    "Truth",
+    "TrueSensor",
     "coverage",
     "draw_truth",
-    "interval_holds_truth",
-    "log_z_lead_of_one_gaussian",
+    "interval_holds_truth_by_quantity",
+    "simulate_log_z_lead_of_one_gaussian",
     "simulate_truth",
 ]
 
@@ -43,8 +43,8 @@ _MASS = 0.95
 
 
 @dataclass(frozen=True)
-class Truth:
-    """A hidden sensor: one Gaussian (centre and sds in mm), the two levels, the noise."""
+class TrueSensor:
+    """A simulated sensor: one Gaussian (centre and sds in mm), the readings over black and white, the noise sd."""
 
     center_mm: tuple[float, float]
     sd_mm: tuple[float, float]
@@ -78,10 +78,10 @@ class Coverage:
         write_text_atomically(path, self.to_json(**about))
 
 
-def draw_truth(*, rng: np.random.Generator) -> Truth:
+def draw_truth(*, rng: np.random.Generator) -> TrueSensor:
     """Draw a sensor like the paper's: offset by a few mm, anisotropic, with I_max - I_min of 45 to 55 units."""
     black = float(rng.uniform(8, 12))
-    return Truth(
+    return TrueSensor(
         center_mm=(float(rng.uniform(-3, 3)), float(rng.uniform(-3, 3))),
         sd_mm=(float(rng.uniform(2.5, 7)), float(rng.uniform(2.5, 7))),
         correlation=float(rng.uniform(-0.5, 0.5)),
@@ -91,7 +91,7 @@ def draw_truth(*, rng: np.random.Generator) -> Truth:
     )
 
 
-def simulate_truth(truth: Truth, *, rng: np.random.Generator) -> Recording:
+def simulate_truth(truth: TrueSensor, *, rng: np.random.Generator) -> Recording:
     """Simulate the paper's plan with this sensor in the pixel world."""
     spot = gaussian_spot([Blob(1.0, truth.center_mm, truth.sd_mm, truth.correlation)])
     world = World(spot, black=truth.black, white=truth.white, noise_sd=truth.noise_sd)
@@ -141,13 +141,13 @@ def _simulate_and_check_intervals(rng: np.random.Generator, n_live: int, quick: 
     """Simulate and calibrate one recording; return for each quantity whether its interval holds the truth."""
     truth = draw_truth(rng=rng)
     recording = simulate_truth(truth, rng=rng)
-    return interval_holds_truth(
+    return interval_holds_truth_by_quantity(
         truth, calibrate(recording, orders=(1,), n_live=n_live, quick=quick, rng=rng).sensor.samples
     )
 
 
-def interval_holds_truth(truth: Truth, samples: FloatArray) -> dict[str, bool]:
-    """Tell for each quantity whether the 95 % interval of samples of one Gaussian, (n, 8), holds the truth."""
+def interval_holds_truth_by_quantity(truth: TrueSensor, samples: FloatArray) -> dict[str, bool]:
+    """Return by quantity whether the 95 % interval of samples of one Gaussian, (n, 8), holds the truth."""
     found = {**mixture_moments(samples, 1), "I_min": samples[:, -2], "I_max": samples[:, -1]}
     held = {}
     for name, value in _true_quantities(truth).items():
@@ -156,8 +156,8 @@ def interval_holds_truth(truth: Truth, samples: FloatArray) -> dict[str, bool]:
     return held
 
 
-def log_z_lead_of_one_gaussian(
-    truth: Truth, *, rng: np.random.Generator, n_live: int = 300, quick: bool = False
+def simulate_log_z_lead_of_one_gaussian(
+    truth: TrueSensor, *, rng: np.random.Generator, n_live: int = 300, quick: bool = False
 ) -> tuple[float, float]:
     """Simulate a single-Gaussian recording; return log Z of one Gaussian minus that of two, and its error."""
     recording = simulate_truth(truth, rng=rng)
@@ -166,7 +166,7 @@ def log_z_lead_of_one_gaussian(
 
 
 def _lead_for_drawn_truth(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
-    return log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
+    return simulate_log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
 
 
 def main() -> None:
@@ -197,11 +197,11 @@ def main() -> None:
     ):
         if asked.campaign == "coverage":
 
-            def count(_: Coverage) -> None:
+            def advance_bar(_: Coverage) -> None:
                 bar.update()
 
             counts = coverage(
-                asked.recordings, rng=rng, n_live=asked.live, quick=asked.quick, executor=executor, progress=count
+                asked.recordings, rng=rng, n_live=asked.live, quick=asked.quick, executor=executor, progress=advance_bar
             )
             counts.save(asked.out, **about)
             return
@@ -221,7 +221,8 @@ def main() -> None:
     write_text_atomically(asked.out, json.dumps({**about, **rows}, indent=1) + "\n")
 
 
-def _true_quantities(truth: Truth) -> dict[str, float]:
+def _true_quantities(truth: TrueSensor) -> dict[str, float]:
+    """Return what `mixture_moments` and the levels are of a sensor, by the same names."""
     return {
         "centre x'": truth.center_mm[0],
         "centre y'": truth.center_mm[1],
@@ -234,6 +235,7 @@ def _true_quantities(truth: Truth) -> dict[str, float]:
 
 
 def _central_interval(samples: FloatArray) -> tuple[float, float]:
+    """Lower and upper end of the central 95 % interval."""
     low, high = np.quantile(samples, [0.5 - _MASS / 2, 0.5 + _MASS / 2])
     return float(low), float(high)
 

@@ -36,7 +36,7 @@ def mixture_moments(theta: FloatArray, n_gaussians: int) -> dict[str, FloatArray
     "centre x'", "centre y'" (mm), "log width along x'", "log width along y'" (of mm), and
     "correlation of x' and y'", each of shape (n_samples,).
     """
-    f = _footprint(theta, n_gaussians)
+    f = _footprint_of_samples(theta, n_gaussians)
     u, v = (f.weight * f.u_mm).sum(axis=-1), (f.weight * f.v_mm).sum(axis=-1)
     du, dv = f.u_mm - u[..., None], f.v_mm - v[..., None]
     var_u = (f.weight * (f.var_u + du * du)).sum(axis=-1)
@@ -58,7 +58,7 @@ def sorted_by_mass(theta: FloatArray, n_gaussians: int) -> FloatArray:
     The prior is exchangeable, so the labels of a posterior sample are arbitrary; sorted by mass, means
     and intervals of single columns are meaningful.
     """
-    order = np.argsort(-_footprint(theta, n_gaussians).weight[:, 0], axis=1, kind="stable")
+    order = np.argsort(-_footprint_of_samples(theta, n_gaussians).weight[:, 0], axis=1, kind="stable")
     out = theta.copy()
     blocks = theta[:, : 6 * n_gaussians].reshape(len(theta), n_gaussians, 6)
     out[:, : 6 * n_gaussians] = np.take_along_axis(blocks, order[:, :, None], axis=1).reshape(len(theta), -1)
@@ -81,7 +81,7 @@ def choose_pixel_mm(theta: FloatArray, n_gaussians: int, *, step_mm: float) -> f
     step_mm
         Scan step.
     """
-    f = _footprint(theta, n_gaussians)
+    f = _footprint_of_samples(theta, n_gaussians)
     # The smaller eigenvalue of the covariance, as a quotient that keeps its digits.
     middle, half = (f.var_u + f.var_v) / 2, np.hypot((f.var_u - f.var_v) / 2, f.cov_uv)
     narrow = np.sqrt((f.var_u * f.var_v - f.cov_uv**2) / (middle + half))
@@ -130,18 +130,18 @@ def mean_field(
     # The samples with the last thousandth of the weight would cost most of the time and change nothing.
     order = np.argsort(-weight)
     kept = order[: int(np.searchsorted(np.cumsum(weight[order]), 0.999)) + 1]
-    f, shares = _footprint(theta[kept], n_gaussians), weight[kept]
+    f, shares = _footprint_of_samples(theta[kept], n_gaussians), weight[kept]
     mass = shares[:, None, None] * f.weight
-    low_u, high_u = _bounds_of_footprint(f.u_mm, np.sqrt(f.var_u), mass)
-    low_v, high_v = _bounds_of_footprint(f.v_mm, np.sqrt(f.var_v), mass)
+    low_u, high_u = _footprint_bounds_along_axis(f.u_mm, np.sqrt(f.var_u), mass)
+    low_v, high_v = _footprint_bounds_along_axis(f.v_mm, np.sqrt(f.var_v), mass)
     widest = max(high_u - low_u, high_v - low_v)
     if widest / pixel_mm > max_pixels - 2:
-        pixel_mm = _pixel_rounded_up(widest / (max_pixels - 2))
+        pixel_mm = _rounded_up_pixel_mm(widest / (max_pixels - 2))
     u_mm, v_mm = _pixel_centres(low_u, high_u, pixel_mm), _pixel_centres(low_v, high_v, pixel_mm)
     return replace(field_of(f, u_mm=u_mm, v_mm=v_mm, weights=shares), pixel_mm=pixel_mm)
 
 
-def _footprint(theta: FloatArray, n_gaussians: int) -> Footprint:
+def _footprint_of_samples(theta: FloatArray, n_gaussians: int) -> Footprint:
     return footprint_of(theta[:, : 6 * n_gaussians], n_gaussians)
 
 
@@ -151,20 +151,20 @@ def _pixel_centres(low_mm: float, high_mm: float, pixel_mm: float) -> FloatArray
     return pixel_mm * numbers
 
 
-def _bounds_of_footprint(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
-    """Bounds five sds beyond the centres of all Gaussians but those with the outermost thousandth of the mass."""
-    return -_quantile_of_nearly_all_mass(_SIGMAS * sd - center, mass), _quantile_of_nearly_all_mass(
-        center + _SIGMAS * sd, mass
-    )
+def _footprint_bounds_along_axis(center: FloatArray, sd: FloatArray, mass: FloatArray) -> tuple[float, float]:
+    """Bounds along one axis, mm: five sds beyond all centres but those with the outermost thousandth of the mass."""
+    return -_mass_quantile_999(_SIGMAS * sd - center, mass), _mass_quantile_999(center + _SIGMAS * sd, mass)
 
 
-def _quantile_of_nearly_all_mass(values: FloatArray, mass: FloatArray) -> float:
+def _mass_quantile_999(values: FloatArray, mass: FloatArray) -> float:
+    """Quantile of values below which 0.999 of the mass lies; both arrays have one shape."""
     flat, weight = values.ravel(), mass.ravel()
     order = np.argsort(flat)
     ladder = np.cumsum(weight[order])
     return float(flat[order][np.searchsorted(ladder, 0.999 * ladder[-1])])
 
 
-def _pixel_rounded_up(pixel_mm: float) -> float:
+def _rounded_up_pixel_mm(pixel_mm: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten."""
     decade = 10.0 ** math.floor(math.log10(pixel_mm))
     return float(next(s * decade for s in (1.0, 2.0, 5.0, 10.0) if s * decade >= pixel_mm * (1 - 1e-9)))

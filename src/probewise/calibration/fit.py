@@ -17,7 +17,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_flag, require_rng, require_whole
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments, sorted_by_mass
-from probewise.calibration.noise import noise_by_scan, pooled_sd
+from probewise.calibration.noise import draw_pooled_sd, noise_by_scan
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import OrderPosterior, Progress, search_order
 from probewise.calibration.priors import PriorRow, SSFPrior, blind_axis_rad, default_prior, scan_geometry
@@ -184,7 +184,7 @@ def calibrate(
     require_described(recording.plan)
     require_rng(rng)
     require_whole("n_live", n_live)
-    wanted = _require_orders(orders)
+    wanted = _checked_orders(orders)
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
     require_flag("quick", quick)
     if quick and not refined:
@@ -206,7 +206,7 @@ def calibrate(
         running = {n: executor.submit(each[n]) for n in sorted(wanted, reverse=True)}
         fits = [running[n].result() for n in wanted]
     table = tuple(OrderEvidence(fit.n_gaussians, fit.log_z, fit.log_z_error) for fit in fits)
-    close = _note_on_close_evidences(table)
+    close = _notes_on_close_evidences(table)
     return Calibration(
         recording,
         tuple(
@@ -215,8 +215,8 @@ def calibrate(
     )
 
 
-def _require_orders(orders: object) -> tuple[int, ...]:
-    """Return the numbers of Gaussians without duplicates."""
+def _checked_orders(orders: object) -> tuple[int, ...]:
+    """Return the numbers of Gaussians without duplicates, or raise ParameterError."""
     allowed = "one or more whole numbers from 1, such as (1, 2)"
     if isinstance(orders, str) or not isinstance(orders, Iterable):
         raise ParameterError("orders", orders, allowed)
@@ -301,7 +301,7 @@ def _sensor_from_posterior(
         names=prior.names,
         samples=samples,
         n_gaussians=n_gaussians,
-        noise_sd=pooled_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
+        noise_sd=draw_pooled_sd(residuals, sd_floor=floor, sd_ceiling=ceiling, rng=rng),
         field=mean_field(theta, n_gaussians, pixel_mm=pixel, weight=weight),
         instrumentation=plan.instrumentation,
         scan_noise=noise_by_scan(
@@ -323,8 +323,8 @@ def _unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: np.random.
     )
 
 
-def _note_on_close_evidences(table: tuple[OrderEvidence, ...]) -> tuple[str, ...]:
-    """Return a note if the evidences of the two best orders agree within their errors."""
+def _notes_on_close_evidences(table: tuple[OrderEvidence, ...]) -> tuple[str, ...]:
+    """Return one note if the evidences of the two best orders agree within their errors, else none."""
     if len(table) < 2:
         return ()
     first, second = sorted(table, key=lambda order: -order.log_z)[:2]

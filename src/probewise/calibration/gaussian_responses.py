@@ -22,7 +22,7 @@ class SingleGaussianResponses:
 
     alone: SensorProblem
 
-    def responses_to(self, gaussian: FloatArray) -> FloatArray:
+    def responses_to_gaussians(self, gaussian: FloatArray) -> FloatArray:
         """Return the responses to Gaussians, whose amplitude does not matter, (n, 6) -> (n, n_used)."""
         if not len(gaussian):
             return np.empty((0, int(self.alone.recording.usable.sum())))
@@ -35,11 +35,11 @@ class SingleGaussianResponses:
     def responses_by_gaussian(self, theta: FloatArray) -> FloatArray:
         """Return the responses to each Gaussian of mixtures, (n, 6 N + 2) -> (n, N, n_used)."""
         n_gaussians = theta.shape[1] // 6
-        seen = self.responses_to(theta[:, :-2].reshape(-1, 6))
+        seen = self.responses_to_gaussians(theta[:, :-2].reshape(-1, 6))
         return seen.reshape(len(theta), n_gaussians, seen.shape[1])
 
 
-def light_by_gaussian(theta: FloatArray) -> FloatArray:
+def total_light_by_gaussian(theta: FloatArray) -> FloatArray:
     """Light that each Gaussian holds, up to a common factor, (n, 6 N + 2) -> (n, N)."""
     g = theta[:, :-2].reshape(len(theta), -1, 6)
     return np.asarray(g[..., 0] / np.sqrt(g[..., 3] * g[..., 4] - g[..., 5] ** 2))

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import expit
 
 from probewise._arrays import FloatArray
-from probewise.calibration.gaussian_responses import SingleGaussianResponses, light_by_gaussian
+from probewise.calibration.gaussian_responses import SingleGaussianResponses, total_light_by_gaussian
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.whole_coordinates import FAINT
 from probewise.errors import ParameterError
@@ -55,7 +55,7 @@ class LightIntegral:
     def log_ratio_when_taken_away(self, theta: FloatArray) -> FloatArray:
         """Log of the ratio for each faint Gaussian of sorted samples of N, (n, 6 N + 2) -> (n, N - n_bright)."""
         n = self.prior.n_gaussians
-        at_once = max(1, _AT_ONCE // (n * self._readings.size))
+        at_once = max(1, _AT_ONCE // (n * self._usable_readings.size))
         blocks = [theta[at : at + at_once] for at in range(0, len(theta), at_once)]
         return (
             np.concatenate([self._log_ratio_of_block(block) for block in blocks])
@@ -67,50 +67,52 @@ class LightIntegral:
         """Log of the ratio for a Gaussian `gaussian`, (n, 6), of any light, added to samples of N - 1, (n, 6 N - 4)."""
         if not len(rest):
             return np.empty(0)
-        at_once = max(1, _AT_ONCE // (self.prior.n_gaussians * self._readings.size))
+        at_once = max(1, _AT_ONCE // (self.prior.n_gaussians * self._usable_readings.size))
         found = []
         for at in range(0, len(rest), at_once):
             part = rest[at : at + at_once]
-            seen, light = self._responses(part)
-            one = self._response_model.responses_to(gaussian[at : at + at_once])
-            found.append(self._log_ratio(_mixture_response(seen, light), one, light, part[:, -2:]))
+            seen, light = self._responses_and_light_by_gaussian(part)
+            one = self._response_model.responses_to_gaussians(gaussian[at : at + at_once])
+            found.append(self._log_ratio_for_one_gaussian(_mixture_response(seen, light), one, light, part[:, -2:]))
         return np.concatenate(found)
 
     def _log_ratio_of_block(self, theta: FloatArray) -> FloatArray:
-        seen, light = self._responses(theta)
+        seen, light = self._responses_and_light_by_gaussian(theta)
         out = np.empty((len(light), light.shape[1] - self.n_bright))
         for at in range(out.shape[1]):
             k = self.n_bright + at
             others = np.delete(light, k, axis=1)
-            out[:, at] = self._log_ratio(
+            out[:, at] = self._log_ratio_for_one_gaussian(
                 _mixture_response(np.delete(seen, k, axis=1), others), seen[:, k], others, theta[:, -2:]
             )
         return out
 
-    def _responses(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _responses_and_light_by_gaussian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Responses of the readings to each Gaussian by itself, (n, N, n_used), and its light, (n, N)."""
-        return self._response_model.responses_by_gaussian(theta), light_by_gaussian(theta)
+        return self._response_model.responses_by_gaussian(theta), total_light_by_gaussian(theta)
 
-    def _log_ratio(self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray) -> FloatArray:
+    def _log_ratio_for_one_gaussian(
+        self, others: FloatArray, one: FloatArray, light: FloatArray, levels: FloatArray
+    ) -> FloatArray:
         """Log of the ratio for one Gaussian with responses `one` beside `others`, which have `light`.
 
         With t the light over that of the brightest of the others, whose own scale is integrated out, the ratio is
         (N - 1) / N times the integral of the likelihood over t from 0, times min(1, t^-N), over that at t = 0.
         """
-        sums = self._sums_by_data_set(others, one, levels)
+        sums = self._residual_sums_by_data_set(others, one, levels)
         return self._log_integral_over_light(*sums, light.sum(axis=-1) / light.max(axis=-1))
 
-    def _sums_by_data_set(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> _Sums:
+    def _residual_sums_by_data_set(self, others: FloatArray, one: FloatArray, levels: FloatArray) -> _Sums:
         """Sum residual squared, residual times change, and change squared within data sets, (..., n_sets) each.
 
         The residual is that without the Gaussian; the change is that of the prediction if the Gaussian held all light.
         """
         span = levels[..., 1:] - levels[..., :1]
-        off = self._readings - levels[..., :1] - span * others
+        off = self._usable_readings - levels[..., :1] - span * others
         change = span * (one - others)
         parts = [off * off, off * change, change * change]
         shapes = [(*part.shape[:-1], -1) for part in parts]
-        sums = [self._likelihood.sums_by_group(part.reshape(-1, part.shape[-1])) for part in parts]
+        sums = [self._student_t_likelihood.sums_by_group(part.reshape(-1, part.shape[-1])) for part in parts]
         square, both, own = (part.reshape(shape) for part, shape in zip(sums, shapes, strict=True))
         return np.broadcast_to(square, own.shape), both, own
 
@@ -128,7 +130,7 @@ class LightIntegral:
         log_density = self._log_likelihood_times_prior(square, both, own, whole, share)
         most = log_density.max(axis=-1)
         summed = most + np.log(np.exp(log_density - most[..., None]) @ (0.5 * weight)) + np.log(high - low)
-        return np.asarray(summed + math.log((n - 1) / n) - self._log_likelihood(square))
+        return np.asarray(summed + math.log((n - 1) / n) - self._log_likelihood_of_sums(square))
 
     def _log_likelihood_times_prior(
         self, square: FloatArray, both: FloatArray, own: FloatArray, whole: FloatArray, share: FloatArray
@@ -137,7 +139,7 @@ class LightIntegral:
         q = share[..., None]
         left = square[..., None, :] - 2.0 * q * both[..., None, :] + q * q * own[..., None, :]
         log_measure = np.log(whole[..., None]) - 2.0 * np.log1p(-share)
-        return np.asarray(self._log_likelihood(left) + log_measure)
+        return np.asarray(self._log_likelihood_of_sums(left) + log_measure)
 
     def _integration_limits(
         self, square: FloatArray, both: FloatArray, own: FloatArray, most: FloatArray
@@ -147,7 +149,9 @@ class LightIntegral:
         for _ in range(_N_NEWTON):
             q = share[..., None]
             left = np.maximum(square - 2.0 * q * both + q * q * own, 1e-300)
-            per_variance = np.minimum(self._likelihood.sizes / left, 1.0 / self._likelihood.sd_floor**2)
+            per_variance = np.minimum(
+                self._student_t_likelihood.sizes / left, 1.0 / self._student_t_likelihood.sd_floor**2
+            )
             told = (per_variance * own).sum(axis=-1) + 1e-12
             best = (per_variance * both).sum(axis=-1) / told
             share = np.clip(best, 0.0, most)
@@ -159,7 +163,7 @@ class LightIntegral:
         high = np.clip(share + reach, 0.0, most)
         return low, np.maximum(high, low + 1e-12)
 
-    def _log_likelihood(self, square: FloatArray) -> FloatArray:
+    def _log_likelihood_of_sums(self, square: FloatArray) -> FloatArray:
         """Log likelihood up to a constant from sums of squares, (..., n_sets) -> (...)."""
         first, per_log, values = self._log_likelihood_tables
         cells = np.log(np.maximum(square, 1e-300))
@@ -180,7 +184,7 @@ class LightIntegral:
         A table holds log integrals over sigma, a straight line except near the bounds of sigma, so linear interpolation
         suffices.
         """
-        likelihood = self._likelihood
+        likelihood = self._student_t_likelihood
         sizes, of = np.unique(likelihood.sizes, return_inverse=True)
         low, high = np.log(likelihood.sd_floor**2 * sizes * 1e-3), np.log(likelihood.sd_ceiling**2 * sizes * 1e3)
         grid = np.linspace(low, high, _N_TABLE, axis=1)
@@ -192,12 +196,12 @@ class LightIntegral:
         return SingleGaussianResponses(self.alone)
 
     @cached_property
-    def _readings(self) -> FloatArray:
+    def _usable_readings(self) -> FloatArray:
         recording = self.alone.recording
         return np.asarray(recording.readings[recording.usable])
 
     @cached_property
-    def _likelihood(self) -> StudentT:
+    def _student_t_likelihood(self) -> StudentT:
         if not isinstance(self.alone.likelihood, StudentT):
             raise ParameterError("alone.likelihood", self.alone.likelihood, "a StudentT")
         return self.alone.likelihood
@@ -208,7 +212,7 @@ def _mixture_response(seen: FloatArray, light: FloatArray) -> FloatArray:
     return np.asarray(((light / light.sum(axis=1, keepdims=True))[:, None, :] @ seen)[:, 0])
 
 
-def bridge_evidences(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
+def bridge_log_z_ratio(added: FloatArray, taken: FloatArray) -> tuple[float, float]:
     """Estimate by a bridge the log of Z of N over Z of N - 1; also return the effective share of the samples.
 
     Parameters
@@ -235,9 +239,9 @@ def bridge_evidences(added: FloatArray, taken: FloatArray) -> tuple[float, float
     found = float(found)
     samples = expit(found - taken).sum(axis=1)
     up = expit(added - found)
-    return found, min(_effective_share(up), _effective_share(samples))
+    return found, min(_effective_sample_fraction(up), _effective_sample_fraction(samples))
 
 
-def _effective_share(weight: FloatArray) -> float:
+def _effective_sample_fraction(weight: FloatArray) -> float:
     """Effective share of weighted samples, (n,)."""
     return float(weight.sum() ** 2 / (weight @ weight) / len(weight)) if weight.any() else 0.0

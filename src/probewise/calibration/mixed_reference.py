@@ -15,14 +15,14 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration.peak_density import PeakDensity
 from probewise.calibration.priors import SSFPrior
-from probewise.calibration.start_density import StartDensity
+from probewise.calibration.reference_density import ReferenceDensity
 
 _SHARE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class MixedReference:
-    """A reference mixed with densities about peaks: a `StartDensity`.
+    """A reference mixed with densities about peaks: a `ReferenceDensity`.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class MixedReference:
         What `reference` adds to its log density: natural log of the evidence of N - 1, or 0.
     """
 
-    reference: StartDensity
+    reference: ReferenceDensity
     peaks: tuple[PeakDensity, ...]
     log_z_below: float
 
@@ -54,19 +54,19 @@ class MixedReference:
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw parameters of N for each sample `rest` of N - 1, (n, 6 N - 4) -> (n, 6 N + 2); nan: impossible."""
         out = np.empty((len(rest), len(self.prior.names)))
-        for density, rows in self._rows_by_density(len(rest), rng):
+        for density, rows in self._assign_rows_to_densities(len(rest), rng):
             out[rows] = density.draw(rest[rows], rng=rng)
         return out
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-        """Propose new parameters by one of the densities, chosen at random for each particle; see `StartDensity`."""
+        """Propose new parameters by one of the densities, drawn for each particle; see `ReferenceDensity`."""
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
-        for density, rows in self._rows_by_density(len(here), rng):
+        for density, rows in self._assign_rows_to_densities(len(here), rng):
             there[rows], log_drawn[rows] = density.propose(here[rows], rng=rng)
         return there, log_drawn
 
-    def _rows_by_density(self, n: int, rng: np.random.Generator) -> list[tuple[StartDensity, IntArray]]:
+    def _assign_rows_to_densities(self, n: int, rng: np.random.Generator) -> list[tuple[ReferenceDensity, IntArray]]:
         """Assign each of `n` rows to one of the densities at random: pairs of a density and its rows."""
         which = np.minimum((rng.random(n) * len(self.peaks) / _SHARE).astype(np.int64), len(self.peaks))
-        densities: tuple[StartDensity, ...] = (*self.peaks, self.reference)
+        densities: tuple[ReferenceDensity, ...] = (*self.peaks, self.reference)
         return [(density, np.flatnonzero(which == k)) for k, density in enumerate(densities)]

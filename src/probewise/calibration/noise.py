@@ -67,7 +67,9 @@ def draw_sd(
     return np.clip(np.where(thin, at_bound, sd), sd_floor, sd_ceiling)
 
 
-def pooled_sd(residuals: FloatArray, *, sd_floor: float, sd_ceiling: float, rng: np.random.Generator) -> FloatArray:
+def draw_pooled_sd(
+    residuals: FloatArray, *, sd_floor: float, sd_ceiling: float, rng: np.random.Generator
+) -> FloatArray:
     """Draw one noise sd per sample from the residuals of all scans: the noise of a new scan.
 
     Parameters
@@ -81,6 +83,9 @@ def pooled_sd(residuals: FloatArray, *, sd_floor: float, sd_ceiling: float, rng:
     """
     total = np.einsum("sp,sp->s", residuals, residuals)
     return draw_sd(total, residuals.shape[1], sd_floor=sd_floor, sd_ceiling=sd_ceiling, rng=rng)
+
+
+pooled_sd = draw_pooled_sd  # its earlier name
 
 
 def noise_by_scan(
@@ -115,6 +120,6 @@ def noise_by_scan(
     for k, name in enumerate(scan_names):
         rows = residuals[:, scan == k]
         if rows.shape[1]:
-            sd = pooled_sd(rows, sd_floor=sd_floor, sd_ceiling=sd_ceiling, rng=rng)
+            sd = draw_pooled_sd(rows, sd_floor=sd_floor, sd_ceiling=sd_ceiling, rng=rng)
             out.append(ScanNoise(name, rows.shape[1], float(sd.mean()), float(sd.std())))
     return tuple(out)

@@ -63,11 +63,11 @@ def search_order(
         note = f"the log evidence is that of nested sampling alone, which ended as {result.stop_reason}"
         return OrderPosterior(result, None, (note,))
     more_precise = refine(result, problem, rng=rng, n_draws=_N_DRAWS, look=False)
-    return OrderPosterior(result, more_precise, _note_on_disagreement(n_gaussians, result, more_precise))
+    return OrderPosterior(result, more_precise, _notes_on_disagreement(n_gaussians, result, more_precise))
 
 
-def _note_on_disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
-    """Return a warning if the two estimates of an evidence do not agree within their errors."""
+def _notes_on_disagreement(n_gaussians: int, result: NestedResult, refined: Weighted) -> tuple[str, ...]:
+    """Return one note if the two estimates of an evidence disagree by more than four errors, else none."""
     apart = abs(refined.log_z - result.log_z) / math.hypot(refined.log_z_error, result.log_z_error)
     if apart <= _DISAGREE or not set(refined.doubts) <= set(refined.inherited):
         return ()

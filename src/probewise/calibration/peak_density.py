@@ -13,9 +13,9 @@ import numpy as np
 from scipy.special import fdtri, gammaln, logsumexp
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.calibration.peak_coordinates import PeakCoordinates
+from probewise.calibration.label_symmetric_coordinates import LabelSymmetricCoordinates
 from probewise.calibration.priors import SSFPrior
-from probewise.calibration.start_density import propose_independently
+from probewise.calibration.reference_density import propose_independently
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
 from probewise.nested.weights import n_effective
@@ -61,9 +61,12 @@ class StudentTDensity:
 
 @dataclass(frozen=True, eq=False)
 class PeakDensity:
-    """A Student-t about a peak, averaged over the labels of the Gaussians: a `StartDensity`."""
+    """A Student-t about a peak, averaged over the labels of the Gaussians: a `ReferenceDensity`.
 
-    space: PeakCoordinates
+    `one`: the Student-t for one order of the labels, in the coordinates `space`.
+    """
+
+    space: LabelSymmetricCoordinates
     one: StudentTDensity
 
     @property
@@ -71,12 +74,14 @@ class PeakDensity:
         """The prior of N Gaussians."""
         return self.space.prior
 
-    def draw_within_prior(self, n: int, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def draw_and_keep_within_prior(
+        self, n: int, *, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Make `n` draws; return those within the prior: coordinates, parameters, log density over the prior's."""
         y = self.one.draw(n, rng)
         theta, log_prior = self.space.leave(y, rng.random(n))
         inside = np.isfinite(log_prior)
-        return y[inside], theta[inside], self._log_density(y[inside]) - log_prior[inside]
+        return y[inside], theta[inside], self._log_density_in_coordinates(y[inside]) - log_prior[inside]
 
     def draw(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Draw one for each row of `rest`, (n, 6 N + 2); nan where outside the prior."""
@@ -92,28 +97,35 @@ class PeakDensity:
     def fitted_to(self, theta: FloatArray) -> PeakDensity:
         """Fit a density to samples, (n, 6 N + 2), each with the labels that are most probable under this one."""
         y = self.space.enter(theta)
-        labelled = np.stack([self.space.permute_labels(y, change) for change in self.space.label_permutations])
+        labelled = np.stack([self.space.apply_label_permutation(y, change) for change in self.space.label_permutations])
         best = np.argmax([self.one.log_density(each) for each in labelled], axis=0)
         own = labelled[best, np.arange(len(y))]
         root = np.linalg.cholesky(_WIDENED**2 * np.cov(own, rowvar=False))
         return PeakDensity(self.space, StudentTDensity(own.mean(axis=0), np.asarray(root, dtype=np.float64)))
 
-    def is_near_peak(self, y: FloatArray) -> BoolArray:
-        """Mark coordinates that, with any labels, lie in the densest region of nine tenths of draws, (n, d) -> (n,)."""
-        each = [self.one.log_density(self.space.permute_labels(y, change)) for change in self.space.label_permutations]
+    def near_peak_mask(self, y: FloatArray) -> BoolArray:
+        """Return a mask, (n, d) -> (n,), of coordinates that with any labels lie in the densest 90 % of draws."""
+        each = [
+            self.one.log_density(self.space.apply_label_permutation(y, change))
+            for change in self.space.label_permutations
+        ]
         return np.asarray(np.max(each, axis=0) > self.one.log_density_around_nine_tenths)
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
         """Return the log of this density divided by the prior's, (n, 6 N + 2) -> (n,)."""
         y = self.space.enter(theta)
-        return self._log_density(y) - self.space.leave(y)[1]
+        return self._log_density_in_coordinates(y) - self.space.leave(y)[1]
 
     def propose(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Propose a draw for each particle; see `propose_independently`."""
         return propose_independently(self, here, rng=rng)
 
-    def _log_density(self, y: FloatArray) -> FloatArray:
-        each = [self.one.log_density(self.space.permute_labels(y, change)) for change in self.space.label_permutations]
+    def _log_density_in_coordinates(self, y: FloatArray) -> FloatArray:
+        """Log density, averaged over the labels, (n, 6 N + 1) -> (n,)."""
+        each = [
+            self.one.log_density(self.space.apply_label_permutation(y, change))
+            for change in self.space.label_permutations
+        ]
         return np.asarray(logsumexp(each, axis=0) - math.log(len(each)))
 
 
@@ -140,16 +152,18 @@ def fit_density_about_peak(
     prior = problem.prior
     if not isinstance(prior, SSFPrior):
         raise ParameterError("problem.prior", prior, "an SSFPrior")
-    space = PeakCoordinates(prior)
+    space = LabelSymmetricCoordinates(prior)
     density, n_calls = _laplace_density(problem, space, peak), 0
     for _ in range(_N_ROUNDS):
-        y, theta, log_density = PeakDensity(space, density).draw_within_prior(n_pilots, rng=rng)
+        y, theta, log_density = PeakDensity(space, density).draw_and_keep_within_prior(n_pilots, rng=rng)
         n_calls += len(y)
         if len(y) < 2 * y.shape[1]:
             density = StudentTDensity(density.mean, 0.5 * density.root)
             continue
         log_weight = problem.log_likelihood(theta) - log_density
-        density = _refitted_density(y, _tempered_log_weights(log_weight, _LEAST_PER_COORDINATE * y.shape[1]), density)
+        density = _refitted_density(
+            y, _temper_log_weights_to_n_effective(log_weight, _LEAST_PER_COORDINATE * y.shape[1]), density
+        )
     return PeakDensity(space, density), n_calls
 
 
@@ -179,16 +193,16 @@ def share_missed_about_peak(
     rng
         Source of randomness.
     """
-    y, drawn, log_density = density.draw_within_prior(n_draws, rng=rng)
-    near = density.is_near_peak(y)
+    y, drawn, log_density = density.draw_and_keep_within_prior(n_draws, rng=rng)
+    near = density.near_peak_mask(y)
     weight = np.exp(problem.log_likelihood(drawn[near]) - log_density[near] - log_z) if near.any() else np.zeros(1)
     about = float(weight.sum()) / n_draws
     error = math.sqrt(max(float((weight**2).sum()) / n_draws - about**2, 0.0) / n_draws)
-    missed = max(about - 2.0 * error - float(density.is_near_peak(density.space.enter(theta)).mean()), 0.0)
+    missed = max(about - 2.0 * error - float(density.near_peak_mask(density.space.enter(theta)).mean()), 0.0)
     return missed / (1.0 + missed)
 
 
-def _laplace_density(problem: SensorProblem, space: PeakCoordinates, peak: FloatArray) -> StudentTDensity:
+def _laplace_density(problem: SensorProblem, space: LabelSymmetricCoordinates, peak: FloatArray) -> StudentTDensity:
     """Make a density of the peak's curvature, and of the prior's width where there is little information."""
     prior, likelihood, recording = space.prior, problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):
@@ -204,7 +218,7 @@ def _laplace_density(problem: SensorProblem, space: PeakCoordinates, peak: Float
     return StudentTDensity(at, np.asarray(np.linalg.cholesky(_WIDENED**2 * covariance), dtype=np.float64))
 
 
-def _tempered_log_weights(log_weight: FloatArray, least: float) -> FloatArray:
+def _temper_log_weights_to_n_effective(log_weight: FloatArray, least: float) -> FloatArray:
     """Scale log weights by the largest power, at most 1, that leaves an effective sample size of `least` or more."""
     low, high = 0.0, 1.0
     if n_effective(log_weight) >= least:

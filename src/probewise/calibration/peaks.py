@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from probewise._arrays import FloatArray
-from probewise.calibration.gaussian_responses import SingleGaussianResponses, light_by_gaussian
+from probewise.calibration.gaussian_responses import SingleGaussianResponses, total_light_by_gaussian
 from probewise.calibration.priors import SSFPrior
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem, StudentT
@@ -36,7 +36,7 @@ _SAME, _HARDLY_LOWER, _N_OTHERS = 0.05, 6.0, 3
 
 
 @dataclass(frozen=True, eq=False)
-class Peak:
+class HighestPeak:
     """The highest peak found, (n_params,), ln L there, and other peaks that are hardly lower, (n_others, n_params)."""
 
     theta: FloatArray
@@ -44,8 +44,10 @@ class Peak:
     others: FloatArray
 
 
-def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np.random.Generator) -> dict[int, Peak]:
-    """Find the highest peak of each order from 1.
+def find_highest_peak_by_order(
+    problem: Callable[[int], SensorProblem], highest: int, *, rng: np.random.Generator
+) -> dict[int, HighestPeak]:
+    """Find the highest peak of the likelihood of each order from 1; return them by order.
 
     Parameters
     ----------
@@ -56,10 +58,10 @@ def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np
     rng
         Source of randomness.
     """
-    found: dict[int, Peak] = {}
+    found: dict[int, HighestPeak] = {}
     responses = SingleGaussianResponses(problem(1))
     for n in range(1, highest + 1):
-        prior = _require_ssf_prior(problem(n))
+        prior = _checked_ssf_prior(problem(n))
         drawn = prior.from_unit_cube(rng.random((_N_DRAWS, len(prior.names))))
         n_free, n_split, n_added = _STARTS if n <= 2 else _FEWER_STARTS
         starts = [drawn[np.argsort(-problem(n).log_likelihood(drawn))[:n_free]]]
@@ -79,7 +81,8 @@ def find_peaks(problem: Callable[[int], SensorProblem], highest: int, *, rng: np
     return found
 
 
-def _require_ssf_prior(problem: SensorProblem) -> SSFPrior:
+def _checked_ssf_prior(problem: SensorProblem) -> SSFPrior:
+    """Return a problem's prior, or raise ParameterError if it is no `SSFPrior`."""
     if not isinstance(problem.prior, SSFPrior):
         raise ParameterError("problem.prior", problem.prior, "an SSFPrior")
     return problem.prior
@@ -121,9 +124,9 @@ def _with_light_gaussian_added(
     return np.concatenate([theta[:, :-2], one, theta[:, -2:]], axis=1)
 
 
-def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianResponses, starts: FloatArray) -> Peak:
-    """Ascend from each start, (n_starts, n_params); the worse half gives up after some steps."""
-    prior, likelihood, recording = _require_ssf_prior(problem), problem.likelihood, problem.recording
+def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianResponses, starts: FloatArray) -> HighestPeak:
+    """Ascend from each start, (n_starts, n_params), the worse half for a few steps only; return what is reached."""
+    prior, likelihood, recording = _checked_ssf_prior(problem), problem.likelihood, problem.recording
     if not isinstance(likelihood, StudentT):
         raise ParameterError("problem.likelihood", likelihood, "a StudentT")
     usable = recording.usable
@@ -167,7 +170,7 @@ def _ascend_from_starts(problem: SensorProblem, responses: SingleGaussianRespons
     theta, high = prior.from_unit_cube(expit(z[order])), high[order]
     lower = -np.diff(high, prepend=high[0] + 1.0)
     others = np.flatnonzero((lower > _SAME) & (high > high[0] - _HARDLY_LOWER))[1 : 1 + _N_OTHERS]
-    return Peak(theta[0], float(high[0]), theta[others])
+    return HighestPeak(theta[0], float(high[0]), theta[others])
 
 
 def _prediction_slopes(prior: SSFPrior, responses: SingleGaussianResponses, z: FloatArray) -> FloatArray:
@@ -183,7 +186,7 @@ def _prediction_slopes(prior: SSFPrior, responses: SingleGaussianResponses, z: F
     theta = prior.from_unit_cube(expit(changed.reshape(7 * n, -1)))
     # The light is the first kind, with the responses of no change.
     seen = responses.responses_by_gaussian(np.concatenate([theta[:n], theta[2 * n :]])).reshape(6, n, n_gaussians, -1)
-    light = light_by_gaussian(theta).reshape(7, n, n_gaussians)
+    light = total_light_by_gaussian(theta).reshape(7, n, n_gaussians)
     theta = theta[:n]
     whole = light[0].sum(axis=1)
     lit = light[0][..., None] * seen[0]

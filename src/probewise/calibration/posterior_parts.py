@@ -40,14 +40,17 @@ class FootprintPlaceAndSize:
         _, u, v, a, b, c = theta[:6]
         return cls((float(u), float(v)), float(0.5 * (a + b) / (a * b - c * c)))
 
-    def coordinates(self, prior: SSFPrior, n_bright: int) -> WholeFootprintCoordinates:
+    def whole_footprint_coordinates(self, prior: SSFPrior, n_bright: int) -> WholeFootprintCoordinates:
         """Return the coordinates of mixtures of which `n_bright` Gaussians are bright."""
         return WholeFootprintCoordinates(prior, self.centre_mm, self.size_mm2, n_bright)
 
 
 @dataclass(frozen=True, eq=False)
 class PosteriorPart:
-    """Equally weighted samples of a part, (n, 6 N + 2), cloud after cloud, sorted by mass, and its evidence."""
+    """Equally weighted samples of a part, (n, 6 N + 2), cloud after cloud, sorted by mass, and its evidence.
+
+    `log_z_of_clouds`, (n_clouds,), and `start_error` are those of an `SMCResult`.
+    """
 
     theta: FloatArray
     log_z_of_clouds: FloatArray
@@ -70,6 +73,7 @@ def evidence_shares(parts: dict[int, PosteriorPart]) -> dict[int, float]:
 
 
 def _normalised_evidences(each: Iterable[PosteriorPart | SMCResult]) -> FloatArray:
+    """Return the evidences divided by their sum, (n_parts,)."""
     log_z = np.array([one.log_z for one in each])
     return np.asarray(np.exp(log_z - logsumexp(log_z)))
 

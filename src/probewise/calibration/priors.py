@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.calibration.coordinates import MomentCoordinates, columns_by_kind
+from probewise.calibration.coordinates import MomentCoordinates, view_by_kind_and_gaussian
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Uniform, checked_columns
 from probewise.recordings import HalfPlane, Ramp, Recording, Stripes
@@ -133,10 +133,10 @@ class SSFPrior:
         """Natural log of the density, (n_samples, 6 N + 2) -> (n_samples,); -inf outside the support."""
         theta = checked_columns(theta, self.names)
         # One contiguous row per kind of parameter, for speed.
-        return self.log_prob_by_kind(np.ascontiguousarray(columns_by_kind(theta)), theta[:, -2], theta[:, -1])
+        return self.log_prob_by_kind(np.ascontiguousarray(view_by_kind_and_gaussian(theta)), theta[:, -2], theta[:, -1])
 
     def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
-        """Return `log_prob` for Gaussians from `columns_by_kind`, (6, N, n_samples), and levels, (n_samples,) each."""
+        """Return `log_prob` for `view_by_kind_and_gaussian`, (6, N, n_samples), and levels, (n_samples,) each."""
         precisions = np.maximum(g[3:5], 0.0)
         product, c = precisions[0] * precisions[1], g[5]
         scale = np.sqrt(product)

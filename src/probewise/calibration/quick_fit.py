@@ -18,14 +18,16 @@ from functools import partial
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.calibration.all_bright_density import AllBrightDensity
 from probewise.calibration.check_by_search import missed_part_in_words
-from probewise.calibration.compensation import Compensation
-from probewise.calibration.light_integral import LightIntegral, bridge_evidences
+from probewise.calibration.compensation import CompensatedShapeProposal
+from probewise.calibration.faint_gaussian_reference import FaintGaussianReference, has_uniform_light
+from probewise.calibration.light_integral import LightIntegral, bridge_log_z_ratio
 from probewise.calibration.mixed_reference import MixedReference
 from probewise.calibration.order_problems import OrderProblems
 from probewise.calibration.order_search import OrderPosterior, Progress, Search
 from probewise.calibration.peak_density import PeakDensity, fit_density_about_peak, share_missed_about_peak
-from probewise.calibration.peaks import Peak, find_peaks
+from probewise.calibration.peaks import HighestPeak, find_highest_peak_by_order
 from probewise.calibration.posterior_parts import (
     FootprintPlaceAndSize,
     PosteriorPart,
@@ -33,15 +35,13 @@ from probewise.calibration.posterior_parts import (
     join_parts,
     split_by_n_bright,
 )
-from probewise.calibration.reference import FaintGaussianReference, has_uniform_light
-from probewise.calibration.shared_light import SharedLightDensity
+from probewise.calibration.reference_density import ReferenceDensity
 from probewise.calibration.smc import N_CLOUDS, N_SNAPSHOTS, SMCResult, TemperatureSummary, run_smc
-from probewise.calibration.start_density import StartDensity
 from probewise.calibration.whole_coordinates import count_bright
 
 # With fewer the posterior may lie along the bounds of the prior, far from any peak; and a search costs little.
 _LEAST_READINGS = 80
-# Quadrature nodes over curved edges for the first-order shifts of `Compensation`: mostly within 0.001 of the span.
+# Quadrature nodes over curved edges for the shifts of `CompensatedShapeProposal`: mostly within 0.001 of the span.
 _FEW_NODES = 8
 _N_PARTICLES = 1000
 # Gain in ln L by one Gaussian above which the posterior is assumed to lie about the highest peak.
@@ -93,7 +93,7 @@ def fit_orders_quickly(
     if unlike:
         return {}, (unlike,)
     climbing = rng.spawn(1)[0]
-    peaks = find_peaks(problems.problem, highest, rng=climbing)
+    peaks = find_highest_peak_by_order(problems.problem, highest, rng=climbing)
     whole = FootprintPlaceAndSize.from_gaussian(peaks[1].theta)
     found: dict[int, OrderPosterior] = {}
     parts: dict[int, PosteriorPart] = {}
@@ -102,12 +102,12 @@ def fit_orders_quickly(
         found[n], parts = fit_next_order(
             problems, n, parts, peaks[n], climbing, whole=whole, needed=needed, search=search, progress=progress
         )
-    return _with_chosen_order_checked(
+    return _check_chosen_order_or_search_in_full(
         problems, {n: found[n] for n in orders}, climbing, search=search, progress=progress
     ), ()
 
 
-def _with_chosen_order_checked(
+def _check_chosen_order_or_search_in_full(
     problems: OrderProblems,
     found: dict[int, OrderPosterior],
     rng: np.random.Generator,
@@ -148,7 +148,7 @@ def fit_next_order(
     problems: OrderProblems,
     n: int,
     below: dict[int, PosteriorPart],
-    peak: Peak,
+    peak: HighestPeak,
     rng: np.random.Generator,
     *,
     whole: FootprintPlaceAndSize,
@@ -205,7 +205,7 @@ def fit_next_order(
 def _smc_from_peak(
     problems: OrderProblems,
     n: int,
-    peak: Peak,
+    peak: HighestPeak,
     rng: np.random.Generator,
     report: Callable[[TemperatureSummary], None] | None,
 ) -> tuple[SMCResult, dict[int, PosteriorPart]]:
@@ -245,7 +245,7 @@ def _smc_from_order_below(
     problems: OrderProblems,
     n: int,
     below: dict[int, PosteriorPart],
-    peak: Peak,
+    peak: HighestPeak,
     whole: FootprintPlaceAndSize,
     rng: np.random.Generator,
     report: Callable[[TemperatureSummary], None] | None,
@@ -289,11 +289,11 @@ def _smc_with_faint_gaussian_added(
     The evidence comes from a bridge between the two parts.
     """
     problem_below = problems.problem(n - 1)
-    coordinates = whole.coordinates(problems.prior_of(n - 1), n_bright)
+    coordinates = whole.whole_footprint_coordinates(problems.prior_of(n - 1), n_bright)
     rest = below.theta
     n_particles = _N_PARTICLES if many else _FEW_PARTICLES
     few = rest[np.arange(n_particles) * len(rest) // n_particles]
-    compensation = Compensation.from_samples(
+    compensation = CompensatedShapeProposal.from_samples(
         problem_below,
         coordinates,
         problems.problem(1, n_nodes=_FEW_NODES),
@@ -301,7 +301,7 @@ def _smc_with_faint_gaussian_added(
         rng=rng,
         n_pool=_POOL if many else _SMALL_POOL,
     )
-    reference: StartDensity = FaintGaussianReference(problems.prior_of(n), problem_below, compensation, n_bright)
+    reference: ReferenceDensity = FaintGaussianReference(problems.prior_of(n), problem_below, compensation, n_bright)
     if about:
         reference = MixedReference(reference, about, below.log_z)
     made = run_smc(
@@ -311,7 +311,7 @@ def _smc_with_faint_gaussian_added(
         log_z_below=below.log_z_of_clouds,
         error_below=below.start_error,
         rng=rng,
-        space=whole.coordinates(problems.prior_of(n), n_bright),
+        space=whole.whole_footprint_coordinates(problems.prior_of(n), n_bright),
         at_once_from=_AT_ONCE_FROM,
         progress=report,
     )
@@ -336,9 +336,9 @@ def _smc_with_all_gaussians_bright(
     report: Callable[[TemperatureSummary], None] | None,
 ) -> SMCResult:
     """Sample the part of the posterior of `n` where all Gaussians are bright, from a wide density."""
-    space = whole.coordinates(problems.prior_of(n), n)
-    fewer = whole.coordinates(problems.prior_of(n - 1), n - 1).enter(below.theta)
-    reference: StartDensity = SharedLightDensity.from_samples_below(space, fewer)
+    space = whole.whole_footprint_coordinates(problems.prior_of(n), n)
+    fewer = whole.whole_footprint_coordinates(problems.prior_of(n - 1), n - 1).enter(below.theta)
+    reference: ReferenceDensity = AllBrightDensity.from_samples_below(space, fewer)
     if about:
         reference = MixedReference(reference, about, 0.0)
     n_steps, least_effective = _TWO_BRIGHT if n == 2 else _MORE_BRIGHT
@@ -361,17 +361,17 @@ def _with_bridged_evidence(made: SMCResult, log_z: FloatArray, added: FloatArray
     """Replace the evidence by that of a bridge if enough samples are effective; add a doubt if the two disagree."""
     if made.temperatures[-1] < 1.0:
         return made
-    ratio, share = bridge_evidences(added, taken)
+    ratio, share = bridge_log_z_ratio(added, taken)
     if share < _LEAST_SHARE:
         return made
     # What each cloud adds to the bridge of all (jackknife): by itself a cloud that is stuck would outweigh the others.
     own = np.repeat(np.arange(N_CLOUDS), len(taken) // N_CLOUDS)
     of_added = np.repeat(np.arange(N_CLOUDS), len(added) // N_CLOUDS)
-    without = np.array([bridge_evidences(added[of_added != k], taken[own != k])[0] for k in range(N_CLOUDS)])
+    without = np.array([bridge_log_z_ratio(added[of_added != k], taken[own != k])[0] for k in range(N_CLOUDS)])
     # Samples of the posterior that still drift give another evidence late than early.
     by_time = taken.reshape(N_CLOUDS, N_SNAPSHOTS, -1, taken.shape[1])
     early, late = (half.reshape(-1, taken.shape[1]) for half in np.split(by_time, 2, axis=1))
-    drift = bridge_evidences(added, late)[0] - bridge_evidences(added, early)[0]
+    drift = bridge_log_z_ratio(added, late)[0] - bridge_log_z_ratio(added, early)[0]
     found = replace(
         made,
         log_z_of_clouds=log_z + N_CLOUDS * ratio - (N_CLOUDS - 1) * without,
@@ -387,7 +387,7 @@ def _with_bridged_evidence(made: SMCResult, log_z: FloatArray, added: FloatArray
 
 
 def _with_doubt_of_missed_peaks(
-    problems: OrderProblems, n: int, made: SMCResult, peak: Peak, rng: np.random.Generator
+    problems: OrderProblems, n: int, made: SMCResult, peak: HighestPeak, rng: np.random.Generator
 ) -> SMCResult:
     """Add a doubt to an SMC run that missed a peak which holds a part of the evidence."""
     if made.warnings or peak.log_likelihood - made.log_likelihood.max() < _HIGHER:

@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_kind, require_path
-from probewise._posterior_samples import NamedSamples, interval_table, require_masks_of_absent_effects, require_samples
+from probewise._posterior_samples import NamedSamples, checked_samples, interval_table, require_masks_of_absent_effects
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -47,9 +47,9 @@ _ALLOWED = "a sensor.json as `probewise calibrate` writes"
 # Effects of single scans or mountings: they explain the recording but do not apply to new scans.
 BOUND_TO_SCANS = frozenset({"height_offset", "scan_angle_error", "scan_misplacement"})
 _FOR_A_FREE_FORM = 4  # Gaussians that approximate a free-form SSF where a mixture is required
-# Effects that may be restricted to some patterns.
 # The light sensor's own `gain_step`, until 0.1, before any simulator had an effect of that name.
 _GAIN_STEP = re.compile(r'"gain_step(?="|\.frac"|\.at_s")')
+# Effects that may be restricted to some patterns.
 _BOUND_TO_PATTERNS = {EdgeShadow.name: EdgeShadow}
 
 
@@ -129,7 +129,7 @@ class FittedSensor(NamedSamples):
     version: str = __version__
 
     def __post_init__(self) -> None:
-        samples, noise_sd = require_samples(self.samples, self.noise_sd, self.names)
+        samples, noise_sd = checked_samples(self.samples, self.noise_sd, self.names)
         unknown = [name for name in self.effects if name not in EFFECTS]
         if unknown:
             raise ParameterError("effects", unknown[0], ", ".join(sorted(EFFECTS)))
@@ -218,9 +218,11 @@ class FittedSensor(NamedSamples):
 
     leading = with_leading_effects  # its earlier name
 
-    def ssf(self) -> tuple[Quantity, ...]:
-        """Summarise the SSF by centre, widths and angle; also each Gaussian, unless it is a free form."""
+    def ssf_quantities(self) -> tuple[Quantity, ...]:
+        """Summarise the SSF by centre, widths and angle, and each Gaussian too, unless it is a free form."""
         return ssf_quantities(self.samples, self.n_gaussians, each=not self.is_free_form)
+
+    ssf = ssf_quantities  # its earlier name
 
     def summary(self) -> str:
         """Describe the sensor in plain text."""
@@ -230,7 +232,7 @@ class FittedSensor(NamedSamples):
         lines = [
             f"{form}, {len(self.samples)} posterior samples"
             + (
-                f", with {', '.join(self._effect_with_frequency(name) for name in self.effects)}"
+                f", with {', '.join(self._effect_with_share_of_samples(name) for name in self.effects)}"
                 if self.effects
                 else ""
             ),
@@ -246,11 +248,11 @@ class FittedSensor(NamedSamples):
             ]
         told = [name for name in self.names if name not in bending]
         median, interval = self.median(), self.interval()
-        rows = [(q.name, q.median, q.interval95) for q in self.ssf()]
+        rows = [(q.name, q.median, q.interval95) for q in self.ssf_quantities()]
         rows += [(name, median[name], interval[name]) for name in told]
         return "\n".join([*lines, *interval_table(rows), *(f"note: {note}" for note in self.notes)])
 
-    def _effect_with_frequency(self, effect: str) -> str:
+    def _effect_with_share_of_samples(self, effect: str) -> str:
         share = 1.0 - self.absent[effect].mean() if effect in self.absent else 1.0
         return effect if share == 1.0 else f"{effect} in {share:.0%} of them"
 
@@ -274,7 +276,7 @@ class FittedSensor(NamedSamples):
                 }
                 for n in self.names
             ],
-            "ssf": [asdict(quantity) for quantity in self.ssf()],
+            "ssf": [asdict(quantity) for quantity in self.ssf_quantities()],
             "levels": {n: {"mean": mean[n], "sd": sd[n]} for n in ("I_min", "I_max")},
             "effects": list(self.effects),
             "patterns": {name: list(patterns) for name, patterns in self.patterns.items()},
@@ -325,26 +327,26 @@ class FittedSensor(NamedSamples):
         samples = read.array("samples", ndim=2)
         try:
             sensor = cls(
-                names=tuple(_text_of_item(read, p, "name", "parameters") for p in read.items("parameters")),
+                names=tuple(_text_of_item(read, p, "name", "parameters") for p in read.objects("parameters")),
                 samples=samples,
                 n_gaussians=read.whole_number("n_gaussians"),
                 noise_sd=read.array("noise", "sd", ndim=1),
                 field=SSFField(
                     read.array("field", "values", ndim=2),
                     read.number("field", "pixel_mm"),
-                    _require_pair(read.array("field", "origin_mm", ndim=1), read),
+                    _checked_pair(read.array("field", "origin_mm", ndim=1), read),
                 ),
                 instrumentation=_read_instrumentation(read),
                 effects=tuple(read.texts("effects")),
                 patterns={name: tuple(read.texts("patterns", name)) for name in document.get("patterns", {})},
                 absent={name: read.mask(len(samples), "absent", name) for name in document.get("absent", {})},
                 scan_noise=tuple(
-                    _dataclass_of_item(read, ScanNoise, s, "noise.scans") for s in read.items("noise", "scans")
+                    _dataclass_of_item(read, ScanNoise, s, "noise.scans") for s in read.objects("noise", "scans")
                 ),
                 fingerprint=read.text("recording", "fingerprint"),
                 source=read.text("recording", "source"),
-                orders=tuple(_dataclass_of_item(read, OrderEvidence, o, "orders") for o in read.items("orders")),
-                priors=tuple(_dataclass_of_item(read, PriorRow, p, "priors") for p in read.items("priors")),
+                orders=tuple(_dataclass_of_item(read, OrderEvidence, o, "orders") for o in read.objects("orders")),
+                priors=tuple(_dataclass_of_item(read, PriorRow, p, "priors") for p in read.objects("priors")),
                 notes=tuple(read.texts("notes")),
                 version=read.text("version"),
             )
@@ -357,7 +359,7 @@ class FittedSensor(NamedSamples):
         return sensor
 
     def unit(self, name: str) -> str:
-        """Return the unit of a parameter."""
+        """Return the unit of a parameter, by its name; "" where it is unknown."""
         if "." in name:
             owner, _, parameter = name.partition(".")
             effect = EFFECTS[owner]() if owner in EFFECTS else None
@@ -407,12 +409,13 @@ def require_sensor(sensor: object, more: str = "") -> None:
 
 
 def _determinants(samples: FloatArray, n_gaussians: int) -> FloatArray:
+    """Compute A B - C^2 of each Gaussian, (n_samples, N); -inf where A is not positive."""
     a, b, c = (samples[:, k : 6 * n_gaussians : 6] for k in (3, 4, 5))
     return np.where(a > 0, a * b - c * c, -np.inf)
 
 
 class _Reader:
-    """Reads typed values from a parsed document; errors name the file and the entry."""
+    """Reads typed values of a parsed document by their keys; FileError names the file and the entry if one is wrong."""
 
     def __init__(self, path: object, document: Mapping[str, Any]) -> None:
         self.path, self.document = path, document
@@ -440,7 +443,7 @@ class _Reader:
             raise self.error_for(".".join(keys), found, "a list of texts")
         return found
 
-    def items(self, *keys: str) -> list[dict[str, Any]]:
+    def objects(self, *keys: str) -> list[dict[str, Any]]:
         found = self.value(*keys)
         if not isinstance(found, list) or not all(isinstance(item, dict) for item in found):
             raise self.error_for(".".join(keys), found, "a list of objects")
@@ -485,7 +488,7 @@ def _text_of_item(read: _Reader, item: Mapping[str, Any], key: str, place: str) 
     return found
 
 
-def _require_pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
+def _checked_pair(values: FloatArray, read: _Reader) -> tuple[float, float]:
     if values.shape != (2,):
         raise read.error_for("field.origin_mm", values.tolist(), "two numbers")
     return float(values[0]), float(values[1])
@@ -505,16 +508,16 @@ def _dataclass_of_item(read: _Reader, kind: type[T], item: Mapping[str, Any], pl
 
 
 def _read_instrumentation(read: _Reader) -> Instrumentation:
-    def optional(key: str) -> float | None:
+    def optional_number(key: str) -> float | None:
         return None if read.value("instrumentation", key) is None else read.number("instrumentation", key)
 
     return Instrumentation(
         unit=read.text("instrumentation", "unit"),
-        min=optional("min"),
-        max=optional("max"),
-        step=optional("step"),
+        min=optional_number("min"),
+        max=optional_number("max"),
+        step=optional_number("step"),
         sensor=read.text("instrumentation", "sensor"),
-        height_mm=optional("height_mm"),
+        height_mm=optional_number("height_mm"),
         controls=tuple(read.texts("instrumentation", "controls")),
         description=read.text("instrumentation", "description"),
     )

@@ -18,7 +18,7 @@ from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray, IntArray, frozen
 from probewise._display import ShowsItself
-from probewise.calibration.start_density import StartDensity
+from probewise.calibration.reference_density import ReferenceDensity
 from probewise.inference import SensorProblem
 from probewise.nested.weights import n_effective, power_bracket, resampled_rows
 from probewise.priors import Coordinates
@@ -174,15 +174,17 @@ class _Particles:
 
     @property
     def log_target_over_reference(self) -> FloatArray:
+        """Log of prior times likelihood over the reference density, (n,)."""
         return self.log_likelihood - self.log_reference
 
     def log_tempered_density(self, beta: float) -> FloatArray:
+        """Log density at temperature `beta`, from the reference at 0 to the posterior at 1, up to a constant, (n,)."""
         return np.asarray(self.log_prior + beta * self.log_likelihood + (1.0 - beta) * self.log_reference)
 
 
 def run_smc(
     problem: SensorProblem,
-    reference: StartDensity,
+    reference: ReferenceDensity,
     rest: FloatArray,
     *,
     log_z_below: FloatArray,
@@ -248,15 +250,15 @@ def run_smc(
     n = len(rest) // n_clouds
     log_z = np.array(log_z_below)
 
-    def drawn() -> _Particles:
+    def draw_particles() -> _Particles:
         with np.errstate(invalid="ignore"):
             return evaluate(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
 
-    now = drawn()
+    now = draw_particles()
     while n_effective(now.log_target_over_reference) < least_effective * len(rest) and len(now.x) < _MOST_DRAWS * len(
         rest
     ):
-        now = now.joined_cloud_by_cloud(drawn(), n_clouds)
+        now = now.joined_cloud_by_cloud(draw_particles(), n_clouds)
     temperatures, accepted, overlap = [0.0], 0.0, 1.0
     while temperatures[-1] < 1.0 and len(temperatures) <= _MOST_TEMPERATURES:
         rise = now.log_target_over_reference
@@ -284,7 +286,9 @@ def run_smc(
         accepted = float(np.mean(shares))
         if beta == 1.0:
             now = evaluate(now.x)
-        log_ratio, share = _log_evidence_ratio(log_weight, (width * now.log_target_over_reference).reshape(n_clouds, n))
+        log_ratio, share = _log_evidence_ratio_and_overlap(
+            log_weight, (width * now.log_target_over_reference).reshape(n_clouds, n)
+        )
         log_z += log_ratio
         overlap = min(overlap, share)
         if progress is not None:
@@ -317,7 +321,7 @@ def run_smc(
 def _snapshots_of_posterior(
     now: _Particles,
     evaluate: Callable[[FloatArray], _Particles],
-    reference: StartDensity,
+    reference: ReferenceDensity,
     space: Coordinates,
     n_more: int,
     rng: np.random.Generator,
@@ -334,7 +338,7 @@ def _snapshots_of_posterior(
     return kept
 
 
-def _log_evidence_ratio(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
+def _log_evidence_ratio_and_overlap(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
     """Estimate by a bridge (Bennett 1976) the log ratio of two temperatures' evidences in each cloud, (n_clouds,).
 
     `before` and `after` are the log weights of particles of the one and of the other, (n_clouds, n) each. Also return
@@ -394,7 +398,7 @@ def _moved_by_differential_evolution(
 def _moved_by_independent_proposals(
     now: _Particles,
     evaluate: Callable[[FloatArray], _Particles],
-    reference: StartDensity,
+    reference: ReferenceDensity,
     space: Coordinates,
     beta: float,
     rng: np.random.Generator,

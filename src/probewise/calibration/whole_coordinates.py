@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.calibration.coordinates import MomentCoordinates, columns_by_kind
-from probewise.calibration.gaussian_responses import light_by_gaussian
+from probewise.calibration.coordinates import MomentCoordinates, view_by_kind_and_gaussian
+from probewise.calibration.gaussian_responses import total_light_by_gaussian
 from probewise.calibration.priors import SSFPrior
 
 # A Gaussian is faint where it holds at most this share of the light of the heaviest; the others are bright.
@@ -50,14 +50,14 @@ class WholeFootprintCoordinates:
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters to coordinates, both (n, 6 N + 2)."""
         x = self._moment_coordinates.enter(theta)
-        g = columns_by_kind(x)
+        g = view_by_kind_and_gaussian(x)
         ratio = np.exp(g[0, 1:])
         g[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
         mean, first = self._centre_of_others_and_first_share(g)
         covariance = _covariance_of_logs(g[3:6, 0])
         whole_mean = mean + first * g[1:3, 0]
         off = g[1:3, 0] - whole_mean
-        whole = first * (covariance + _second_moment_products(off)) + self._covariance_of_others(g, whole_mean)
+        whole = first * (covariance + _second_moment_products(off)) + self._covariance_from_others(g, whole_mean)
         g[1:3, 0] = whole_mean
         g[3:6, 0] = _logs_of_covariance(whole)
         return x
@@ -65,7 +65,7 @@ class WholeFootprintCoordinates:
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates to parameters, (n, 6 N + 2); also return the prior's log density, (n,)."""
         y = x.copy()
-        g = columns_by_kind(y)
+        g = view_by_kind_and_gaussian(y)
         # Sorted by mass; a clipped ratio must not pass for one that is.
         sorted_by_mass = (g[0, 1:2] <= 0.0).all(axis=0) & (g[0, 2:] <= g[0, 1:-1]).all(axis=0)
         g[0, 1:] = g[0, 1:].clip(-100.0, 0.0)
@@ -74,18 +74,18 @@ class WholeFootprintCoordinates:
         mean, first = self._centre_of_others_and_first_share(g)
         whole_mean, whole = g[1:3, 0].copy(), _covariance_of_logs(g[3:6, 0])
         # An extreme correlation is one in its last digit.
-        real = _is_covariance(whole)
+        real = _positive_definite_mask(whole)
         whole[:, ~real] = _UNIT
         g[1:3, 0] = (whole_mean - mean) / first
         off = g[1:3, 0] - whole_mean
-        own = (whole - self._covariance_of_others(g, whole_mean)) / first - _second_moment_products(off)
-        real &= _is_covariance(own)
+        own = (whole - self._covariance_from_others(g, whole_mean)) / first - _second_moment_products(off)
+        real &= _positive_definite_mask(own)
         own[:, ~real] = _UNIT
         g[3:6, 0] = _logs_of_covariance(own)
         heaviest = 1.0 / (1.0 + ratio.sum(axis=0))
         g[1:3, 0] = heaviest * (g[1:3, 0] + (ratio * g[1:3, 1:]).sum(axis=1))
         theta, log_density = self._moment_coordinates.leave(y)
-        log_density += 2.0 * np.log(heaviest) - 5.0 * np.log(first) + _log_volume(whole) - _log_volume(own)
+        log_density += 2.0 * np.log(heaviest) - 5.0 * np.log(first) + _log_volume_ratio(whole) - _log_volume_ratio(own)
         real &= sorted_by_mass & np.isfinite(log_density)
         if self.n_bright is not None:
             real &= 1 + (ratio > FAINT).sum(axis=0) == self.n_bright
@@ -108,7 +108,7 @@ class WholeFootprintCoordinates:
         light = self._tapered_shares(g)
         return (light * g[1:3, 1:]).sum(axis=1), 1.0 - light.sum(axis=0)
 
-    def _covariance_of_others(self, g: FloatArray, mean: FloatArray) -> FloatArray:
+    def _covariance_from_others(self, g: FloatArray, mean: FloatArray) -> FloatArray:
         """Sum the contributions of all but the first to the covariance of the whole, (3, n)."""
         off = g[1:3, 1:] - mean[:, None]
         return np.asarray(
@@ -118,7 +118,7 @@ class WholeFootprintCoordinates:
 
 def count_bright(theta: FloatArray) -> IntArray:
     """Count the Gaussians that hold more than `FAINT` of the heaviest one's light, (n, 6 N + 2) -> (n,)."""
-    light = light_by_gaussian(theta)
+    light = total_light_by_gaussian(theta)
     return np.asarray((light > FAINT * light.max(axis=1, keepdims=True)).sum(axis=1))
 
 
@@ -128,7 +128,8 @@ def _covariance_of_logs(logs: FloatArray) -> FloatArray:
     return np.stack([*variance, np.tanh(logs[2]) * np.sqrt(variance[0] * variance[1])])
 
 
-def _is_covariance(covariance: FloatArray) -> BoolArray:
+def _positive_definite_mask(covariance: FloatArray) -> BoolArray:
+    """Return a mask of variances and covariance that are positive definite, (3, ...) -> (...)."""
     xx, yy, xy = covariance
     return np.asarray((xx > 0.0) & (yy > 0.0) & (xy**2 < (1.0 - _LEAST) * xx * yy))
 
@@ -140,10 +141,11 @@ def _logs_of_covariance(covariance: FloatArray) -> FloatArray:
 
 
 def _second_moment_products(off: FloatArray) -> FloatArray:
+    """Compute x^2, y^2 and x y, (2, ...) -> (3, ...)."""
     return np.stack([off[0] ** 2, off[1] ** 2, off[0] * off[1]])
 
 
-def _log_volume(covariance: FloatArray) -> FloatArray:
+def _log_volume_ratio(covariance: FloatArray) -> FloatArray:
     """Log of the volume ratio of `_covariance_of_logs`, up to a constant, (3, ...) -> (...)."""
     xx, yy, xy = covariance
     product = xx * yy

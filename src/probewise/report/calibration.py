@@ -185,7 +185,7 @@ def ssf_table(sensor: FittedSensor) -> Markup:
         ("SSF", "unit", "median", "95 % interval"),
         (
             (without_unit(q.name), _unit_in_words(q.unit), *value_and_interval(q.median, *q.interval95))
-            for q in sensor.ssf()
+            for q in sensor.ssf_quantities()
         ),
         caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "
         "and of the angle of the long axis from the x' axis, anticlockwise.",

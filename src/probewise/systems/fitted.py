@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_kind
-from probewise._posterior_samples import NamedSamples, interval_table, require_masks_of_absent_effects, require_samples
+from probewise._posterior_samples import NamedSamples, checked_samples, interval_table, require_masks_of_absent_effects
 from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError
@@ -80,7 +80,7 @@ class FittedSystem(NamedSamples):
     version: str = __version__
 
     def __post_init__(self) -> None:
-        samples, noise_sd = require_samples(self.samples, self.noise_sd, self.names)
+        samples, noise_sd = checked_samples(self.samples, self.noise_sd, self.names)
         own = {name.partition("[")[0] for name in self.names if name.partition("[")[0] in self.simulator.parameters}
         lacking = [name for name in self.simulator.parameters if name not in own]
         if lacking:

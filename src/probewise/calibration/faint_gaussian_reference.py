@@ -17,7 +17,7 @@ import numpy as np
 from scipy.special import logsumexp, ndtr, ndtri
 
 from probewise._arrays import FloatArray
-from probewise.calibration.compensation import CompensatingShift, Compensation
+from probewise.calibration.compensation import CompensatedShapeProposal, CompensatingShift
 from probewise.calibration.priors import SSFPrior
 from probewise.calibration.whole_coordinates import FAINT, count_bright
 from probewise.errors import ParameterError
@@ -44,17 +44,19 @@ _TINY = float(np.finfo(float).tiny)
 
 
 def has_uniform_light(prior: SSFPrior) -> bool:
-    """Whether the light that a Gaussian holds is uniform from nothing: what `FaintGaussianReference` is made for."""
+    """Return whether the prior of a Gaussian's light is uniform from 0, as `FaintGaussianReference` requires."""
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
 
 
 class _AddGaussian(Protocol):
+    """A function that adds a Gaussian to each sample of N - 1, (n, 6 N - 4) -> (n, 6 N + 2)."""
+
     def __call__(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray: ...
 
 
 @dataclass(frozen=True)
-class JumpProposal:
-    """A proposal that jumps from N - 1 sorted Gaussians to N.
+class AddedGaussianProposal:
+    """A proposal of N sorted Gaussians that adds one to N - 1, and its inverse.
 
     Attributes
     ----------
@@ -84,7 +86,7 @@ class FaintGaussianReference:
       prior's unit, and r the new one's density over its prior's below m: N! p_N L r / (N m Z). r mixes Gaussians of the
       prior, light ones more often, and some near one of the others.
     - One is added and the others shift, by an amount that depends on the new one and the masses alone, so that volumes
-      stay; see `Compensation`.
+      stay; see `CompensatedShapeProposal`.
     - A bright one is split. Its moments (mass, mass times centre, mass times second moment) lose those of
       the new one, which lies near it; at a fixed new one that is a shift, so volumes of moments stay.
 
@@ -105,7 +107,7 @@ class FaintGaussianReference:
 
     prior: SSFPrior
     below: SensorProblem
-    compensation: Compensation
+    compensation: CompensatedShapeProposal
     n_bright: int
 
     def __post_init__(self) -> None:
@@ -113,23 +115,25 @@ class FaintGaussianReference:
             raise ParameterError("prior", self.prior, "a prior of 2 Gaussians or more, with masses uniform from 0 to 1")
 
     @cached_property
-    def proposals(self) -> tuple[JumpProposal, ...]:
+    def proposals(self) -> tuple[AddedGaussianProposal, ...]:
         """The proposals that the density mixes."""
         return (
             *(
-                JumpProposal(
+                AddedGaussianProposal(
                     _SPLIT / self.n_bright,
-                    partial(self.split_bright_gaussian, label=label),
-                    partial(self.merge_into_bright_gaussian, label=label),
+                    partial(self.split_gaussian_off_bright_one, label=label),
+                    partial(self.merge_last_gaussian_into_bright_one, label=label),
                 )
                 for label in range(self.n_bright)
             ),
-            JumpProposal(
+            AddedGaussianProposal(
                 _ADDED,
                 self.with_drawn_gaussian,
                 lambda theta: (self.without_last_gaussian(theta), self.log_density_of_drawn_gaussian(theta)),
             ),
-            JumpProposal(1.0 - _ADDED - _SPLIT, self.with_compensated_gaussian, self.without_compensated_gaussian),
+            AddedGaussianProposal(
+                1.0 - _ADDED - _SPLIT, self.with_compensated_gaussian, self.without_compensated_gaussian
+            ),
         )
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
@@ -159,13 +163,15 @@ class FaintGaussianReference:
         there, log_drawn = np.empty(here.shape), np.empty(len(here))
         split = rng.random(len(here)) < _RESPLIT
         for rows, move in (
-            (np.flatnonzero(split), self._with_faint_one_split_elsewhere),
-            (np.flatnonzero(~split), self._with_faint_one_replaced),
+            (np.flatnonzero(split), self._propose_faint_one_split_elsewhere),
+            (np.flatnonzero(~split), self._propose_faint_one_replaced),
         ):
             there[rows], log_drawn[rows] = move(here[rows], rng=rng)
         return there, log_drawn
 
-    def _with_faint_one_replaced(self, here: FloatArray, *, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    def _propose_faint_one_replaced(
+        self, here: FloatArray, *, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
         """Take away any Gaussian but the first, undo the shift of the others, add another one and shift them for it.
 
         The new one may be as heavy as the first, so that all others are moved, not the lightest alone. `here` is
@@ -182,10 +188,10 @@ class FaintGaussianReference:
         there, log_drawn = np.full(here.shape, np.nan), np.full(m, -np.inf)
         rows = np.flatnonzero(np.isfinite(log_here))
         if rows.size:
-            after, last, answer = self._draw_compensated(before[rows], False, rng)
+            after, last, answer = self._draw_gaussian_and_compensate(before[rows], False, rng)
             real = np.isfinite(after).all(axis=1)
             rows, after, last, answer = rows[real], after[real], last[real], answer.take(np.flatnonzero(real))
-            there[rows] = _insert_gaussian(after, last)
+            there[rows] = _insert_gaussian_before_levels(after, last)
             log_there = self._undo_compensation(after, last, answer, False)[1]
             log_drawn[rows] = np.where(np.isfinite(log_there), log_here[rows] - log_there, -np.inf)
         return there, log_drawn
@@ -195,19 +201,19 @@ class FaintGaussianReference:
         return np.concatenate([theta[:, :-8], theta[:, -2:]], axis=1)
 
     def with_drawn_gaussian(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
-        """Add a Gaussian drawn from r to N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2)."""
+        """Add a Gaussian, drawn from the class's r, to N - 1 sorted ones, (n, 6 N - 4) -> (n, 6 N + 2)."""
         n = len(rest)
         near = rng.random(n) < _NEAR
         last = self.prior.from_unit_cube(rng.random((n, len(self.prior.names))))[:, :6]
-        last[near] = self._draw_shapes_near_others(rest[near], rng)
+        last[near] = self._draw_gaussians_near_others(rest[near], rng)
         ratio = np.where(near, 1.0 - rng.random(len(rest)), _draw_mass_ratios(len(rest), rng))
         last[:, 0] = (
             ratio * self._greatest_faint_mass(self._masses(rest), last_of_all=True) * self._amplitude_scale(last)
         )
-        return _insert_gaussian(rest, last)
+        return _insert_gaussian_before_levels(rest, last)
 
     def log_density_of_drawn_gaussian(self, theta: FloatArray) -> FloatArray:
-        """Log of r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
+        """Log of the class's r / m at the last Gaussian, (n, 6 N + 2) -> (n,)."""
         mass = self._masses(theta)
         least = self._greatest_faint_mass(mass[:, :-1], last_of_all=True)
         near = self._log_density_near_others(theta[:, -8:-2], self.without_last_gaussian(theta))
@@ -216,15 +222,15 @@ class FaintGaussianReference:
 
     def with_compensated_gaussian(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray:
         """Add a Gaussian to N - 1 sorted ones and shift these, (n, 6 N - 4) -> (n, 6 N + 2)."""
-        return _insert_gaussian(*self._draw_compensated(rest, True, rng)[:2])
+        return _insert_gaussian_before_levels(*self._draw_gaussian_and_compensate(rest, True, rng)[:2])
 
     def without_compensated_gaussian(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Undo `with_compensated_gaussian`; also return the log density as `JumpProposal.back` does."""
+        """Undo `with_compensated_gaussian`; also return the log density as `AddedGaussianProposal.back` does."""
         last = theta[:, -8:-2]
         answer = self.compensation.linear.compensating_shift(last)
         return self._undo_compensation(self.without_last_gaussian(theta), last, answer, True)
 
-    def _draw_compensated(
+    def _draw_gaussian_and_compensate(
         self, rest: FloatArray, last_of_all: bool, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray, CompensatingShift]:
         """Draw a Gaussian and shift N - 1 others, sorted by mass, to compensate for it.
@@ -233,11 +239,11 @@ class FaintGaussianReference:
         """
         last, answer = self.compensation.draw(len(rest), rng=rng)
         near = np.flatnonzero(rng.random(len(rest)) < _NEAR)
-        last[near] = self._draw_shapes_near_others(rest[near], rng)
+        last[near] = self._draw_gaussians_near_others(rest[near], rng)
         answer = answer.with_rows_replaced(near, self.compensation.linear.compensating_shift(last[near]))
         masses = self._masses(rest)
         whole, most = masses.sum(axis=1), self._greatest_faint_mass(masses, last_of_all=last_of_all)
-        told = answer.draw_share(most / (whole + most), rng=rng)
+        told = answer.draw_light_share(most / (whole + most), rng=rng)
         by_share = rng.random(len(rest)) < _TOLD
         ratio = np.where(by_share, told / (1.0 - told) * whole / most, _draw_mass_ratios(len(rest), rng))
         last[:, 0] = ratio * most * self._amplitude_scale(last)
@@ -249,7 +255,7 @@ class FaintGaussianReference:
     def _undo_compensation(
         self, after: FloatArray, last: FloatArray, answer: CompensatingShift, last_of_all: bool
     ) -> tuple[FloatArray, FloatArray]:
-        """Undo `_draw_compensated`; also return the log density as `JumpProposal.back` does."""
+        """Undo `_draw_gaussian_and_compensate`; also return the log density as `AddedGaussianProposal.back` does."""
         coordinates = self.compensation.coordinates
         masses, mass = self._masses(after), last[:, 0] / self._amplitude_scale(last)
         whole, most = masses.sum(axis=1), self._greatest_faint_mass(masses, last_of_all=last_of_all)
@@ -257,7 +263,7 @@ class FaintGaussianReference:
         x = coordinates.enter(after)
         log_after = coordinates.leave(x)[1]
         before, log_before = coordinates.leave(x - share[:, None] * answer.shift)
-        log_share = answer.log_share_density(share, most / (whole + most))
+        log_share = answer.log_light_share_density(share, most / (whole + most))
         log_share += np.log(most * whole) - 2.0 * np.log(whole + mass)  # d share / d ratio
         log_ratio = np.logaddexp(math.log(1.0 - _TOLD) + _log_density_of_mass_ratio(ratio), math.log(_TOLD) + log_share)
         near = self._log_density_near_others(last, np.where(np.isfinite(log_before)[:, None], before, after))
@@ -268,7 +274,7 @@ class FaintGaussianReference:
             found = log_shape + log_ratio - np.log(most) + log_before - log_after
         return before, np.where((ratio < 1.0) & np.isfinite(found), found, -np.inf)
 
-    def _draw_shapes_near_others(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def _draw_gaussians_near_others(self, rest: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Draw Gaussians near one of the others, their mass to be replaced, (n, 6 N - 4) -> (n, 6)."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
@@ -280,23 +286,25 @@ class FaintGaussianReference:
     def _log_density_near_others(self, last: FloatArray, rest: FloatArray) -> FloatArray:
         """Log density of shapes, (n, 6), near one of the others, over the prior's, (n,)."""
         centre, width = self._cube_places_and_kernel_widths(rest)
-        at = self._cube_places_and_kernel_widths(_insert_gaussian(rest[:, -2:], last))[0]
+        at = self._cube_places_and_kernel_widths(_insert_gaussian_before_levels(rest[:, -2:], last))[0]
         return np.asarray(
             logsumexp(_log_truncated_normal_density(at, centre, width), axis=1) - math.log(self.prior.n_gaussians - 1)
         )
 
-    def split_bright_gaussian(self, rest: FloatArray, label: int, *, rng: np.random.Generator) -> FloatArray:
+    def split_gaussian_off_bright_one(self, rest: FloatArray, label: int, *, rng: np.random.Generator) -> FloatArray:
         """Split a Gaussian off a bright one, (n, 6 N - 4) -> (n, 6 N + 2); nan where nothing of that one is left."""
-        last = self._draw_near_bright(rest, label, self._greatest_faint_mass(self._masses(rest), last_of_all=True), rng)
+        last = self._draw_gaussian_near_bright_one(
+            rest, label, self._greatest_faint_mass(self._masses(rest), last_of_all=True), rng
+        )
         return self._split_off(rest, label, last)
 
-    def merge_into_bright_gaussian(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
-        """Undo `split_bright_gaussian`; also return the log density as `JumpProposal.back` does."""
+    def merge_last_gaussian_into_bright_one(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
+        """Undo `split_gaussian_off_bright_one`; also return the log density as `AddedGaussianProposal.back` does."""
         rest = self._merge_into_bright(self.without_last_gaussian(theta), label, theta[:, -8:-2])
         most = self._greatest_faint_mass(self._masses(rest), last_of_all=True)
         return rest, self._log_density_of_split(rest, self.without_last_gaussian(theta), label, theta[:, -8:-2], most)
 
-    def _with_faint_one_split_elsewhere(
+    def _propose_faint_one_split_elsewhere(
         self, here: FloatArray, *, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
         """Merge a faint Gaussian into a bright one, and split another off a bright one; returns as `propose`."""
@@ -316,7 +324,7 @@ class FaintGaussianReference:
             rest = self._merge_into_bright(others, to_bright, last)
             most = self._greatest_faint_mass(self._masses(rest), last_of_all=False)
             log_here = self._log_density_of_split(rest, others, to_bright, last, most)
-            new_last = self._draw_near_bright(rest, of_bright, most, rng)
+            new_last = self._draw_gaussian_near_bright_one(rest, of_bright, most, rng)
             new = self._split_off(rest, of_bright, new_last)
             log_there = self._log_density_of_split(rest, self.without_last_gaussian(new), of_bright, new_last, most)
             there[rows] = new
@@ -326,7 +334,9 @@ class FaintGaussianReference:
                 )
         return there, log_drawn
 
-    def _draw_near_bright(self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator) -> FloatArray:
+    def _draw_gaussian_near_bright_one(
+        self, rest: FloatArray, label: int, most: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
         """Draw a Gaussian near a bright one, (n, 6), of a mass up to `most`."""
         n = len(rest)
         u = rng.random((n, len(self.prior.names)))
@@ -339,8 +349,8 @@ class FaintGaussianReference:
     def _split_off(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
         """Subtract a Gaussian's moments from those of a bright one, and append it; nan where nothing would be left."""
         own = slice(6 * label, 6 * label + 6)
-        left = self._from_moments(self._moments(rest[:, own]) - self._moments(last))
-        out = _insert_gaussian(rest, last)
+        left = self._gaussian_from_moments(self._moments_of_gaussian(rest[:, own]) - self._moments_of_gaussian(last))
+        out = _insert_gaussian_before_levels(rest, last)
         out[:, own] = left
         return np.where(np.isfinite(left).all(axis=1, keepdims=True), out, np.nan)
 
@@ -348,17 +358,19 @@ class FaintGaussianReference:
         """Add a Gaussian's moments to those of a bright one, keeping light, centre and covariance of the two."""
         own = slice(6 * label, 6 * label + 6)
         out = others.copy()
-        out[:, own] = self._from_moments(self._moments(others[:, own]) + self._moments(last))
+        out[:, own] = self._gaussian_from_moments(
+            self._moments_of_gaussian(others[:, own]) + self._moments_of_gaussian(last)
+        )
         return out
 
     def _log_density_of_split(
         self, rest: FloatArray, others: FloatArray, label: int, last: FloatArray, most: FloatArray
     ) -> FloatArray:
-        """Log density of a split over the prior's, (n,), without the factors that `JumpProposal` names; may be -inf."""
+        """Log density of a split over the prior's, (n,), as `AddedGaussianProposal.back` returns it; may be -inf."""
         own = slice(6 * label, 6 * label + 6)
         centre, width = self._cube_places_and_kernel_widths(rest)
         ratio = last[:, 0] / self._amplitude_scale(last) / np.maximum(most, _TINY)
-        at = self._cube_places_and_kernel_widths(_insert_gaussian(rest[:, -2:], last))[0][:, 0]
+        at = self._cube_places_and_kernel_widths(_insert_gaussian_before_levels(rest[:, -2:], last))[0][:, 0]
         # At a fixed last Gaussian the moments of the bright one are shifted, so volumes in them stay.
         with np.errstate(divide="ignore", invalid="ignore"):
             found = self._log_prior_of_moments(rest[:, own], rest) - self._log_prior_of_moments(others[:, own], rest)
@@ -379,7 +391,7 @@ class FaintGaussianReference:
         log_prob = alone.log_prob_by_kind(g.T[:, None].copy(), levels_of[:, -2], levels_of[:, -1])
         return np.asarray(log_prob - 5.0 * log_mass + 3.5 * log_det)
 
-    def _moments(self, g: FloatArray) -> FloatArray:
+    def _moments_of_gaussian(self, g: FloatArray) -> FloatArray:
         """Mass, first and second moments about the origin, (n, 6) -> (n, 6)."""
         det = g[:, 3] * g[:, 4] - g[:, 5] ** 2
         u, v = g[:, 1], g[:, 2]
@@ -387,7 +399,7 @@ class FaintGaussianReference:
         each = [ones, u, v, 0.5 * g[:, 4] / det + u * u, 0.5 * g[:, 3] / det + v * v, -0.5 * g[:, 5] / det + u * v]
         return np.stack(each, axis=1) * (g[:, 0] / self._amplitude_scale(g))[:, None]
 
-    def _from_moments(self, m: FloatArray) -> FloatArray:
+    def _gaussian_from_moments(self, m: FloatArray) -> FloatArray:
         """Compute a Gaussian's parameters from its moments, (n, 6) -> (n, 6); nan where no Gaussian has them."""
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = m[:, 1] / m[:, 0], m[:, 2] / m[:, 0]
@@ -404,6 +416,7 @@ class FaintGaussianReference:
         return np.asarray(np.minimum(most, masses.min(axis=1)) if last_of_all else most)
 
     def _amplitude_scale(self, g: FloatArray) -> FloatArray:
+        """Amplitudes that Gaussians of these widths have at unit mass, (..., 6) -> (...)."""
         return self.prior.amplitude_scale(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
 
     def _masses(self, theta: FloatArray) -> FloatArray:
@@ -434,7 +447,7 @@ class FaintGaussianReference:
         return centre, width
 
 
-def _insert_gaussian(rest: FloatArray, last: FloatArray) -> FloatArray:
+def _insert_gaussian_before_levels(rest: FloatArray, last: FloatArray) -> FloatArray:
     """Put a Gaussian, (n, 6), before the levels, (n, 6 N - 4) -> (n, 6 N + 2)."""
     return np.concatenate([rest[:, :-2], last, rest[:, -2:]], axis=1)
 
@@ -448,6 +461,7 @@ def _draw_mass_ratios(n: int, rng: np.random.Generator) -> FloatArray:
 
 
 def _log_density_of_mass_ratio(ratio: FloatArray) -> FloatArray:
+    """Log of the density from which `_draw_mass_ratios` draws, (n,)."""
     light = (1.0 - _EVEN_MASS) / (-math.log(_LEAST_RATIO) * np.maximum(ratio, _TINY))
     return np.asarray(np.log(_EVEN_MASS + np.where(ratio > _LEAST_RATIO, light, 0.0)))
 

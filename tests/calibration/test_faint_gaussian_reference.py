@@ -8,12 +8,12 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SSFPrior, default_prior
-from probewise.calibration.compensation import Compensation
+from probewise.calibration.compensation import CompensatedShapeProposal
+from probewise.calibration.faint_gaussian_reference import FaintGaussianReference, has_uniform_light
+from probewise.calibration.label_symmetric_coordinates import LabelSymmetricCoordinates
 from probewise.calibration.mixed_reference import MixedReference
 from probewise.calibration.order_problems import OrderProblems
-from probewise.calibration.peak_coordinates import PeakCoordinates
 from probewise.calibration.peak_density import PeakDensity, StudentTDensity
-from probewise.calibration.reference import FaintGaussianReference, has_uniform_light
 from probewise.calibration.whole_coordinates import FAINT, count_bright
 from probewise.errors import ParameterError
 from probewise.inference import SensorProblem
@@ -42,7 +42,7 @@ PARTS = [(2, 1), (3, 1), (3, 2)]
 
 @pytest.fixture
 def references(
-    recording: Recording, make_compensation: Callable[..., Compensation]
+    recording: Recording, make_compensation: Callable[..., CompensatedShapeProposal]
 ) -> dict[tuple[int, int], FaintGaussianReference]:
     silent, rng = cast("SensorProblem", _Silent()), np.random.default_rng(30)
     return {
@@ -84,7 +84,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
     references: dict[tuple[int, int], FaintGaussianReference], recording: Recording
 ) -> None:
     """Where the recording says nothing: mean weight the share of the prior with one bright Gaussian, four errors."""
-    rng, space = np.random.default_rng(36), PeakCoordinates(references[2, 1].prior)
+    rng, space = np.random.default_rng(36), LabelSymmetricCoordinates(references[2, 1].prior)
     y = space.enter(space.prior.from_unit_cube(rng.random((2000, 14))))
     peaks = tuple(
         PeakDensity(space, StudentTDensity(y.mean(axis=0), width * np.linalg.cholesky(np.cov(y, rowvar=False))))
@@ -139,7 +139,7 @@ def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth:
     covariance = noise_sd**2 * np.linalg.inv(slope @ slope.T)
     x = np.tile(centre, (4000, 1))
     x[:, told] += rng.standard_normal((4000, 6)) @ np.linalg.cholesky(covariance).T
-    compensation = Compensation.from_samples(problem, space, problem, space.leave(x)[0], rng=rng, n_pool=10)
+    compensation = CompensatedShapeProposal.from_samples(problem, space, problem, space.leave(x)[0], rng=rng, n_pool=10)
     other = np.array([[1.0, 4.0, -3.0, 0.02, 0.05, 0.0]])
     lone = np.concatenate([other, truth[None, -2:]], axis=1)
     change = problem.model.predict(lone, recording.plan)[0] - predicted(centre)[0]
@@ -153,7 +153,7 @@ def test_compensation_is_the_refit_of_least_squares(recording: Recording, truth:
 
 
 def test_the_pool_grows_until_enough_of_its_shapes_are_effective(
-    make_compensation: Callable[..., Compensation],
+    make_compensation: Callable[..., CompensatedShapeProposal],
 ) -> None:
     compensation = make_compensation(2, np.random.default_rng(33), n_pool=60_000)
     log_asked = 0.8 * compensation.answers.log_bayes_factor(compensation.most)
@@ -171,10 +171,10 @@ def test_a_split_keeps_light_centre_and_covariance(
     rng = np.random.default_rng(32)
     rest, _ = _sorted_draws(default_prior(recording, n - 1), 200, m, rng)
     for label in range(m):
-        split = references[n, m].split_bright_gaussian(rest, label, rng=rng)
+        split = references[n, m].split_gaussian_off_bright_one(rest, label, rng=rng)
         alive = np.isfinite(split).all(axis=1)
         assert alive.sum() > 50
-        merged, log_density = references[n, m].merge_into_bright_gaussian(split[alive], label)
+        merged, log_density = references[n, m].merge_last_gaussian_into_bright_one(split[alive], label)
         np.testing.assert_allclose(merged, rest[alive], rtol=1e-6)
         assert np.isfinite(log_density).mean() > 0.5
 
@@ -192,7 +192,7 @@ def test_only_a_uniform_prior_of_light_has_a_reference(
 
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_gaussians_that_are_redrawn_leave_the_prior_as_it_is(
-    make_compensation: Callable[..., Compensation], recording: Recording, n: int, m: int
+    make_compensation: Callable[..., CompensatedShapeProposal], recording: Recording, n: int, m: int
 ) -> None:
     """Where the recording says nothing: means and mean squares in the prior's cube, within five errors of uniform ones.
 

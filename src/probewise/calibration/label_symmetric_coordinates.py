@@ -21,13 +21,16 @@ _MOST_LOG = 60.0
 
 
 @dataclass(frozen=True)
-class PeakCoordinates:
-    """Coordinates of N Gaussians whose light is uniform from 0 to a unit; see `has_uniform_light`."""
+class LabelSymmetricCoordinates:
+    """Coordinates of N Gaussians in which a permutation of labels changes no volume.
+
+    `prior`: of N Gaussians with light uniform from 0 to a unit; see `has_uniform_light`.
+    """
 
     prior: SSFPrior
 
     @cached_property
-    def _log_contrasts(self) -> FloatArray:
+    def _contrast_matrix(self) -> FloatArray:
         """Orthonormal contrasts of N logs, (N - 1, N)."""
         n = self.prior.n_gaussians
         rows = [np.r_[np.ones(k), -float(k), np.zeros(n - k - 1)] / math.sqrt(k * (k + 1)) for k in range(1, n)]
@@ -40,15 +43,15 @@ class PeakCoordinates:
         Each has the order of the columns of shapes and levels, (5 N + 2,), and the matrix that turns the contrasts,
         (N - 1, N - 1).
         """
-        n, c = self.prior.n_gaussians, self._log_contrasts
+        n, c = self.prior.n_gaussians, self._contrast_matrix
         found = []
         for order in itertools.permutations(range(n)):
             columns = np.concatenate([*(np.arange(5 * k, 5 * k + 5) for k in order), [5 * n, 5 * n + 1]])
             found.append((columns, c[:, np.argsort(order)] @ c.T))
         return tuple(found)
 
-    def permute_labels(self, y: FloatArray, change: tuple[IntArray, FloatArray]) -> FloatArray:
-        """Permute the labels of the Gaussians in coordinates, (n, 6 N + 1) -> (n, 6 N + 1)."""
+    def apply_label_permutation(self, y: FloatArray, change: tuple[IntArray, FloatArray]) -> FloatArray:
+        """Relabel the Gaussians in coordinates, (n, 6 N + 1) -> (n, 6 N + 1), by one of `label_permutations`."""
         columns, matrix = change
         k = self.prior.n_gaussians - 1
         return np.concatenate([y[:, :k] @ matrix.T, y[:, k:][:, columns]], axis=1)
@@ -65,7 +68,7 @@ class PeakCoordinates:
         shape[..., 3] = np.log(0.5 * g[..., 3] / det)
         shape[..., 4] = np.arctanh(-g[..., 5] / np.sqrt(g[..., 3] * g[..., 4]))
         return np.concatenate(
-            [log_light @ self._log_contrasts.T, shape.reshape(len(theta), 5 * n), theta[:, -2:]], axis=1
+            [log_light @ self._contrast_matrix.T, shape.reshape(len(theta), 5 * n), theta[:, -2:]], axis=1
         )
 
     def leave(self, y: FloatArray, sum_of_logs: FloatArray | None = None) -> tuple[FloatArray, FloatArray]:
@@ -83,7 +86,7 @@ class PeakCoordinates:
         Parameters, (n, 6 N + 2), and log density, (n,); -inf outside the prior's support.
         """
         n = self.prior.n_gaussians
-        log_light = (y[:, : n - 1] @ self._log_contrasts).clip(-_MOST_LOG, _MOST_LOG)
+        log_light = (y[:, : n - 1] @ self._contrast_matrix).clip(-_MOST_LOG, _MOST_LOG)
         most = log_light.max(axis=1)
         shape = y[:, n - 1 : -2].reshape(len(y), n, 5)
         log_variance = shape[..., 2:4].clip(-_MOST_LOG, _MOST_LOG)

@@ -10,7 +10,7 @@ from probewise._arrays import FloatArray
 from probewise.calibration.priors import SSFPrior
 
 
-class StartDensity(Protocol):
+class ReferenceDensity(Protocol):
     """A normalised density of N Gaussians that particles start from."""
 
     @property
@@ -38,7 +38,7 @@ class StartDensity(Protocol):
 
 
 def propose_independently(
-    density: StartDensity, here: FloatArray, *, rng: np.random.Generator
+    density: ReferenceDensity, here: FloatArray, *, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Draw from a density, independently of the particles `here`, (n, 6 N + 2).
 

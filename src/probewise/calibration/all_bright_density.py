@@ -14,7 +14,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.calibration.peak_density import StudentTDensity
 from probewise.calibration.priors import SSFPrior
-from probewise.calibration.start_density import propose_independently
+from probewise.calibration.reference_density import propose_independently
 from probewise.calibration.whole_coordinates import WholeFootprintCoordinates
 
 # Of the others' log ratios to the heaviest: mean and sd; in units of the whole: variance of places, sd of the logs.
@@ -25,14 +25,14 @@ _WIDENED = 2.0
 
 
 @dataclass(frozen=True, eq=False)
-class SharedLightDensity:
-    """A Student-t in `WholeFootprintCoordinates`: a `StartDensity`."""
+class AllBrightDensity:
+    """A Student-t in `WholeFootprintCoordinates`: a `ReferenceDensity`."""
 
     space: WholeFootprintCoordinates
     one: StudentTDensity
 
     @classmethod
-    def from_samples_below(cls, space: WholeFootprintCoordinates, fewer: FloatArray) -> SharedLightDensity:
+    def from_samples_below(cls, space: WholeFootprintCoordinates, fewer: FloatArray) -> AllBrightDensity:
         """Make the density of N Gaussians from samples `fewer` of N - 1 in such coordinates, (n, 6 N - 4)."""
         d = fewer.shape[1] + 6
         own, last = np.r_[: d - 8, d - 2, d - 1], np.arange(d - 8, d - 2)

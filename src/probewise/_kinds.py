@@ -59,7 +59,7 @@ def require_pair(name: str, value: object, allowed: str = "two finite numbers (x
     raise ParameterError(name, value, allowed)
 
 
-def require_one_or_several(name: str, value: object) -> tuple[float, ...]:
+def require_one_or_several_numbers(name: str, value: object) -> tuple[float, ...]:
     """Return a number, or each of a list of finite numbers, as a tuple; raise ParameterError for a text or None."""
     if isinstance(value, Real):
         value = (value,)

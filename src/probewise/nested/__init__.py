@@ -9,12 +9,12 @@ from probewise.nested.dead_points import DeadPoints
 from probewise.nested.diversify import DiversifyTally, diversify
 from probewise.nested.dynamic import Goal, intensified
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
+from probewise.nested.function_problem import FunctionProblem, Posed, make_problem, pose
 from probewise.nested.genealogy import chain_memory, relative_lineage_variance
 from probewise.nested.importance import Weighted, pareto_k, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
 from probewise.nested.merging import agreement_of, alive_at_death, merge
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
-from probewise.nested.pose import Posed, pose
 from probewise.nested.refine import refine
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
@@ -42,6 +42,7 @@ __all__ = [
     "DiversifyTally",
     "Evaluator",
     "EvidenceChange",
+    "FunctionProblem",
     "Goal",
     "KernelMove",
     "Move",
@@ -67,6 +68,7 @@ __all__ = [
     "diversify_by_kernels",
     "intensified",
     "least_live",
+    "make_problem",
     "merge",
     "pareto_k",
     "pose",

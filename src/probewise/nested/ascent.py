@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.nested.evaluate import Evaluator, Points
-from probewise.nested.repartition import principal_root, root_of_covariance
+from probewise.nested.repartition import covariance_root_of_points, root_of_covariance
 from probewise.nested.result import NestedResult
 from probewise.nested.space import within_bounds_mask
 
@@ -85,4 +85,6 @@ def gaussian_of_last_live_points(run: NestedResult, evaluate: Evaluator) -> Gaus
     """Return the start of a climb: mean and covariance of a run's last live points, and the highest of them."""
     last = slice(-run.n_live, None)
     live = evaluate.points_from_known_values(run.theta[last], run.log_likelihood[last], run.label[last])
-    return GaussianAtPeak(live.take(live.rows_by_rising_likelihood()[-1:]), live.u.mean(axis=0), principal_root(live.u))
+    return GaussianAtPeak(
+        live.take(live.rows_by_rising_likelihood()[-1:]), live.u.mean(axis=0), covariance_root_of_points(live.u)
+    )

@@ -16,7 +16,7 @@ from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.importance import HeldOutSamples, Posterior, Weighted, draw_and_weigh
 from probewise.nested.mixture import single_student_t
 from probewise.nested.moves import SliceMove
-from probewise.nested.repartition import principal_root
+from probewise.nested.repartition import covariance_root_of_points
 from probewise.nested.space import Space, unbounded_space_of
 from probewise.nested.weights import n_effective
 
@@ -94,7 +94,7 @@ def draw_uniformly_near_hilltop(top: GaussianAtPeak, evaluate: Evaluator, rng: n
     highest, log_volume = top.highest_log_likelihood, -math.inf
     for _ in range(_ROUNDS):
         drawn, _ = move.draw(starts, Bound(highest - below, 1.0), live, evaluate, rng)
-        last, log_volume = log_volume, float(np.linalg.slogdet(principal_root(drawn.u))[1])
+        last, log_volume = log_volume, float(np.linalg.slogdet(covariance_root_of_points(drawn.u))[1])
         rise = max(float(drawn.log_likelihood.max()) - highest, 0.0)
         if rise < _SETTLED and abs(log_volume - last) < _SETTLED * math.sqrt(n_params):
             break

@@ -14,7 +14,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, IntArray
 from probewise.nested.ascent import GaussianAtPeak
 from probewise.nested.evaluate import Evaluator, Points
-from probewise.nested.repartition import principal_root
+from probewise.nested.repartition import covariance_root_of_points
 from probewise.nested.result import NestedResult
 from probewise.nested.space import Space, within_bounds_mask
 
@@ -47,10 +47,10 @@ def sds_after_early_dead_points(run: NestedResult, space: Space) -> FloatArray:
     return np.asarray(np.maximum(space.enter(run.theta[last : last + _BLOCK]).std(axis=0), 1e-300))
 
 
-def tops_from_early_points(
+def peaks_climbed_from_early_points(
     first: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> list[GaussianAtPeak]:
-    """Climb from early dead points that a dip separates from the posterior; return the tops that are high and apart.
+    """Climb from early dead points that a dip separates from the posterior; return peaks that are high and apart.
 
     At most `max_calls` evaluations, counted by `evaluate`, are used for lines to the posterior, and some for climbs.
     """
@@ -70,7 +70,7 @@ def tops_from_early_points(
     if not apart.size:
         return []
     chosen = apart[_rows_far_apart(start.u[apart] / scale, start.log_likelihood[apart])]
-    roots = np.stack([principal_root(u[row : row + _BLOCK]) for row in rows[chosen]])
+    roots = np.stack([covariance_root_of_points(u[row : row + _BLOCK]) for row in rows[chosen]])
     now, scales = _climb_along_random_lines(start.take(chosen), roots, evaluate, rng)
     # Of the evidence below a level a lost mode holds no more than its share of live points there.
     enough = first.log_likelihood[last] - _FROM_TOP * n_params

@@ -26,7 +26,7 @@ from probewise.nested.hills import (
     log_evidence_of_unmet_hills,
 )
 from probewise.nested.importance import Posterior
-from probewise.nested.lost import sds_after_early_dead_points, separated_by_dip_mask, tops_from_early_points
+from probewise.nested.lost import peaks_climbed_from_early_points, sds_after_early_dead_points, separated_by_dip_mask
 from probewise.nested.result import NestedResult
 
 DISAGREE = 2.5
@@ -109,16 +109,16 @@ def find_missed_hills(
         gaussian_of_last_live_points(run, evaluate), evaluate, max_calls=calls_left(_ASCENT_SHARE), rng=rng
     )
     if lost is None:
-        tops = tops_from_early_points(run, evaluate, max_calls=calls_left(), rng=rng)
+        tops = peaks_climbed_from_early_points(run, evaluate, max_calls=calls_left(), rng=rng)
         if top.highest_log_likelihood > float(run.log_likelihood.max()) + _FAR_ABOVE * len(run.names):
             tops.append(top)
-        lost = _hills_not_met(tops, run, evaluate, max_calls=calls_left(_WEIGHING_SHARE), rng=rng)
+        lost = _weigh_hills_and_keep_unmet(tops, run, evaluate, max_calls=calls_left(_WEIGHING_SHARE), rng=rng)
     peaks = find_higher_peaks(run, top, evaluate, max_calls=calls_left(), rng=rng)
-    above = _hills_not_met(peaks, run, evaluate, max_calls=calls_left(), rng=rng)
+    above = _weigh_hills_and_keep_unmet(peaks, run, evaluate, max_calls=calls_left(), rng=rng)
     return MissedHills(lost, above, evaluate.n_calls)
 
 
-def _hills_not_met(
+def _weigh_hills_and_keep_unmet(
     tops: Iterable[GaussianAtPeak], run: NestedResult, evaluate: Evaluator, *, max_calls: int, rng: np.random.Generator
 ) -> tuple[HillEstimate, ...]:
     """Weigh the hills below these tops, each once and the highest first; return those that a run has not met."""

@@ -172,7 +172,7 @@ class SliceMove:
         n_lines = max(self.fewest_steps, math.ceil(self.steps_per_param * n_params))
         n_hops = self.hops if len(clusters) > 1 else 0
         n_steps = n_lines + n_hops
-        kind = self._kinds_of_steps(n_chains, n_steps, n_hops, rng)
+        kind = self._draw_kinds_of_steps(n_chains, n_steps, n_hops, rng)
         frames = _random_orthonormal_directions(kind == _FRAME, n_params, rng)
         axis = _axis_numbers_in_random_order(n_chains, n_steps, n_params, rng)
         now = start.copy()
@@ -278,7 +278,7 @@ class SliceMove:
             now = replace(now, u=periodic.wrapped_to_unit(now.u))
         return now, Tally(n_evaluated, n_taken, int((~moved).sum()), n_tried)
 
-    def _kinds_of_steps(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
+    def _draw_kinds_of_steps(self, n_chains: int, n_steps: int, n_hops: int, rng: np.random.Generator) -> IntArray:
         """Draw the kind of every step of every chain, (n_chains, n_steps)."""
         lot = rng.random((n_chains, n_steps))
         kind = np.where(lot < self.axes, _AXIS, np.where(lot < self.axes + self.differences, _DIFFERENCE, _FRAME))

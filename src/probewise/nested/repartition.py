@@ -82,7 +82,7 @@ class _StudentMixture:
     def from_groups(groups: Sequence[FloatArray], widening: float) -> _StudentMixture:
         """Make a part of each group of points, (n, n_params): its share, mean, and principal axes times `widening`."""
         n = np.array([len(group) for group in groups])
-        root = np.stack([principal_root(group, widening) for group in groups])
+        root = np.stack([covariance_root_of_points(group, widening) for group in groups])
         return _StudentMixture(n / n.sum(), np.stack([group.mean(axis=0) for group in groups]), root)
 
 
@@ -232,7 +232,7 @@ def split_into_clusters(x: FloatArray) -> list[FloatArray]:
     return groups if min(map(len, groups)) >= least else [x]
 
 
-def principal_root(x: FloatArray, scale: float = 1.0) -> FloatArray:
+def covariance_root_of_points(x: FloatArray, scale: float = 1.0) -> FloatArray:
     """Return a root of the covariance of points (n, n_params), times `scale`; see `root_of_covariance`."""
     return root_of_covariance(np.atleast_2d(np.cov(x, rowvar=False)), scale)
 

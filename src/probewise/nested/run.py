@@ -16,8 +16,8 @@ from probewise._kinds import require_number, require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import check_and_repeat
 from probewise.nested.evaluate import Samplable
+from probewise.nested.function_problem import AnyPrior, as_problem
 from probewise.nested.moves import Move, SliceMove
-from probewise.nested.pose import AnyPrior, as_problem
 from probewise.nested.result import NestedResult
 from probewise.nested.sampler import least_live, run_once
 from probewise.nested.stop import RoundSummary, StopRule
@@ -55,7 +55,7 @@ def run(
     prior
         With a log likelihood: a prior, distributions by name or in order, or a function from the unit cube.
     names, vectorized, pass_dict, periodic
-        With a log likelihood: how the functions are called; see `pose`.
+        With a log likelihood: how the functions are called; see `make_problem`.
     rng
         Source of randomness; its state is stored in the result.
     n_live

@@ -26,6 +26,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_finite_number, require_rng, require_whole
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
+from probewise.nested.function_problem import AnyPrior, as_problem
 from probewise.nested.importance import (
     HeldOutSamples,
     Weighted,
@@ -37,7 +38,6 @@ from probewise.nested.importance import (
     with_error_of_lost_parts,
 )
 from probewise.nested.mixture import fit_mixture, single_student_t
-from probewise.nested.pose import AnyPrior, as_problem
 from probewise.nested.proposal import Proposal, mixture_of_proposals
 from probewise.nested.repartition import repartitioned
 from probewise.nested.result import NestedResult

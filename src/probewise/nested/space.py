@@ -123,13 +123,13 @@ class _Unbounded:
         return self.coordinates.leave(u)
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray:
-        if isinstance(self.coordinates, _DrawsFromPrior):
+        if isinstance(self.coordinates, _CoordinatesWithDraw):
             return self.coordinates.draw(n, rng=rng)
         return self.enter(self.prior.from_unit_cube(rng.random((n, len(self.prior.names)))))
 
 
 @runtime_checkable
-class _HasCoordinates(Protocol):
+class _PriorWithCoordinates(Protocol):
     """A prior with sampling coordinates of its own."""
 
     @property
@@ -137,7 +137,7 @@ class _HasCoordinates(Protocol):
 
 
 @runtime_checkable
-class _DrawsFromPrior(Protocol):
+class _CoordinatesWithDraw(Protocol):
     """Coordinates that draw from the prior themselves, because some of them match no parameters."""
 
     def draw(self, n: int, *, rng: np.random.Generator) -> FloatArray: ...
@@ -151,11 +151,11 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
     ParameterError
         If `periodic` names parameters that the prior does not have, or the prior has its own coordinates.
     """
-    own = isinstance(prior, _HasCoordinates)
+    own = isinstance(prior, _PriorWithCoordinates)
     if periodic and (own or not set(periodic) <= set(prior.names)):
         allowed = "none: the prior has coordinates of its own" if own else f"names among {prior.names}"
         raise ParameterError("periodic", tuple(periodic), allowed)
-    if isinstance(prior, _HasCoordinates):
+    if isinstance(prior, _PriorWithCoordinates):
         return _Unbounded(prior, prior.coordinates)
     return _UnitCube(prior, tuple(prior.names.index(name) for name in periodic))
 
@@ -168,7 +168,7 @@ def unbounded_space_of(prior: Prior) -> Space:
     ParameterError
         If the prior has neither coordinates of its own nor `to_unit_cube`.
     """
-    if isinstance(prior, _HasCoordinates):
+    if isinstance(prior, _PriorWithCoordinates):
         return _Unbounded(prior, prior.coordinates)
     require_prior("problem.prior", prior, "to_unit_cube")
     return _Unbounded(prior, _NormalScores(prior))

@@ -17,8 +17,8 @@ from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
 from probewise.inquiry.any_settings.posterior import Model, Readings, prior_samples, updated
 from probewise.inquiry.any_settings.settings import Settings
 from probewise.inquiry.choice import choose
-from probewise.nested import Weighted, pose
-from probewise.nested.pose import AnyPrior
+from probewise.nested import Weighted, make_problem
+from probewise.nested.function_problem import AnyPrior
 from probewise.nested.weights import resampled_rows
 from probewise.priors import require_prior
 
@@ -82,7 +82,7 @@ class Inquiry(ShowsItself):
     ) -> None:
         require_callable("model", model, "a function model(parameters, settings) that predicts readings")
         require_rng(rng)
-        named = pose(lambda _: 0.0, prior).prior
+        named = make_problem(lambda _: 0.0, prior).prior
         require_prior("prior", named, "to_unit_cube", "log_prob")
         self._settings = Settings.of(settings)
         self._model = Model.of(model, named, ReadingNoise.of(noise), self._settings)

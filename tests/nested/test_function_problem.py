@@ -14,7 +14,7 @@ from scipy import stats
 from scipy.special import i0e
 
 from probewise.errors import DoubtfulResultWarning, NotConvergedError, ParameterError
-from probewise.nested import NestedResult, SliceMove, pose, refine, run
+from probewise.nested import NestedResult, SliceMove, make_problem, refine, run
 from probewise.nested.evaluate import Bound, Evaluator
 from probewise.priors import Normal, Product, Uniform
 
@@ -90,7 +90,7 @@ def test_the_evidence_under_a_normal_prior_of_scipy_is_the_convolution() -> None
 
 
 def test_a_posed_problem_can_be_checked_and_refined() -> None:
-    problem = pose(many_points, {"x": stats.norm(0, 1), "y": Normal(0.0, 1.0)}, vectorized=True)
+    problem = make_problem(many_points, {"x": stats.norm(0, 1), "y": Normal(0.0, 1.0)}, vectorized=True)
     result = run(problem, rng=rng(), n_live=100)
     assert result.check is not None
     found = refine(result, problem, rng=rng(), n_draws=1000)
@@ -121,7 +121,7 @@ def test_chains_step_over_the_end_of_a_circle_and_stay_even() -> None:
         return np.where(np.abs((x[:, 0] + 0.5) % 1.0 - 0.5) < 0.1, 0.0, -1.0)
 
     evaluate = Evaluator(
-        pose(function, {"a": Uniform(0.0, 1.0), "b": Uniform(0.0, 1.0)}, vectorized=True, periodic=["a"])
+        make_problem(function, {"a": Uniform(0.0, 1.0), "b": Uniform(0.0, 1.0)}, vectorized=True, periodic=["a"])
     )
     draw = rng()
     live = evaluate(np.column_stack([draw.uniform(0.9, 1.0, 400), draw.random(400)]), draw)
@@ -157,7 +157,7 @@ def test_what_does_not_fit_is_refused_in_words(
 
 def test_a_problem_in_one_takes_no_prior_besides() -> None:
     with pytest.raises(ParameterError, match="given beside a problem that has its own"):
-        run(pose(one_point, SQUARE), SQUARE, rng=rng())
+        run(make_problem(one_point, SQUARE), SQUARE, rng=rng())
 
 
 def test_a_function_of_many_points_that_was_not_said_to_be_one_is_told_how() -> None:
@@ -166,7 +166,7 @@ def test_a_function_of_many_points_that_was_not_said_to_be_one_is_told_how() -> 
 
 
 def test_a_pair_of_numbers_is_a_uniform_prior() -> None:
-    posed = pose(lambda x: 0.0, {"x": (0, 2), "y": [-1.0, 1.0]})
+    posed = make_problem(lambda x: 0.0, {"x": (0, 2), "y": [-1.0, 1.0]})
     assert posed.prior == Product({"x": Uniform(0.0, 2.0), "y": Uniform(-1.0, 1.0)})
     with pytest.raises(ParameterError, match="low < high"):
-        pose(lambda x: 0.0, {"x": (2, 0)})
+        make_problem(lambda x: 0.0, {"x": (2, 0)})

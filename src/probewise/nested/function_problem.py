@@ -64,8 +64,8 @@ class _TransformPrior:
 
 
 @dataclass(frozen=True)
-class Posed:
-    """A problem made of plain functions by `pose`, for every function of `probewise.nested`.
+class FunctionProblem:
+    """A problem made of plain functions by `make_problem`, for every function of `probewise.nested`.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Posed:
     prior
         The prior, with names.
     vectorized, pass_dict
-        How the function is called; see `pose`.
+        How the function is called; see `make_problem`.
     periodic
         Names of the periodic parameters.
     """
@@ -105,7 +105,7 @@ class Posed:
         return np.asarray(answer).reshape(())[()] if not np.ma.isMaskedArray(answer) else np.nan
 
 
-def pose(
+def make_problem(
     log_likelihood: Callable[..., Any],
     prior: AnyPrior,
     *,
@@ -113,7 +113,7 @@ def pose(
     vectorized: bool = False,
     pass_dict: bool = False,
     periodic: Sequence[str] = (),
-) -> Posed:
+) -> FunctionProblem:
     """Make a problem of a log likelihood and a prior.
 
     Parameters
@@ -136,7 +136,7 @@ def pose(
 
     Returns
     -------
-    Posed
+    FunctionProblem
         A problem for `run`, `refine`, `repartitioned`, `update` and `diversify`. A prior given as a function from the
         unit cube suffices for `run`; the others need its density or inverse and raise an error without.
 
@@ -150,7 +150,10 @@ def pose(
     unknown = [name for name in periodic if name not in named.names]
     if isinstance(periodic, str) or unknown:
         raise ParameterError("periodic", periodic, f"names among {named.names}")
-    return Posed(log_likelihood, named, vectorized, pass_dict, tuple(periodic))
+    return FunctionProblem(log_likelihood, named, vectorized, pass_dict, tuple(periodic))
+
+
+Posed, pose = FunctionProblem, make_problem  # their earlier names
 
 
 def _as_named_prior(prior: AnyPrior, names: Sequence[str] | None, vectorized: bool) -> Prior:
@@ -235,7 +238,7 @@ def as_problem(
         raise ParameterError(
             "problem", problem, f"{allowed} with its prior: nested.run(log_likelihood, prior, rng=rng)"
         )
-    return pose(
+    return make_problem(
         cast("Callable[..., Any]", problem),
         prior,
         names=names,

@@ -9,7 +9,7 @@ import pytest
 
 from probewise._arrays import FloatArray
 from probewise.calibration import SMCResult
-from probewise.calibration.posterior_parts import evidence_shares, join_parts, split_by_n_bright
+from probewise.calibration.posterior_parts import evidence_shares, join_smc_results_of_parts, split_by_n_bright
 
 _N = 8 * 4 * 20
 
@@ -36,7 +36,7 @@ def _bright_share(theta: FloatArray) -> float:
 
 def test_parts_are_joined_by_their_evidence() -> None:
     """A quarter of the evidence; counts are rounded at random in each of 32 blocks: four sds of their mean."""
-    both = join_parts({1: climbed(0.01, np.log(3.0)), 2: climbed(0.5, 0.0)}, np.random.default_rng(1))
+    both = join_smc_results_of_parts({1: climbed(0.01, np.log(3.0)), 2: climbed(0.5, 0.0)}, np.random.default_rng(1))
     assert both.log_z == pytest.approx(np.log(4.0))
     assert abs(_bright_share(both.theta) - 0.25) < 4 * 0.5 / 20 / np.sqrt(32)
     assert both.n_calls == 20
@@ -44,7 +44,7 @@ def test_parts_are_joined_by_their_evidence() -> None:
 
 
 def test_a_posterior_is_split_as_it_was_joined() -> None:
-    both = join_parts({1: climbed(0.01, np.log(3.0)), 2: climbed(0.5, 0.0)}, np.random.default_rng(2))
+    both = join_smc_results_of_parts({1: climbed(0.01, np.log(3.0)), 2: climbed(0.5, 0.0)}, np.random.default_rng(2))
     parts = split_by_n_bright(both, np.random.default_rng(3))
     assert set(parts) == {1, 2}
     shares = evidence_shares(parts)
@@ -55,4 +55,4 @@ def test_a_posterior_is_split_as_it_was_joined() -> None:
 
 def test_a_part_that_is_not_reached_is_a_doubt_of_all() -> None:
     stuck = replace(climbed(0.01, 1.0), temperatures=np.array([0.0, 0.3]))
-    assert join_parts({1: stuck, 2: climbed(0.5, 0.0)}, np.random.default_rng(4)).warnings
+    assert join_smc_results_of_parts({1: stuck, 2: climbed(0.5, 0.0)}, np.random.default_rng(4)).warnings

@@ -69,7 +69,7 @@ def test_the_paper_plan_gives_widths_from_half_a_step_to_a_quarter_of_the_span()
     assert isinstance(prior.precision, LogUniform)
     assert 1 / math.sqrt(2 * prior.precision.high) == pytest.approx(0.5)
     assert 1 / math.sqrt(2 * prior.precision.low) == pytest.approx(25.0)
-    assert len(prior.describe()) == 6
+    assert len(prior.table_rows()) == 6
 
 
 def test_the_prior_scales_with_the_recording() -> None:

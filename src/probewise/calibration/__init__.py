@@ -21,7 +21,7 @@ from probewise.calibration.priors import (
 )
 from probewise.calibration.sensor_file import FittedSensor, OrderEvidence, read_sensor, write_sensor
 from probewise.calibration.smc import Climb, Rung, SMCResult, TemperatureSummary
-from probewise.calibration.ssf_summary import Quantity, ssf_quantities
+from probewise.calibration.ssf_summary import Quantity, QuantitySummary, ssf_quantities
 
 __all__ = [
     "Calibration",
@@ -33,6 +33,7 @@ __all__ = [
     "OrderPosterior",
     "PriorRow",
     "Quantity",
+    "QuantitySummary",
     "Rung",
     "SMCResult",
     "SSFPrior",

@@ -51,10 +51,10 @@ def missed_part_in_words(
         # So few live points are rough, which is known; nobody sees this run.
         warnings.simplefilter("ignore", DoubtfulResultWarning)
         found = run(problem, rng=rng, n_live=n_live, progress=report, max_cost=1.0, return_interrupted=False)
-    return _missed_part_by_comparison(problems, n, climbed, found, rng)
+    return _missed_part_by_comparison_in_words(problems, n, climbed, found, rng)
 
 
-def _missed_part_by_comparison(
+def _missed_part_by_comparison_in_words(
     problems: OrderProblems, n: int, climbed: SMCResult, found: NestedResult, rng: np.random.Generator
 ) -> str:
     error = float(np.hypot(found.log_z_error, climbed.log_z_error))

@@ -20,8 +20,8 @@ class MixturePrior(Prior, Protocol):
         """Number of Gaussians, N."""
         ...
 
-    def amplitude_scale(self, determinant: FloatArray) -> FloatArray:
-        """Return the unit of a Gaussian's amplitude, for A B - C^2 of any shape."""
+    def amplitude_at_unit_mass(self, determinant: FloatArray) -> FloatArray:
+        """Return the amplitude a of a Gaussian of unit mass, the prior's unit of a, for its A B - C^2, any shape."""
         ...
 
     def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:
@@ -58,7 +58,7 @@ class MomentCoordinates:
             np.take_along_axis(log_mass, order, axis=1),
         )
         out = np.empty_like(g)
-        out[:, 0, 0] = np.log(g[:, 0, 0] / self.prior.amplitude_scale(det[:, 0]))
+        out[:, 0, 0] = np.log(g[:, 0, 0] / self.prior.amplitude_at_unit_mass(det[:, 0]))
         out[:, 1:, 0] = log_mass[:, 1:] - log_mass[:, :1]
         out[..., 1:3] = g[..., 1:3]
         out[..., 3] = np.log(0.5 * g[..., 4] / det)
@@ -82,7 +82,7 @@ class MomentCoordinates:
         np.divide(0.5 * np.exp(-log_variance), rest, out=out[3:5])
         product = out[3] * out[4]
         np.multiply(-r, np.sqrt(product), out=out[5])
-        log_a = np.log(self.prior.amplitude_scale(product[0] * rest[0])) + log_first
+        log_a = np.log(self.prior.amplitude_at_unit_mass(product[0] * rest[0])) + log_first
         # The others' masses follow from the first one's: a = mass times the root of A B - C^2.
         half_log_det = -0.5 * (both + log_rest)
         log_a = np.concatenate([log_a[None], log_ratio + (log_a - half_log_det[0]) + half_log_det[1:]])

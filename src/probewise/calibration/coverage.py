@@ -165,7 +165,7 @@ def simulate_log_z_lead_of_one_gaussian(
     return one.log_z - two.log_z, math.hypot(one.log_z_error, two.log_z_error)
 
 
-def _lead_for_drawn_truth(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
+def _simulate_log_z_lead_for_drawn_truth(rng: np.random.Generator, n_live: int, quick: bool) -> tuple[float, float]:
     return simulate_log_z_lead_of_one_gaussian(draw_truth(rng=rng), rng=rng, n_live=n_live, quick=quick)
 
 
@@ -207,7 +207,7 @@ def main() -> None:
             return
         leads = []
         each = rng.spawn(asked.recordings), [asked.live] * asked.recordings, [asked.quick] * asked.recordings
-        for lead, error in executor.map(_lead_for_drawn_truth, *each):
+        for lead, error in executor.map(_simulate_log_z_lead_for_drawn_truth, *each):
             leads.append((round(lead, 3), round(error, 3)))
             bar.update()
     preferred = sum(lead > 0 for lead, _ in leads)

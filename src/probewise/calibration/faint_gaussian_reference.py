@@ -208,7 +208,7 @@ class FaintGaussianReference:
         last[near] = self._draw_gaussians_near_others(rest[near], rng)
         ratio = np.where(near, 1.0 - rng.random(len(rest)), _draw_mass_ratios(len(rest), rng))
         last[:, 0] = (
-            ratio * self._greatest_faint_mass(self._masses(rest), last_of_all=True) * self._amplitude_scale(last)
+            ratio * self._greatest_faint_mass(self._masses(rest), last_of_all=True) * self._amplitude_at_unit_mass(last)
         )
         return _insert_gaussian_before_levels(rest, last)
 
@@ -246,7 +246,7 @@ class FaintGaussianReference:
         told = answer.draw_light_share(most / (whole + most), rng=rng)
         by_share = rng.random(len(rest)) < _TOLD
         ratio = np.where(by_share, told / (1.0 - told) * whole / most, _draw_mass_ratios(len(rest), rng))
-        last[:, 0] = ratio * most * self._amplitude_scale(last)
+        last[:, 0] = ratio * most * self._amplitude_at_unit_mass(last)
         share = ratio * most / (whole + ratio * most)
         coordinates = self.compensation.coordinates
         after, log_prior = coordinates.leave(coordinates.enter(rest) + share[:, None] * answer.shift)
@@ -257,7 +257,7 @@ class FaintGaussianReference:
     ) -> tuple[FloatArray, FloatArray]:
         """Undo `_draw_gaussian_and_compensate`; also return the log density as `AddedGaussianProposal.back` does."""
         coordinates = self.compensation.coordinates
-        masses, mass = self._masses(after), last[:, 0] / self._amplitude_scale(last)
+        masses, mass = self._masses(after), last[:, 0] / self._amplitude_at_unit_mass(last)
         whole, most = masses.sum(axis=1), self._greatest_faint_mass(masses, last_of_all=last_of_all)
         share, ratio = mass / (whole + mass), mass / most
         x = coordinates.enter(after)
@@ -343,7 +343,7 @@ class FaintGaussianReference:
         centre, width = self._cube_places_and_kernel_widths(rest)
         u[:, _SHAPE] = _draw_truncated_normal(centre[:, label], width[:, label], rng)
         last = self.prior.from_unit_cube(u)[:, :6]
-        last[:, 0] = _draw_mass_ratios(n, rng) * most * self._amplitude_scale(last)
+        last[:, 0] = _draw_mass_ratios(n, rng) * most * self._amplitude_at_unit_mass(last)
         return last
 
     def _split_off(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
@@ -369,7 +369,7 @@ class FaintGaussianReference:
         """Log density of a split over the prior's, (n,), as `AddedGaussianProposal.back` returns it; may be -inf."""
         own = slice(6 * label, 6 * label + 6)
         centre, width = self._cube_places_and_kernel_widths(rest)
-        ratio = last[:, 0] / self._amplitude_scale(last) / np.maximum(most, _TINY)
+        ratio = last[:, 0] / self._amplitude_at_unit_mass(last) / np.maximum(most, _TINY)
         at = self._cube_places_and_kernel_widths(_insert_gaussian_before_levels(rest[:, -2:], last))[0][:, 0]
         # At a fixed last Gaussian the moments of the bright one are shifted, so volumes in them stay.
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -387,7 +387,7 @@ class FaintGaussianReference:
         """Log of one Gaussian's prior density over its moments, up to a constant, (n, 6) -> (n,)."""
         alone = replace(self.prior, n_gaussians=1)
         log_det = np.log(np.maximum(g[:, 3] * g[:, 4] - g[:, 5] ** 2, _TINY))
-        log_mass = np.log(g[:, 0] / self._amplitude_scale(g))
+        log_mass = np.log(g[:, 0] / self._amplitude_at_unit_mass(g))
         log_prob = alone.log_prob_by_kind(g.T[:, None].copy(), levels_of[:, -2], levels_of[:, -1])
         return np.asarray(log_prob - 5.0 * log_mass + 3.5 * log_det)
 
@@ -397,7 +397,7 @@ class FaintGaussianReference:
         u, v = g[:, 1], g[:, 2]
         ones = np.ones(len(g))
         each = [ones, u, v, 0.5 * g[:, 4] / det + u * u, 0.5 * g[:, 3] / det + v * v, -0.5 * g[:, 5] / det + u * v]
-        return np.stack(each, axis=1) * (g[:, 0] / self._amplitude_scale(g))[:, None]
+        return np.stack(each, axis=1) * (g[:, 0] / self._amplitude_at_unit_mass(g))[:, None]
 
     def _gaussian_from_moments(self, m: FloatArray) -> FloatArray:
         """Compute a Gaussian's parameters from its moments, (n, 6) -> (n, 6); nan where no Gaussian has them."""
@@ -407,7 +407,7 @@ class FaintGaussianReference:
             det = uu * vv - uv * uv
             real = (m[:, 0] > 0) & (uu > 0) & (vv > 0) & (det > 0)
             g = np.stack([m[:, 0], u, v, 0.5 * vv / det, 0.5 * uu / det, -0.5 * uv / det], axis=1)
-            g[:, 0] *= self._amplitude_scale(g)
+            g[:, 0] *= self._amplitude_at_unit_mass(g)
         return np.where(real[:, None], g, np.nan)
 
     def _greatest_faint_mass(self, masses: FloatArray, *, last_of_all: bool) -> FloatArray:
@@ -415,14 +415,14 @@ class FaintGaussianReference:
         most = FAINT * masses.max(axis=1)
         return np.asarray(np.minimum(most, masses.min(axis=1)) if last_of_all else most)
 
-    def _amplitude_scale(self, g: FloatArray) -> FloatArray:
+    def _amplitude_at_unit_mass(self, g: FloatArray) -> FloatArray:
         """Amplitudes that Gaussians of these widths have at unit mass, (..., 6) -> (...)."""
-        return self.prior.amplitude_scale(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
+        return self.prior.amplitude_at_unit_mass(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
 
     def _masses(self, theta: FloatArray) -> FloatArray:
         """Masses in the prior's unit, (n, 6 N' + 2) -> (n, N')."""
         g = theta[:, :-2].reshape(len(theta), theta.shape[1] // 6, 6)
-        return np.asarray(g[..., 0] / self._amplitude_scale(g))
+        return np.asarray(g[..., 0] / self._amplitude_at_unit_mass(g))
 
     def _cube_places_and_kernel_widths(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Place of each Gaussian in the prior's cube, without its mass, (n, N', 5), and the widths of kernels there."""

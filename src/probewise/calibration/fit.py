@@ -101,7 +101,7 @@ class Calibration(ShowsItself):
     @property
     def priors(self) -> tuple[PriorRow, ...]:
         """The table of priors."""
-        return self.chosen.prior.describe()
+        return self.chosen.prior.table_rows()
 
     def probabilities(self) -> dict[int, float]:
         """Posterior probability of each order, with equal prior probabilities."""
@@ -309,7 +309,7 @@ def _sensor_from_posterior(
         ),
         fingerprint=fingerprint(recording),
         source=PurePath(recording.source).name,
-        priors=prior.describe(),
+        priors=prior.table_rows(),
         notes=(*notes, *result.warnings),
     )
 

@@ -96,7 +96,7 @@ class LabelSymmetricCoordinates:
         g[..., 1:3] = shape[..., :2]
         g[..., 3:5] = 0.5 * np.exp(-log_variance) / rest[..., None]
         g[..., 5] = -r * np.sqrt(g[..., 3] * g[..., 4])
-        scale = self.prior.amplitude_scale(g[..., 3] * g[..., 4] * rest)
+        scale = self.prior.amplitude_at_unit_mass(g[..., 3] * g[..., 4] * rest)
         g[..., 0] = scale * np.exp(log_light - most[:, None]) * (1.0 - 1e-12)
         theta = np.concatenate([g.reshape(len(y), 6 * n), y[:, -2:]], axis=1)
         jacobian = np.log(g[..., 0]) - 1.5 * log_variance.sum(axis=-1) - 2.0 * np.log(rest) - 3.0 * math.log(2.0)

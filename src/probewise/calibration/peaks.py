@@ -119,8 +119,10 @@ def _with_light_gaussian_added(
 ) -> FloatArray:
     """Add a Gaussian with at most a fifth of the first one's light, (n, 6 N + 2), (n, 6) -> (n, 6 N + 8)."""
     one, first = lone.copy(), theta[:, :6]
-    light = first[:, 0] / prior.amplitude_scale(first[:, 3] * first[:, 4] - first[:, 5] ** 2)
-    one[:, 0] = light * rng.uniform(0.01, 0.2, len(one)) * prior.amplitude_scale(one[:, 3] * one[:, 4] - one[:, 5] ** 2)
+    light = first[:, 0] / prior.amplitude_at_unit_mass(first[:, 3] * first[:, 4] - first[:, 5] ** 2)
+    one[:, 0] = (
+        light * rng.uniform(0.01, 0.2, len(one)) * prior.amplitude_at_unit_mass(one[:, 3] * one[:, 4] - one[:, 5] ** 2)
+    )
     return np.concatenate([theta[:, :-2], one, theta[:, -2:]], axis=1)
 
 

@@ -96,7 +96,7 @@ def split_by_n_bright(found: SMCResult | NestedResult | Weighted, rng: np.random
     return parts
 
 
-def join_parts(made: dict[int, SMCResult], rng: np.random.Generator) -> SMCResult:
+def join_smc_results_of_parts(made: dict[int, SMCResult], rng: np.random.Generator) -> SMCResult:
     """Join SMC runs to the parts of a posterior, given by number of bright Gaussians.
 
     Each part contributes samples by its share of the evidence.

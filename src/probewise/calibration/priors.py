@@ -107,7 +107,7 @@ class SSFPrior:
             g[:, 3] = self.precision.from_unit(x[:, 3])
             g[:, 4] = self.precision.from_unit(x[:, 4])
             g[:, 5] = self.max_correlation * (2 * x[:, 5] - 1) * np.sqrt(g[:, 3] * g[:, 4])
-            g[:, 0] *= self.amplitude_scale(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
+            g[:, 0] *= self.amplitude_at_unit_mass(g[:, 3] * g[:, 4] - g[:, 5] ** 2)
         out[:, -2] = self.i_min.from_unit(u[:, -2])
         out[:, -1] = self.i_max.from_unit(u[:, -1])
         return out
@@ -119,7 +119,7 @@ class SSFPrior:
         for n in range(self.n_gaussians):
             g, x = theta[:, 6 * n : 6 * n + 6], out[:, 6 * n : 6 * n + 6]
             product = g[:, 3] * g[:, 4]
-            x[:, 0] = self.amplitude.to_unit(g[:, 0] / self.amplitude_scale(product - g[:, 5] ** 2))
+            x[:, 0] = self.amplitude.to_unit(g[:, 0] / self.amplitude_at_unit_mass(product - g[:, 5] ** 2))
             x[:, 1] = self.offset_mm.to_unit(g[:, 1])
             x[:, 2] = self.offset_mm.to_unit(g[:, 2])
             x[:, 3] = self.precision.to_unit(g[:, 3])
@@ -141,7 +141,7 @@ class SSFPrior:
         product, c = precisions[0] * precisions[1], g[5]
         scale = np.sqrt(product)
         inside = (scale > 0) & (np.abs(c) <= self.max_correlation * (1 + 1e-12) * scale)
-        a_scale = self.amplitude_scale(product - c * c)
+        a_scale = self.amplitude_at_unit_mass(product - c * c)
         each = self.amplitude.log_prob(g[0] / a_scale) - np.log(np.maximum(a_scale * scale, _TINY))
         offset, precision = self.offset_mm.log_prob(g[1:3]), self.precision.log_prob(g[3:5])
         each += (offset[0] + offset[1]) + (precision[0] + precision[1])
@@ -156,8 +156,8 @@ class SSFPrior:
         """The sampling coordinates for nested sampling."""
         return MomentCoordinates(self)
 
-    def describe(self) -> tuple[PriorRow, ...]:
-        """Return the table of priors for the report, one row per kind of parameter."""
+    def table_rows(self) -> tuple[PriorRow, ...]:
+        """Return the rows of the report's table of priors, one per kind of parameter."""
         why = dict(self.reasons)
         by_mass = self.unit_mass_mm2 is not None
         rows = (
@@ -180,11 +180,15 @@ class SSFPrior:
         )
         return tuple(PriorRow(*row) for row in rows)
 
-    def amplitude_scale(self, determinant: FloatArray) -> FloatArray:
-        """Amplitude of a Gaussian of unit mass, for A B - C^2 of shape (n_samples,)."""
+    describe = table_rows  # its earlier name
+
+    def amplitude_at_unit_mass(self, determinant: FloatArray) -> FloatArray:
+        """Return the amplitude a of a Gaussian of unit mass, for its A B - C^2, any shape; 1 if the prior is of a."""
         if self.unit_mass_mm2 is None:
             return np.ones_like(determinant)
         return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, _TINY))
+
+    amplitude_scale = amplitude_at_unit_mass  # its earlier name
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from probewise.calibration.posterior_parts import (
     FootprintPlaceAndSize,
     PosteriorPart,
     evidence_shares,
-    join_parts,
+    join_smc_results_of_parts,
     split_by_n_bright,
 )
 from probewise.calibration.reference_density import ReferenceDensity
@@ -269,7 +269,7 @@ def _smc_from_order_below(
     if held.get(n - 1, 0.0) > _BRIGHT_HELD:
         near = tuple(density for density, own in zip(about, bright, strict=True) if own == n)
         made[n] = _smc_with_all_gaussians_bright(problems, n, below[n - 1], near, whole, rng=rng, report=report)
-    return join_parts(made, rng), {m: PosteriorPart.from_smc(climbed) for m, climbed in made.items()}
+    return join_smc_results_of_parts(made, rng), {m: PosteriorPart.from_smc(climbed) for m, climbed in made.items()}
 
 
 def _smc_with_faint_gaussian_added(

@@ -20,7 +20,7 @@ from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
 from probewise.calibration.priors import PriorRow
-from probewise.calibration.ssf_summary import Quantity, ssf_quantities
+from probewise.calibration.ssf_summary import QuantitySummary, ssf_quantities
 from probewise.effects import EFFECTS, EdgeShadow
 from probewise.errors import FileError, ParameterError, ProbewiseError, shown
 from probewise.recordings import Instrumentation, parse_json_file_text, read_text, write_text_atomically
@@ -218,7 +218,7 @@ class FittedSensor(NamedSamples):
 
     leading = with_leading_effects  # its earlier name
 
-    def ssf_quantities(self) -> tuple[Quantity, ...]:
+    def ssf_quantities(self) -> tuple[QuantitySummary, ...]:
         """Summarise the SSF by centre, widths and angle, and each Gaussian too, unless it is a free form."""
         return ssf_quantities(self.samples, self.n_gaussians, each=not self.is_free_form)
 
@@ -268,7 +268,7 @@ class FittedSensor(NamedSamples):
             "parameters": [
                 {
                     "name": n,
-                    "unit": self.unit(n),
+                    "unit": self.unit_of_parameter(n),
                     "mean": mean[n],
                     "sd": sd[n],
                     "median": median[n],
@@ -358,7 +358,7 @@ class FittedSensor(NamedSamples):
             ) from error
         return sensor
 
-    def unit(self, name: str) -> str:
+    def unit_of_parameter(self, name: str) -> str:
         """Return the unit of a parameter, by its name; "" where it is unknown."""
         if "." in name:
             owner, _, parameter = name.partition(".")
@@ -367,6 +367,8 @@ class FittedSensor(NamedSamples):
         if name in ("I_min", "I_max"):
             return self.instrumentation.unit
         return {"a": "1", "u": "mm", "v": "mm"}.get(name[0], "mm^-2")
+
+    unit = unit_of_parameter  # its earlier name
 
 
 def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:

@@ -232,7 +232,7 @@ def run_smc(
     space = reference.prior.coordinates if space is None else space
     n_calls = n_calls_below
 
-    def evaluate(x: FloatArray, beta: float = 0.0) -> _Particles:
+    def evaluate_particles(x: FloatArray, beta: float = 0.0) -> _Particles:
         nonlocal n_calls
         theta, log_prior = space.leave(x)
         # What is impossible weighs nothing, but was drawn.
@@ -252,7 +252,7 @@ def run_smc(
 
     def draw_particles() -> _Particles:
         with np.errstate(invalid="ignore"):
-            return evaluate(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
+            return evaluate_particles(space.enter(reference.draw(np.repeat(rest, _DRAWS, axis=0), rng=rng)))
 
     now = draw_particles()
     while n_effective(now.log_target_over_reference) < least_effective * len(rest) and len(now.x) < _MOST_DRAWS * len(
@@ -280,12 +280,12 @@ def run_smc(
         temperatures.append(beta)
         shares = []
         for _ in range(n_steps):
-            now, share = _moved_by_differential_evolution(now, partial(evaluate, beta=beta), beta, rng)
+            now, share = _moved_by_differential_evolution(now, partial(evaluate_particles, beta=beta), beta, rng)
             shares.append(share)
-        now = _moved_by_independent_proposals(now, partial(evaluate, beta=beta), reference, space, beta, rng)
+        now = _moved_by_independent_proposals(now, partial(evaluate_particles, beta=beta), reference, space, beta, rng)
         accepted = float(np.mean(shares))
         if beta == 1.0:
-            now = evaluate(now.x)
+            now = evaluate_particles(now.x)
         log_ratio, share = _log_evidence_ratio_and_overlap(
             log_weight, (width * now.log_target_over_reference).reshape(n_clouds, n)
         )
@@ -297,7 +297,7 @@ def run_smc(
     if temperatures[-1] == 1.0:
         # A reference that is far from the posterior is forgotten late.
         kept = _snapshots_of_posterior(
-            now, partial(evaluate, beta=1.0), reference, space, n_more * (len(temperatures) - 1), rng
+            now, partial(evaluate_particles, beta=1.0), reference, space, n_more * (len(temperatures) - 1), rng
         )
     x = np.stack([cloud.x.reshape(n_clouds, n, -1) for cloud in kept], axis=1)
     theta, _ = space.leave(x.reshape(-1, x.shape[-1]))
@@ -320,7 +320,7 @@ def run_smc(
 
 def _snapshots_of_posterior(
     now: _Particles,
-    evaluate: Callable[[FloatArray], _Particles],
+    evaluate_particles: Callable[[FloatArray], _Particles],
     reference: ReferenceDensity,
     space: Coordinates,
     n_more: int,
@@ -330,9 +330,9 @@ def _snapshots_of_posterior(
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     kept = []
     for k in range(1, n_more + 1):
-        now, _ = _moved_by_differential_evolution(now, evaluate, 1.0, rng)
+        now, _ = _moved_by_differential_evolution(now, evaluate_particles, 1.0, rng)
         if k % _AFRESH == 0:
-            now = _moved_by_independent_proposals(now, evaluate, reference, space, 1.0, rng)
+            now = _moved_by_independent_proposals(now, evaluate_particles, reference, space, 1.0, rng)
         if k in keep:
             kept.append(now)
     return kept
@@ -365,7 +365,7 @@ def _next_temperature(rise: FloatArray, beta: float, share: float, n_particles: 
 
 
 def _moved_by_differential_evolution(
-    now: _Particles, evaluate: Callable[[FloatArray], _Particles], beta: float, rng: np.random.Generator
+    now: _Particles, evaluate_particles: Callable[[FloatArray], _Particles], beta: float, rng: np.random.Generator
 ) -> tuple[_Particles, float]:
     """Move each particle once, one half after the other; return the cloud and the share of moves accepted.
 
@@ -388,7 +388,7 @@ def _moved_by_differential_evolution(
         scale[rng.random(m) < _WHOLE_JUMP] = 1.0
         one, two = rng.choice(other, (2, m))
         step = scale[:, None] * (now.x[one] - now.x[two]) + jitter * rng.standard_normal((m, d))
-        new = evaluate(old.x + np.where(by_block[:, None] & ~in_block, 0.0, step))
+        new = evaluate_particles(old.x + np.where(by_block[:, None] & ~in_block, 0.0, step))
         better = np.log(rng.random(m)) < new.log_tempered_density(beta) - old.log_tempered_density(beta)
         n_accepted += int(better.sum())
         now = now.with_rows_replaced(own[better], new.take(np.flatnonzero(better)))
@@ -397,7 +397,7 @@ def _moved_by_differential_evolution(
 
 def _moved_by_independent_proposals(
     now: _Particles,
-    evaluate: Callable[[FloatArray], _Particles],
+    evaluate_particles: Callable[[FloatArray], _Particles],
     reference: ReferenceDensity,
     space: Coordinates,
     beta: float,
@@ -406,7 +406,7 @@ def _moved_by_independent_proposals(
     """Propose a draw from the reference to each particle, accepted by the ratio of target over reference density."""
     there, log_drawn = reference.propose(space.leave(now.x)[0], rng=rng)
     with np.errstate(invalid="ignore"):
-        new = evaluate(space.enter(there))
+        new = evaluate_particles(space.enter(there))
         log_accept = (
             new.log_tempered_density(beta) - now.log_tempered_density(beta) + log_drawn + now.log_prior - new.log_prior
         )

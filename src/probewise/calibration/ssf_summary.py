@@ -11,7 +11,7 @@ from probewise.sensor import Footprint, footprint_of
 
 
 @dataclass(frozen=True)
-class Quantity:
+class QuantitySummary:
     """A quantity's posterior: name (ending in the unit), unit, median and central 95 % interval."""
 
     name: str
@@ -20,7 +20,10 @@ class Quantity:
     interval95: tuple[float, float]
 
 
-def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) -> tuple[Quantity, ...]:
+Quantity = QuantitySummary  # its earlier name
+
+
+def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) -> tuple[QuantitySummary, ...]:
     """Summarise the whole SSF and, if there are several, each Gaussian: medians and 95 % intervals.
 
     `centre_u_mm` and `centre_v_mm`; `sd_long_mm` and `sd_short_mm` along the axes of the covariance; `angle_deg` of the
@@ -57,7 +60,7 @@ def _whole_moments(f: Footprint) -> tuple[FloatArray, ...]:
 
 def _quantities_of_moments(
     prefix: str, u: FloatArray, v: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
-) -> tuple[Quantity, ...]:
+) -> tuple[QuantitySummary, ...]:
     middle, half = (var_u + var_v) / 2, np.hypot((var_u - var_v) / 2, cov_uv)
     angle = 0.5 * np.arctan2(2 * cov_uv, var_u - var_v)
     # An axis' angle is defined up to half a turn: unwrap about the mean direction.
@@ -72,6 +75,6 @@ def _quantities_of_moments(
     )
 
 
-def _quantity_of_samples(name: str, unit: str, values: FloatArray) -> Quantity:
+def _quantity_of_samples(name: str, unit: str, values: FloatArray) -> QuantitySummary:
     low, median, high = (float(q) for q in np.quantile(values, [0.025, 0.5, 0.975]))
-    return Quantity(name, unit, median, (low, high))
+    return QuantitySummary(name, unit, median, (low, high))

@@ -12,7 +12,7 @@ from nested_sampling import hard, problems
 from probewise.nested import NestedResult
 from probewise.nested.ascent import climb_to_top, gaussian_of_last_live_points
 from probewise.nested.evaluate import Evaluator
-from probewise.nested.missing import find_missed_hills
+from probewise.nested.missed_hills import find_missed_hills
 from probewise.nested.sampler import run_once
 
 

@@ -11,7 +11,7 @@ from nested_sampling import problems
 from scipy.stats import chi2, norm
 
 from probewise.errors import ParameterError, ShapeError
-from probewise.nested import Goal, NestedResult, alive_at_death, intensified, merge, run
+from probewise.nested import Goal, NestedResult, intensified, merge, n_alive_at_death, run
 from probewise.priors import Normal, Product
 
 
@@ -28,7 +28,7 @@ def test_the_result_is_a_run_with_more_points_alive_between_two_levels(name: str
     after = intensified(before, posed, n_live=40, goal=goal, rng=rng)
     assert np.array_equal(np.lexsort((after.label, after.log_likelihood)), np.arange(after.n_dead))
     assert np.array_equal(
-        alive_at_death(after.log_likelihood, after.label, after.log_birth, after.birth_label), after.n_at_death
+        n_alive_at_death(after.log_likelihood, after.label, after.log_birth, after.birth_label), after.n_at_death
     )
     assert 50 < after.n_at_death.max() <= 90  # a thread may start in the middle of a round
     assert math.isclose(np.exp(after.log_weight).sum(), 1.0)

@@ -13,7 +13,7 @@ from nested_sampling import problems
 from scipy.stats import chi2, combine_pvalues
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.nested import Agreement, NestedResult, agreement_of, alive_at_death, merge, run
+from probewise.nested import Agreement, NestedResult, agreement_of, merge, n_alive_at_death, run
 from probewise.priors import Product, Uniform
 
 N_ERRORS = 3.9
@@ -37,7 +37,7 @@ def rng() -> np.random.Generator:
 
 
 def alive(result: NestedResult) -> np.ndarray:
-    return alive_at_death(result.log_likelihood, result.label, result.log_birth, result.birth_label)
+    return n_alive_at_death(result.log_likelihood, result.label, result.log_birth, result.birth_label)
 
 
 @pytest.mark.parametrize("name", ["plateau", "naive steps", "Rosenbrock 2-D"])
@@ -53,14 +53,14 @@ def test_the_count_of_two_runs_by_hand() -> None:
     label = np.array([0.2, 0.7, 0.5, 0.4, 0.1, 0.3])
     birth = np.array([-np.inf, -np.inf, 1.0, -np.inf, -np.inf, 1.0])
     birth_label = np.array([1.0, 1.0, 0.2, 1.0, 1.0, 0.4])
-    assert alive_at_death(level, label, birth, birth_label).tolist() == [4, 4, 3, 4, 2, 1]
+    assert n_alive_at_death(level, label, birth, birth_label).tolist() == [4, 4, 3, 4, 2, 1]
 
 
 @pytest.mark.slow
 def test_the_order_of_the_points_does_not_matter(terraces: list[NestedResult], rng: np.random.Generator) -> None:
     one = terraces[0]
     rows = rng.permutation(one.n_dead)
-    shuffled = alive_at_death(one.log_likelihood[rows], one.label[rows], one.log_birth[rows], one.birth_label[rows])
+    shuffled = n_alive_at_death(one.log_likelihood[rows], one.label[rows], one.log_birth[rows], one.birth_label[rows])
     assert np.array_equal(shuffled, one.n_at_death[rows])
 
 

@@ -48,7 +48,7 @@ def has_uniform_light(prior: SSFPrior) -> bool:
     return prior.unit_mass_mm2 is not None and prior.amplitude == Uniform(0.0, 1.0)
 
 
-class _AddGaussian(Protocol):
+class _GaussianAdder(Protocol):
     """A function that adds a Gaussian to each sample of N - 1, (n, 6 N - 4) -> (n, 6 N + 2)."""
 
     def __call__(self, rest: FloatArray, *, rng: np.random.Generator) -> FloatArray: ...
@@ -70,7 +70,7 @@ class AddedGaussianProposal:
     """
 
     share: float
-    draw: _AddGaussian
+    draw: _GaussianAdder
     back: Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
@@ -296,11 +296,11 @@ class FaintGaussianReference:
         last = self._draw_gaussian_near_bright_one(
             rest, label, self._greatest_faint_mass(self._masses(rest), last_of_all=True), rng
         )
-        return self._split_off(rest, label, last)
+        return self._split_gaussian_off(rest, label, last)
 
     def merge_last_gaussian_into_bright_one(self, theta: FloatArray, label: int) -> tuple[FloatArray, FloatArray]:
         """Undo `split_gaussian_off_bright_one`; also return the log density as `AddedGaussianProposal.back` does."""
-        rest = self._merge_into_bright(self.without_last_gaussian(theta), label, theta[:, -8:-2])
+        rest = self._merge_gaussian_into_bright_one(self.without_last_gaussian(theta), label, theta[:, -8:-2])
         most = self._greatest_faint_mass(self._masses(rest), last_of_all=True)
         return rest, self._log_density_of_split(rest, self.without_last_gaussian(theta), label, theta[:, -8:-2], most)
 
@@ -321,11 +321,11 @@ class FaintGaussianReference:
             old = here[rows]
             last = old[:, 6 * faint : 6 * faint + 6]
             others = np.delete(old, slice(6 * faint, 6 * faint + 6), axis=1)
-            rest = self._merge_into_bright(others, to_bright, last)
+            rest = self._merge_gaussian_into_bright_one(others, to_bright, last)
             most = self._greatest_faint_mass(self._masses(rest), last_of_all=False)
             log_here = self._log_density_of_split(rest, others, to_bright, last, most)
             new_last = self._draw_gaussian_near_bright_one(rest, of_bright, most, rng)
-            new = self._split_off(rest, of_bright, new_last)
+            new = self._split_gaussian_off(rest, of_bright, new_last)
             log_there = self._log_density_of_split(rest, self.without_last_gaussian(new), of_bright, new_last, most)
             there[rows] = new
             with np.errstate(invalid="ignore"):
@@ -346,7 +346,7 @@ class FaintGaussianReference:
         last[:, 0] = _draw_mass_ratios(n, rng) * most * self._amplitude_at_unit_mass(last)
         return last
 
-    def _split_off(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
+    def _split_gaussian_off(self, rest: FloatArray, label: int, last: FloatArray) -> FloatArray:
         """Subtract a Gaussian's moments from those of a bright one, and append it; nan where nothing would be left."""
         own = slice(6 * label, 6 * label + 6)
         left = self._gaussian_from_moments(self._moments_of_gaussian(rest[:, own]) - self._moments_of_gaussian(last))
@@ -354,7 +354,7 @@ class FaintGaussianReference:
         out[:, own] = left
         return np.where(np.isfinite(left).all(axis=1, keepdims=True), out, np.nan)
 
-    def _merge_into_bright(self, others: FloatArray, label: int, last: FloatArray) -> FloatArray:
+    def _merge_gaussian_into_bright_one(self, others: FloatArray, label: int, last: FloatArray) -> FloatArray:
         """Add a Gaussian's moments to those of a bright one, keeping light, centre and covariance of the two."""
         own = slice(6 * label, 6 * label + 6)
         out = others.copy()

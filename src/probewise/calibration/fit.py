@@ -285,7 +285,7 @@ def _sensor_from_posterior(
     # Samples of an SMC run have equal weights, so those that are kept suffice for the field.
     theta, weight = (samples, None) if isinstance(result, SMCResult) else (result.theta, result.weight)
     blind = blind_axis_rad(recording)
-    silent = _unconstrained_moments(samples, prior, rng)
+    silent = _names_of_unconstrained_moments(samples, prior, rng)
     if blind is not None:
         notes = (
             *notes,
@@ -314,7 +314,7 @@ def _sensor_from_posterior(
     )
 
 
-def _unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:
+def _names_of_unconstrained_moments(samples: FloatArray, prior: SSFPrior, rng: np.random.Generator) -> tuple[str, ...]:
     """Names of the moments (centre, widths, correlation) that the recording did not constrain."""
     before = mixture_moments(prior.from_unit_cube(rng.random((2000, len(prior.names)))), prior.n_gaussians)
     after = mixture_moments(samples, prior.n_gaussians)

@@ -44,7 +44,7 @@ class StudentTDensity:
         return np.asarray(self.mean + white @ self.root.T)
 
     @property
-    def log_density_around_nine_tenths(self) -> float:
+    def log_density_enclosing_nine_tenths(self) -> float:
         """Log density above which nine tenths of the draws lie, by Fisher's distribution."""
         d = len(self.mean)
         at = self.mean + math.sqrt(d * float(fdtri(d, _DEGREES_OF_FREEDOM, _NEAR))) * self.root[:, 0]
@@ -109,7 +109,7 @@ class PeakDensity:
             self.one.log_density(self.space.apply_label_permutation(y, change))
             for change in self.space.label_permutations
         ]
-        return np.asarray(np.max(each, axis=0) > self.one.log_density_around_nine_tenths)
+        return np.asarray(np.max(each, axis=0) > self.one.log_density_enclosing_nine_tenths)
 
     def log_density_over_prior(self, theta: FloatArray) -> FloatArray:
         """Return the log of this density divided by the prior's, (n, 6 N + 2) -> (n,)."""

@@ -40,7 +40,7 @@ def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) 
         Whether to summarise each of several Gaussians too.
     """
     f = footprint_of(samples[:, : 6 * n_gaussians], n_gaussians)
-    found = _quantities_of_moments("", *_whole_moments(f))
+    found = _quantities_of_moments("", *_moments_of_whole_footprint(f))
     if n_gaussians > 1 and each:
         for k in range(n_gaussians):
             prefix = f"gaussian_{k + 1}."
@@ -50,7 +50,7 @@ def ssf_quantities(samples: FloatArray, n_gaussians: int, *, each: bool = True) 
     return found
 
 
-def _whole_moments(f: Footprint) -> tuple[FloatArray, ...]:
+def _moments_of_whole_footprint(f: Footprint) -> tuple[FloatArray, ...]:
     """Compute the moments of the whole mixture, (n_samples,) each: u, v, their variances and covariance."""
     u, v = ((f.weight * centre).sum(axis=-1)[:, 0] for centre in (f.u_mm, f.v_mm))
     du, dv = f.u_mm[:, 0] - u[:, None], f.v_mm[:, 0] - v[:, None]

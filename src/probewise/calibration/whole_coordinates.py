@@ -53,13 +53,13 @@ class WholeFootprintCoordinates:
         g = view_by_kind_and_gaussian(x)
         ratio = np.exp(g[0, 1:])
         g[1:3, 0] += (ratio * (g[1:3, :1] - g[1:3, 1:])).sum(axis=1)
-        mean, first = self._centre_of_others_and_first_share(g)
-        covariance = _covariance_of_logs(g[3:6, 0])
+        mean, first = self._centre_from_others_and_first_share(g)
+        covariance = _covariance_from_logs(g[3:6, 0])
         whole_mean = mean + first * g[1:3, 0]
         off = g[1:3, 0] - whole_mean
         whole = first * (covariance + _second_moment_products(off)) + self._covariance_from_others(g, whole_mean)
         g[1:3, 0] = whole_mean
-        g[3:6, 0] = _logs_of_covariance(whole)
+        g[3:6, 0] = _logs_from_covariance(whole)
         return x
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -71,8 +71,8 @@ class WholeFootprintCoordinates:
         g[0, 1:] = g[0, 1:].clip(-100.0, 0.0)
         g[3:5] = g[3:5].clip(-100.0, 100.0)
         ratio = np.exp(g[0, 1:])
-        mean, first = self._centre_of_others_and_first_share(g)
-        whole_mean, whole = g[1:3, 0].copy(), _covariance_of_logs(g[3:6, 0])
+        mean, first = self._centre_from_others_and_first_share(g)
+        whole_mean, whole = g[1:3, 0].copy(), _covariance_from_logs(g[3:6, 0])
         # An extreme correlation is one in its last digit.
         real = _positive_definite_mask(whole)
         whole[:, ~real] = _UNIT
@@ -81,7 +81,7 @@ class WholeFootprintCoordinates:
         own = (whole - self._covariance_from_others(g, whole_mean)) / first - _second_moment_products(off)
         real &= _positive_definite_mask(own)
         own[:, ~real] = _UNIT
-        g[3:6, 0] = _logs_of_covariance(own)
+        g[3:6, 0] = _logs_from_covariance(own)
         heaviest = 1.0 / (1.0 + ratio.sum(axis=0))
         g[1:3, 0] = heaviest * (g[1:3, 0] + (ratio * g[1:3, 1:]).sum(axis=1))
         theta, log_density = self._moment_coordinates.leave(y)
@@ -103,7 +103,7 @@ class WholeFootprintCoordinates:
         light = np.exp(g[0, 1:]) / (1.0 + (reach / _TAPER**2) ** 2)
         return np.asarray(light / (1.0 + light.sum(axis=0)))
 
-    def _centre_of_others_and_first_share(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _centre_from_others_and_first_share(self, g: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Sum the centres of all but the first times their tapered shares, (2, n); and the first one's share, (n,)."""
         light = self._tapered_shares(g)
         return (light * g[1:3, 1:]).sum(axis=1), 1.0 - light.sum(axis=0)
@@ -112,7 +112,7 @@ class WholeFootprintCoordinates:
         """Sum the contributions of all but the first to the covariance of the whole, (3, n)."""
         off = g[1:3, 1:] - mean[:, None]
         return np.asarray(
-            (self._tapered_shares(g) * (_covariance_of_logs(g[3:6, 1:]) + _second_moment_products(off))).sum(axis=1)
+            (self._tapered_shares(g) * (_covariance_from_logs(g[3:6, 1:]) + _second_moment_products(off))).sum(axis=1)
         )
 
 
@@ -122,7 +122,7 @@ def count_bright(theta: FloatArray) -> IntArray:
     return np.asarray((light > FAINT * light.max(axis=1, keepdims=True)).sum(axis=1))
 
 
-def _covariance_of_logs(logs: FloatArray) -> FloatArray:
+def _covariance_from_logs(logs: FloatArray) -> FloatArray:
     """Compute variances and covariance from log variances and arctanh of the correlation, (3, ...) -> (3, ...)."""
     variance = np.exp(logs[:2])
     return np.stack([*variance, np.tanh(logs[2]) * np.sqrt(variance[0] * variance[1])])
@@ -134,8 +134,8 @@ def _positive_definite_mask(covariance: FloatArray) -> BoolArray:
     return np.asarray((xx > 0.0) & (yy > 0.0) & (xy**2 < (1.0 - _LEAST) * xx * yy))
 
 
-def _logs_of_covariance(covariance: FloatArray) -> FloatArray:
-    """Undo `_covariance_of_logs`."""
+def _logs_from_covariance(covariance: FloatArray) -> FloatArray:
+    """Undo `_covariance_from_logs`."""
     xx, yy, xy = covariance
     return np.stack([np.log(xx), np.log(yy), np.arctanh(xy / np.sqrt(xx * yy))])
 
@@ -146,7 +146,7 @@ def _second_moment_products(off: FloatArray) -> FloatArray:
 
 
 def _log_volume_ratio(covariance: FloatArray) -> FloatArray:
-    """Log of the volume ratio of `_covariance_of_logs`, up to a constant, (3, ...) -> (...)."""
+    """Log of the volume ratio of `_covariance_from_logs`, up to a constant, (3, ...) -> (...)."""
     xx, yy, xy = covariance
     product = xx * yy
     return np.asarray(0.5 * np.log(product) + np.log(product - xy**2))

@@ -13,7 +13,7 @@ from probewise.nested.function_problem import FunctionProblem, Posed, make_probl
 from probewise.nested.genealogy import chain_memory, relative_lineage_variance
 from probewise.nested.importance import Weighted, pareto_k, update
 from probewise.nested.kernels import KernelMove, diversify_by_kernels
-from probewise.nested.merging import agreement_of, alive_at_death, merge
+from probewise.nested.merging import agreement_of, alive_at_death, merge, n_alive_at_death
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.refine import refine
 from probewise.nested.repartition import Repartitioned, repartitioned
@@ -70,6 +70,7 @@ __all__ = [
     "least_live",
     "make_problem",
     "merge",
+    "n_alive_at_death",
     "pareto_k",
     "pose",
     "refine",

@@ -8,8 +8,8 @@ nothing, a small run of the same problem is used. The jump distance of the chain
 is no substitute: it is smallest for many modes or a thin shell, where the evidence is right.
 
 Neither estimate sees a narrow peak that begins above where both end, or a part of the posterior without live points,
-both of which `missing` looks for. Where a part without live points holds evidence that matters, the run is repeated
-with hops between the parts that are then known.
+both of which `missed_hills` looks for. Where a part without live points holds evidence that matters, the run is
+repeated with hops between the parts that are then known.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Samplable
 from probewise.nested.hills import HillEstimate, log_evidence_of_unmet_hills
 from probewise.nested.hops import HoppingMove
-from probewise.nested.missing import DISAGREE, MissedHills, find_missed_hills, log_z_rise_in_errors
+from probewise.nested.missed_hills import DISAGREE, MissedHills, find_missed_hills, log_z_rise_in_errors
 from probewise.nested.moves import Move, SliceMove
 from probewise.nested.repartition import Repartitioned, repartitioned, split_into_clusters
 from probewise.nested.result import Check, NestedResult, warning_of_few_lineages, warning_of_few_possible_draws

@@ -66,7 +66,7 @@ class LivePoints:
 
 
 @dataclass(frozen=True, eq=False)
-class DeadOfRound:
+class DeadPointsOfRound:
     """The points that one round removed, worst first, and the insertion ranks of their successors.
 
     `n_at_death`: number of points alive when each died, itself included. `rank`: how many of the
@@ -90,7 +90,7 @@ class RunState:
     """
 
     live: LivePoints
-    dead: tuple[DeadOfRound, ...]
+    dead: tuple[DeadPointsOfRound, ...]
     moving: Move
     log_start: float
     log_start_error: float
@@ -197,7 +197,7 @@ class CheckpointFile:
             arrays |= {f"dead_{name}": getattr(births, name) for name in _BIRTHS}
             arrays |= {f"dead_{name}": np.concatenate([getattr(d, name) for d in now.dead]) for name in _RECORD}
         buffer = io.BytesIO()
-        np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_as_json)), **arrays)
+        np.savez(buffer, allow_pickle=False, head=np.array(json.dumps(head, default=_json_default)), **arrays)
         return buffer.getvalue()
 
     def resume(self, evaluate: Evaluator, move: Move, rng: np.random.Generator) -> RunState | None:
@@ -299,7 +299,7 @@ def _run_state_from_file(head: dict[str, object], arrays: dict[str, np.ndarray],
         rows = slice(int(end - size), int(end))
         points = Points(*(arrays[f"dead_{name}"][rows] for name in _POINTS))
         births = BirthRecords(*(arrays[f"dead_{name}"][rows] for name in _BIRTHS))
-        dead.append(DeadOfRound(points, births, *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
+        dead.append(DeadPointsOfRound(points, births, *(arrays[f"dead_{name}"][rows] for name in _RECORD)))
     live = LivePoints(
         Points(*(arrays[f"live_{name}"] for name in _POINTS)),
         BirthRecords(*(arrays[f"live_{name}"] for name in _BIRTHS)),
@@ -337,7 +337,8 @@ def _with_numeric_fields(move: Move, numbers: object) -> Move:
     return restored
 
 
-def _as_json(value: object) -> object:
+def _json_default(value: object) -> object:
+    """Convert what `json` cannot: arrays to lists, anything else to text."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 

@@ -40,12 +40,12 @@ class Clusters:
     def from_groups(groups: list[FloatArray]) -> Clusters:
         """Compute mean and covariance of groups of points, each (n, n_params)."""
         mean = np.stack([g.mean(axis=0) for g in groups])
-        root = np.stack([_covariance_root(g) for g in groups])
+        root = np.stack([_cholesky_of_covariance(g) for g in groups])
         inverse = np.asarray(np.linalg.inv(root), dtype=np.float64)
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
         return Clusters(mean, root, inverse, log_det, np.array([len(g) for g in groups]))
 
-    def map_between(self, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
+    def map_with_log_volume_ratio(self, u: FloatArray, home: IntArray, goal: IntArray) -> tuple[FloatArray, FloatArray]:
         """Map points of clusters `home` to clusters `goal`, affinely; also return the log of the volume ratio.
 
         Points are (n, n_params), clusters (n,).
@@ -129,7 +129,7 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
     axes = np.concatenate([z, z @ vectors / np.sqrt(np.maximum(values, flattest))], axis=1)
     # Two equal modes make the kurtosis small, a small mode beside a large one makes it large.
     fourth = (axes**4).mean(axis=0)
-    whole = n * _covariance_root_log_det(points)
+    whole = n * _log_det_of_covariance_cholesky(points)
     n_more = 1 + n_params * (n_params + 3) / 2
     best, halves = n_more + 0.15 * n + 10.0, None
     for axis in {int(np.argmin(fourth)), int(np.argmax(fourth))}:
@@ -148,7 +148,9 @@ def _split_in_two(points: FloatArray, least: int) -> tuple[FloatArray, FloatArra
             continue
         a, b = points[~side], points[side]
         entropy = n_one * np.log(n_one / n) + (n - n_one) * np.log(1 - n_one / n)
-        gain = whole - len(a) * _covariance_root_log_det(a) - len(b) * _covariance_root_log_det(b) + entropy
+        gain = (
+            whole - len(a) * _log_det_of_covariance_cholesky(a) - len(b) * _log_det_of_covariance_cholesky(b) + entropy
+        )
         if gain > best:
             best, halves = float(gain), (a, b)
     return halves
@@ -159,7 +161,7 @@ def _least_points_of_cluster(n_params: int) -> int:
     return 2 * n_params + 2
 
 
-def _covariance_root(points: FloatArray) -> FloatArray:
+def _cholesky_of_covariance(points: FloatArray) -> FloatArray:
     """Cholesky factor of the covariance of points (n, n_params), with a small ridge where there is no extent."""
     n_params = points.shape[1]
     centred = points - points.mean(axis=0)
@@ -169,6 +171,6 @@ def _covariance_root(points: FloatArray) -> FloatArray:
     return np.linalg.cholesky(covariance + np.diag(ridge))
 
 
-def _covariance_root_log_det(points: FloatArray) -> float:
-    """Log determinant of the root of the covariance: half of that of the covariance."""
-    return float(np.log(np.diag(_covariance_root(points))).sum())
+def _log_det_of_covariance_cholesky(points: FloatArray) -> float:
+    """Log determinant of the Cholesky factor of the covariance: half of that of the covariance."""
+    return float(np.log(np.diag(_cholesky_of_covariance(points))).sum())

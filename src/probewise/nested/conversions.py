@@ -65,7 +65,7 @@ def to_arviz(result: DeadPoints, attributes: Mapping[str, object], *, rng: np.ra
     arviz = _import_optional("arviz")
     if not result.names:
         raise ParameterError("names", result.names, "one parameter or more; without any there are no samples")
-    rows = result.rows(n, rng=rng)
+    rows = result.draw_rows(n, rng=rng)
     groups = {
         "posterior": {name: result.theta[None, rows, i] for i, name in enumerate(result.names)},
         "sample_stats": {

@@ -94,7 +94,7 @@ def intensified(
     evaluate = Evaluator(problem)
     _require_complete_run_of(result, evaluate)
     seed_state = generator_state_as_json(rng.bit_generator.state)
-    first, last = _rows_to_intensify(result, goal)
+    first, last = _first_and_last_row_to_intensify(result, goal)
     thread = _draw_thread(result, evaluate, SliceMove() if move is None else move, first, last, n_live, max_calls, rng)
     return _join_thread_to_run(result, thread, seed_state, evaluate.n_calls, rng)
 
@@ -132,7 +132,7 @@ def _require_complete_run_of(result: NestedResult, evaluate: Evaluator) -> None:
         )
 
 
-def _rows_to_intensify(result: NestedResult, goal: Goal) -> tuple[int, int]:
+def _first_and_last_row_to_intensify(result: NestedResult, goal: Goal) -> tuple[int, int]:
     """Return the rows of the two deaths between which new points count most."""
     weight = result.weight
     if goal == "posterior":

@@ -44,7 +44,7 @@ class HoppingMove:
         modes, space = self.modes, evaluate.space
         home = modes.assign(now.u)
         goal = (home + rng.integers(1, len(modes), size=len(home))) % len(modes)
-        u, log_growth = modes.map_between(now.u, home, goal)
+        u, log_growth = modes.map_with_log_volume_ratio(now.u, home, goal)
         # The way back must be the same map.
         able = within_bounds_mask(space, u) & (modes.assign(u) == goal)
         level = now.log_density - log_growth - rng.standard_exponential(len(home))

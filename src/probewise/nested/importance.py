@@ -193,7 +193,7 @@ def update(
     if previous.names != evaluate.names:
         raise ParameterError("previous.names", previous.names, f"the problem's names {evaluate.names}")
     space = unbounded_space_of(problem.prior)
-    rows = np.unique(previous.rows(1000, rng=rng))
+    rows = np.unique(previous.draw_rows(1000, rng=rng))
     theta = previous.theta[rows]
     log_likelihood = evaluate.log_likelihood(theta)
     log_weight = previous.log_weight[rows] + log_likelihood - previous.log_likelihood[rows]
@@ -283,7 +283,7 @@ def with_error_of_lost_parts(found: Weighted, n_lineages: float, space: Space, r
     if not found.n_eff > 1:
         return found
     n = int(min(found.n_eff, 1000))
-    parts = find_disconnected_clusters(space.enter(found.theta[np.unique(found.rows(n, rng=rng))]))
+    parts = find_disconnected_clusters(space.enter(found.theta[np.unique(found.draw_rows(n, rng=rng))]))
     share = parts.size / parts.size.sum()
     lost = float(share @ np.exp(-n_lineages * share))
     return replace(found, lost=lost, log_z_error=math.hypot(found.log_z_error, lost))

@@ -15,7 +15,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import weighted_mean_and_error
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, integrate
-from probewise.nested.missing import DISAGREE
+from probewise.nested.missed_hills import DISAGREE
 from probewise.nested.result import Agreement, Check, NestedResult, software_versions
 
 # p value below which runs disagree: one false alarm in 1000 merges.
@@ -159,7 +159,7 @@ class JoinedRecord:
         together = [np.concatenate(each) for each in zip(*parts, strict=True)]
         order = np.lexsort((together[1], together[0]))
         log_likelihood, label, log_birth, birth_label = (each[order] for each in together)
-        n_at_death = alive_at_death(log_likelihood, label, log_birth, birth_label)
+        n_at_death = n_alive_at_death(log_likelihood, label, log_birth, birth_label)
         return cls(order, log_likelihood, label, log_birth, birth_label, n_at_death)
 
     def parents_in_joined_order(self, parent: IntArray) -> IntArray:
@@ -168,7 +168,7 @@ class JoinedRecord:
         return np.asarray(np.where(parent >= 0, place[parent], -1)[self.order])
 
 
-def alive_at_death(
+def n_alive_at_death(
     log_likelihood: FloatArray, label: FloatArray, log_birth: FloatArray, birth_label: FloatArray
 ) -> IntArray:
     """Count the points alive at each death from the levels of birth and death.
@@ -195,6 +195,9 @@ def alive_at_death(
     return out[:n]
 
 
+alive_at_death = n_alive_at_death  # its earlier name
+
+
 def _joined_checks(parts: Sequence[NestedResult], log_z: float, error: float) -> Check | None:
     """Average the runs' second estimates, weighted by their errors; None where a run has none."""
     checks = [r.check for r in parts if r.check is not None]
@@ -218,7 +221,7 @@ def _seed_states_of_mergeable_runs(parts: Sequence[NestedResult]) -> list[object
         if result.names != names:
             raise ParameterError(f"names of run {number}", result.names, f"those of the first run, {names}")
         record = (result.log_likelihood, result.label, result.log_birth, result.birth_label)
-        if not np.array_equal(alive_at_death(*record), result.n_at_death):
+        if not np.array_equal(n_alive_at_death(*record), result.n_at_death):
             raise ParameterError(
                 f"n_at_death of run {number}",
                 "not what births and deaths give",

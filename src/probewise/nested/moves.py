@@ -236,7 +236,9 @@ class SliceMove:
                     first = (hopping & ok).nonzero()[0]
                     who = chain[first]
                     goal[first] = (home[who] + rng.integers(1, len(clusters), size=who.size)) % len(clusters)
-                    candidate[first], log_growth = metrics.map_between(who, now.u[who], home[who], goal[first])
+                    candidate[first], log_growth = metrics.map_with_log_volume_ratio(
+                        who, now.u[who], home[who], goal[first]
+                    )
                     if periodic is not None:
                         # Across the cut of a circle the reverse hop would differ.
                         ok[first] &= (periodic.wrapped_at_cut(candidate[first]) == candidate[first]).all(axis=1)
@@ -380,11 +382,13 @@ class _ClusterMetrics:
         """Return for chains `rows` the row of the metric of cluster `home`, their own cluster without their start."""
         return np.where(home == self.own_home[rows], self.n_clusters + rows, home)
 
-    def map_between(
+    def map_with_log_volume_ratio(
         self, rows: IntArray, u: FloatArray, home: IntArray, goal: IntArray
     ) -> tuple[FloatArray, FloatArray]:
         """Map points to their counterparts in other clusters; also return the log of the volume ratio."""
-        return self.each.map_between(u, self.rows_of_metrics(rows, home), self.rows_of_metrics(rows, goal))
+        return self.each.map_with_log_volume_ratio(
+            u, self.rows_of_metrics(rows, home), self.rows_of_metrics(rows, goal)
+        )
 
 
 @dataclass(frozen=True, eq=False)

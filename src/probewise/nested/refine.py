@@ -19,7 +19,7 @@ from probewise.nested.importance import (
     split_off_held_out,
     with_error_of_lost_parts,
 )
-from probewise.nested.missing import find_missed_hills
+from probewise.nested.missed_hills import find_missed_hills
 from probewise.nested.proposal import fit_wide_and_narrow_proposals, mixture_of_proposals
 from probewise.nested.result import NestedResult
 from probewise.nested.space import unbounded_space_of

@@ -56,25 +56,25 @@ class _StudentMixture:
         return np.asarray(np.linalg.inv(self.root))
 
     @cached_property
-    def log_volume(self) -> FloatArray:
+    def log_det_of_roots(self) -> FloatArray:
         """Log absolute determinants of the roots, (n_parts,)."""
         return np.asarray(np.linalg.slogdet(self.root)[1])
 
-    def to_axes(self, x: FloatArray, part: int) -> FloatArray:
+    def to_principal_axes(self, x: FloatArray, part: int) -> FloatArray:
         """Map x to coordinates along the axes of a part, (n, n_params) -> (n, n_params)."""
         # A matrix product would depend, in the last bit, on the batch, which an executor divides.
         return np.asarray(np.einsum("nj,ij->ni", x - self.center[part], self.inverse_root[part]))
 
     def log_densities(self, x: FloatArray) -> FloatArray:
         """Return each part's log density times its share, (n, n_params) -> (n_parts, n)."""
-        own = [_student_t_log_density(self.to_axes(x, part)) for part in range(len(self))]
-        return np.asarray(np.stack(own) + (np.log(self.share) - self.log_volume)[:, None])
+        own = [_student_t_log_density(self.to_principal_axes(x, part)) for part in range(len(self))]
+        return np.asarray(np.stack(own) + (np.log(self.share) - self.log_det_of_roots)[:, None])
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Return the log density of the mixture, (n, n_params) -> (n,)."""
         return np.asarray(np.logaddexp.reduce(self.log_densities(x), axis=0))
 
-    def from_axes(self, e: FloatArray, part: IntArray) -> FloatArray:
+    def from_principal_axes(self, e: FloatArray, part: IntArray) -> FloatArray:
         """Map coordinates along the axes of a part, one for each row, to x: (n, n_params) and (n,) -> (n, n_params)."""
         return np.asarray(self.center[part] + np.einsum("nij,nj->ni", self.root[part], e))
 
@@ -117,7 +117,7 @@ class _PriorNearPosterior:
         """Draw `n` points of this prior in the coordinates of chains, (n, n_params)."""
         part = rng.choice(len(self.parts), size=n, p=self.parts.share)
         e = rng.standard_t(_DEGREES_OF_FREEDOM, (n, len(self.names)))
-        return self.whole.to_axes(self.parts.from_axes(e, part), 0)
+        return self.whole.to_principal_axes(self.parts.from_principal_axes(e, part), 0)
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         # The first number also chooses the part: its place within the part's share is again uniform.
@@ -126,13 +126,13 @@ class _PriorNearPosterior:
         within = u.copy()
         within[:, 0] = (u[:, 0] - (ladder - self.parts.share)[part]) / self.parts.share[part]
         e = np.asarray(stdtrit(_DEGREES_OF_FREEDOM, np.clip(within, 0.0, 1.0)), dtype=np.float64)
-        return self.space.leave(self.parts.from_axes(e, part))[0]
+        return self.space.leave(self.parts.from_principal_axes(e, part))[0]
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Return the place in the cube that leads to theta by way of the part that is densest there."""
         x = self.space.enter(theta)
         part = np.argmax(self.parts.log_densities(x), axis=0)
-        e = np.stack([self.parts.to_axes(x, k) for k in range(len(self.parts))])[part, np.arange(len(x))]
+        e = np.stack([self.parts.to_principal_axes(x, k) for k in range(len(self.parts))])[part, np.arange(len(x))]
         u = np.asarray(stdtr(_DEGREES_OF_FREEDOM, e))
         u[:, 0] = (np.cumsum(self.parts.share) - self.parts.share)[part] + self.parts.share[part] * u[:, 0]
         return u
@@ -152,13 +152,13 @@ class _PriorNearPosterior:
 
     def enter(self, theta: FloatArray) -> FloatArray:
         """Map parameters to coordinates along the axes of `whole`, both (n, n_params)."""
-        return self.whole.to_axes(self.space.enter(theta), 0)
+        return self.whole.to_principal_axes(self.space.enter(theta), 0)
 
     def leave(self, e: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Map coordinates to parameters, (n, n_params); also return this prior's log density in them, (n,)."""
         x = self.whole.center[0] + e @ self.whole.root[0].T
         theta, log_plain = self.space.leave(x)
-        log_density = self.parts.log_density(x) + self.whole.log_volume[0]
+        log_density = self.parts.log_density(x) + self.whole.log_det_of_roots[0]
         return theta, np.where(np.isfinite(log_plain), log_density, -np.inf)
 
 

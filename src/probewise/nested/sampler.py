@@ -24,7 +24,14 @@ from probewise._kinds import (
     require_whole,
 )
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested.checkpoint import BirthRecords, CheckpointFile, DeadOfRound, LivePoints, RunState, settings_of_run
+from probewise.nested.checkpoint import (
+    BirthRecords,
+    CheckpointFile,
+    DeadPointsOfRound,
+    LivePoints,
+    RunState,
+    settings_of_run,
+)
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.evidence import DOUBTFUL_P_VALUE, birth_rows, insertion_p_value, integrate, log_volumes
 from probewise.nested.genealogy import relative_lineage_variance
@@ -62,7 +69,7 @@ def move_at_volume(move: Move, log_volume: float) -> Move:
 
 def replace_worst_live_points(
     live: LivePoints, move: Move, evaluate: Evaluator, *, n_replaced: int, rng: np.random.Generator
-) -> tuple[LivePoints, DeadOfRound, Tally]:
+) -> tuple[LivePoints, DeadPointsOfRound, Tally]:
     """Replace the `n_replaced` worst live points by new ones above the best of them.
 
     Returns the new live points, the dead ones, and the statistics of the move.
@@ -86,7 +93,7 @@ def replace_worst_live_points(
     n_ranked = len(spared) + np.arange(n_replaced)
     rank = np.where(np.arange(n_live) < n_ranked[:, None], worse, False).sum(axis=1)
     n_at_death = n_live - np.arange(n_replaced)
-    dead = DeadOfRound(live.points.take(doomed), live.births.take(doomed), n_at_death, rank, n_ranked)
+    dead = DeadPointsOfRound(live.points.take(doomed), live.births.take(doomed), n_at_death, rank, n_ranked)
     known = live.births.take(spared)
     fresh = BirthRecords(
         np.full(n_replaced, bound.log_likelihood),

@@ -53,7 +53,7 @@ def within_bounds_mask(space: Space, u: FloatArray) -> BoolArray:
 
 
 @dataclass(frozen=True)
-class _UnitCube:
+class _UnitCubeSpace:
     """The unit cube, in which the prior is uniform; `periodic` columns are wrapped."""
 
     prior: Prior
@@ -81,7 +81,7 @@ class _UnitCube:
 
 
 @dataclass(frozen=True)
-class _NormalScores:
+class _NormalScoreCoordinates:
     """Normal scores of the unit cube: coordinates with a standard normal prior."""
 
     prior: Prior
@@ -98,7 +98,7 @@ class _NormalScores:
 
 
 @dataclass(frozen=True)
-class _Unbounded:
+class _UnboundedSpace:
     """Coordinates without bounds: the prior's own, or normal scores."""
 
     prior: Prior
@@ -156,8 +156,8 @@ def space_of(prior: Prior, periodic: Sequence[str] = ()) -> Space:
         allowed = "none: the prior has coordinates of its own" if own else f"names among {prior.names}"
         raise ParameterError("periodic", tuple(periodic), allowed)
     if isinstance(prior, _PriorWithCoordinates):
-        return _Unbounded(prior, prior.coordinates)
-    return _UnitCube(prior, tuple(prior.names.index(name) for name in periodic))
+        return _UnboundedSpace(prior, prior.coordinates)
+    return _UnitCubeSpace(prior, tuple(prior.names.index(name) for name in periodic))
 
 
 def unbounded_space_of(prior: Prior) -> Space:
@@ -169,6 +169,6 @@ def unbounded_space_of(prior: Prior) -> Space:
         If the prior has neither coordinates of its own nor `to_unit_cube`.
     """
     if isinstance(prior, _PriorWithCoordinates):
-        return _Unbounded(prior, prior.coordinates)
+        return _UnboundedSpace(prior, prior.coordinates)
     require_prior("problem.prior", prior, "to_unit_cube")
-    return _Unbounded(prior, _NormalScores(prior))
+    return _UnboundedSpace(prior, _NormalScoreCoordinates(prior))

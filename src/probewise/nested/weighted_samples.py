@@ -29,11 +29,13 @@ class WeightedSamples(ShowsItself):
         """Posterior weights, summing to one, (n,)."""
         return np.asarray(np.exp(self.log_weight))
 
-    def rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
+    def draw_rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
         """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
         require_rng(rng)
         n = require_whole("n", n)
         return np.asarray(rng.permutation(resampled_rows(self.weight, n, rng)))
+
+    rows = draw_rows  # its earlier name
 
     def samples(self, n: int, *, rng: np.random.Generator) -> FloatArray:
         """Draw `n` equally weighted posterior samples, (n, n_params), in random order.
@@ -41,7 +43,7 @@ class WeightedSamples(ShowsItself):
         Systematic resampling: a point of weight w occurs n w times, rounded up or down, so points
         repeat only where a weight exceeds 1 / n; `diversify` makes repeated samples distinct.
         """
-        return np.asarray(self.theta[self.rows(n, rng=rng)])
+        return np.asarray(self.theta[self.draw_rows(n, rng=rng)])
 
     def sd(self) -> FloatArray:
         """Posterior standard deviation of the parameters, (n_params,)."""

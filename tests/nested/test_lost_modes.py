@@ -16,7 +16,7 @@ from probewise.nested.clusters import Clusters
 from probewise.nested.evaluate import Bound, Evaluator, Samplable
 from probewise.nested.hills import log_evidence_of_unmet_hills
 from probewise.nested.hops import HoppingMove
-from probewise.nested.missing import MissedHills, find_missed_hills
+from probewise.nested.missed_hills import MissedHills, find_missed_hills
 from probewise.nested.sampler import run_once
 
 SHARE = 0.6

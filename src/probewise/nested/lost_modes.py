@@ -62,7 +62,7 @@ def peaks_climbed_from_early_points(
     # Denser in the beginning: a mode that dies out late has points there, too.
     rows = np.unique((last * np.linspace(0.0, 1.0, n_starts) ** 3).astype(np.int64))
     start = evaluate.points_from_known_values(first.theta[rows], first.log_likelihood[rows], first.label[rows])
-    samples = np.unique(first.rows(_N_KNOWN, rng=rng))
+    samples = np.unique(first.draw_rows(_N_KNOWN, rng=rng))
     known = evaluate.points_from_known_values(first.theta[samples], first.log_likelihood[samples], first.label[samples])
     u = evaluate.space.enter(first.theta[: last + _BLOCK])
     scale = sds_after_early_dead_points(first, evaluate.space)

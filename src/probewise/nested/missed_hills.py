@@ -1,10 +1,10 @@
 """Look for parts of the posterior that a run has missed, from its last live points and its dead ones.
 
-Candidates come from three searches. Early dead points climb to modes that died out (`lost`). Draws about the last live
-points climb to the top of their peak (`ascent`): a top far above all points of the run means that the run ended beside
-the bulk of its posterior, on the arm of a heavy tail along which its chains hardly moved. Draws about that top meet
-narrow peaks above the end (`beyond`). Each hill is weighed by importance sampling, and held
-against the share of the run's posterior at the same place (`hills`).
+Candidates come from three searches. Early dead points climb to modes that died out (`lost_modes`). Draws about the last
+live points climb to the top of their peak (`ascent`): a top far above all points of the run means that the run ended
+beside the bulk of its posterior, on the arm of a heavy tail along which its chains hardly moved. Draws about that top
+meet narrow peaks above the end (`higher_peaks`). Each hill is weighed by importance sampling, and held against the
+share of the run's posterior at the same place (`hills`).
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise.nested.ascent import GaussianAtPeak, climb_to_top, gaussian_of_last_live_points
-from probewise.nested.beyond import find_higher_peaks
 from probewise.nested.evaluate import Evaluator, Points, Samplable
+from probewise.nested.higher_peaks import find_higher_peaks
 from probewise.nested.hills import (
     HillEstimate,
     calls_for_hill_evidence,
@@ -26,7 +26,11 @@ from probewise.nested.hills import (
     log_evidence_of_unmet_hills,
 )
 from probewise.nested.importance import Posterior
-from probewise.nested.lost import peaks_climbed_from_early_points, sds_after_early_dead_points, separated_by_dip_mask
+from probewise.nested.lost_modes import (
+    peaks_climbed_from_early_points,
+    sds_after_early_dead_points,
+    separated_by_dip_mask,
+)
 from probewise.nested.result import NestedResult
 
 DISAGREE = 2.5

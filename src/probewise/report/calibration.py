@@ -173,7 +173,10 @@ def parameter_table(sensor: FittedSensor) -> Markup:
     median, ends = sensor.median(), sensor.interval()
     return table(
         ("parameter", "unit", "median", "95 % interval"),
-        ((n, _unit_in_words(sensor.unit_of_parameter(n)), *value_and_interval(median[n], *ends[n])) for n in sensor.names),
+        (
+            (n, _unit_in_words(sensor.unit_of_parameter(n)), *value_and_interval(median[n], *ends[n]))
+            for n in sensor.names
+        ),
         caption="Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of "
         "[[A, C], [C, B]].",
     )

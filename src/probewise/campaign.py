@@ -19,7 +19,7 @@ from typing import Any, Self, TypeVar
 from probewise.errors import FileError, NotConvergedError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings import hold_lock, parse_json_file_text, read_bytes, write_text_atomically
-from probewise.recordings.atomic import write_to_disk
+from probewise.recordings.atomic import write_and_sync
 
 __all__ = ["FORMAT", "CampaignContents", "Finished", "read_campaign", "run_campaign"]
 
@@ -157,7 +157,7 @@ class _ResultLog:
             raise ParameterError(
                 f"the result of {key}", result, f"a JSON object of finite numbers ({error})"
             ) from error
-        write_to_disk(self._file, self._path, line.encode() + b"\n")
+        write_and_sync(self._file, self._path, line.encode() + b"\n")
         return line
 
 

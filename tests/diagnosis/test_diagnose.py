@@ -266,7 +266,7 @@ def test_a_jump_of_one_scan_is_unknown_and_its_repair_gains():
 @pytest.mark.slow
 def test_a_jump_of_all_scans_that_go_forward_is_hysteresis_of_half_its_size():
     plain = recording("two_way")
-    step = 1.0 * (plain.plan.direction[:, 0] > 0)
+    step = 1.0 * (plain.plan.direction_of_motion[:, 0] > 0)
     found = diagnose(dataclasses.replace(plain, readings=plain.readings + step), rng=np.random.default_rng(0))
     assert found.combination == ("hysteresis",)
     (amp,) = next(effect for effect in found.effects if effect.name == "hysteresis").parameters

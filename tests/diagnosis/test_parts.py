@@ -40,10 +40,10 @@ from probewise.diagnosis.residuals.locate import places_of_effect, significant_p
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
-from probewise.recordings.plans import jittered
+from probewise.recordings.plans import with_jittered_times
 from probewise.sensor import footprint_of, mixture_names
 
-EXTENT = Extent(10.0, 60.0, jittered(two_way_plan(), rng=np.random.default_rng(0)))
+EXTENT = Extent(10.0, 60.0, with_jittered_times(two_way_plan(), rng=np.random.default_rng(0)))
 
 
 def line(n: int = 12, *, scans: int = 2, unit: str = "LEGO") -> Recording:

@@ -41,11 +41,11 @@ from probewise.effects import (
 from probewise.effects.patches import straight_scan_lines
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
-from probewise.recordings.plans import jittered
+from probewise.recordings.plans import with_jittered_times
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseLevel, Poses, Stage
 
-PLAN = jittered(two_way_plan(), rng=np.random.default_rng(0))
+PLAN = with_jittered_times(two_way_plan(), rng=np.random.default_rng(0))
 EXTENT = Extent(10.0, 60.0, PLAN)
 
 

@@ -21,7 +21,7 @@ def test_every_combination_stands_at_every_place():
         assert dict(design.settings) == {"height_mm": plan.covariates["height_mm"][row]}
     assert len({designs[row] for row in range(len(designs))}) == len(designs)
     assert (plan.time_s == 7.0).all()
-    assert (plan.direction == 0).all()
+    assert (plan.direction_of_motion == 0).all()
 
 
 def test_the_default_is_one_reading_a_place():

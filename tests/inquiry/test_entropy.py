@@ -145,7 +145,7 @@ def test_the_grid_is_the_papers_field_row_by_row():
 
 def test_the_places_of_a_plan_are_alternatives_without_a_direction():
     """A lag or a backlash must not carry from one possible reading to the next."""
-    assert (Grid(n_x=3, n_y=3).plan("field").direction == 0).all()
+    assert (Grid(n_x=3, n_y=3).plan("field").direction_of_motion == 0).all()
 
 
 @pytest.mark.parametrize("change", [{"width_mm": 0.0}, {"n_x": 1}, {"height_mm": float("nan")}])

@@ -5,7 +5,7 @@ import pytest
 
 from probewise.errors import ParameterError
 from probewise.recordings import paper_plan, read_recording, shipped, two_way_plan
-from probewise.recordings.plans import jittered
+from probewise.recordings.plans import with_jittered_times
 
 
 def test_the_paper_plan_is_the_papers():
@@ -19,8 +19,8 @@ def test_the_paper_plan_is_the_papers():
     np.testing.assert_allclose(plan.orientation_rad[[r[0] for r in rows]], np.radians([0, 90, 180, 270, 0]))
     assert [plan.pattern_names[k] for k in plan.pattern[rows[4]]] == [f"quadrant_{c}" for c in "abcd"]
     assert plan.patterns["quadrant_d"].corner_mm == (-4, 4)
-    np.testing.assert_array_equal(plan.direction[rows[0]], np.tile([1.0, 0.0], (101, 1)))
-    np.testing.assert_array_equal(plan.direction[rows[4]], 0)
+    np.testing.assert_array_equal(plan.direction_of_motion[rows[0]], np.tile([1.0, 0.0], (101, 1)))
+    np.testing.assert_array_equal(plan.direction_of_motion[rows[4]], 0)
     np.testing.assert_allclose(np.diff(plan.time_s[rows[0]]), 1.2)
 
 
@@ -30,25 +30,25 @@ def test_the_two_way_plan_goes_both_ways_in_every_orientation():
     for deg in (0, 90, 180, 270):
         out, back = (plan.rows_by_scan()[plan.scan_names.index(f"edge_{deg}_{way}")] for way in ("out", "back"))
         np.testing.assert_array_equal(plan.x_mm[out], plan.x_mm[back][::-1])
-        assert plan.direction[out[0], 0] == 1
-        assert plan.direction[back[0], 0] == -1
+        assert plan.direction_of_motion[out[0], 0] == 1
+        assert plan.direction_of_motion[back[0], 0] == -1
         fast = 2 if deg >= 180 else 1
         np.testing.assert_allclose(np.diff(plan.time_s[out])[0], fast * np.diff(plan.time_s[back])[0])
     assert set(plan.pattern_names) >= {"white", "black", "disc"}
-    np.testing.assert_array_equal(plan.direction[-1], [0, -1])
+    np.testing.assert_array_equal(plan.direction_of_motion[-1], [0, -1])
     assert np.all(np.diff(plan.time_s) > 0)
 
 
 def test_jitter_keeps_the_order_and_the_pace():
     plan = two_way_plan()
-    taken = jittered(plan, rng=np.random.default_rng(1))
+    taken = with_jittered_times(plan, rng=np.random.default_rng(1))
     ratio = np.diff(taken.time_s) / np.diff(plan.time_s)
     assert ratio.min() > 0.899
     assert ratio.max() < 1.101
     assert ratio.std() > 0.05
     assert taken.covariates["battery_mv"][-1] < taken.covariates["battery_mv"][0] - 100
     with pytest.raises(ParameterError):
-        jittered(plan, rng=np.random.default_rng(1), share=2)
+        with_jittered_times(plan, rng=np.random.default_rng(1), share=2)
 
 
 @pytest.mark.parametrize(("name", "n_points"), [("paper", 408), ("concealed", 961)])

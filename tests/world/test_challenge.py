@@ -201,8 +201,8 @@ def test_kept_back_are_a_new_angle_a_new_pattern_and_another_direction(name):
     assert np.abs(np.sin(2 * (tests["angle"].orientation_rad[0] - angles))).min() > 0.5
     (pattern,) = tests["pattern"].patterns.values()
     assert type(pattern) not in {type(known) for known in plan.patterns.values()}
-    ways = {tuple(way) for way in np.round(plan.direction, 2)}
-    assert tuple(np.round(tests["direction"].direction[0], 2)) not in ways
+    ways = {tuple(way) for way in np.round(plan.direction_of_motion, 2)}
+    assert tuple(np.round(tests["direction"].direction_of_motion[0], 2)) not in ways
     latest = plan.time_s[-1]
     for test in tests.values():
         assert test.time_s[0] > latest

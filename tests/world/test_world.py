@@ -78,7 +78,7 @@ def test_one_reading_by_one_gives_the_same_as_the_whole_plan(clean):
             PLAN.orientation_rad[k],
             time_s=PLAN.time_s[k],
             rng=None,
-            direction=tuple(PLAN.direction[k]),
+            direction=tuple(PLAN.direction_of_motion[k]),
         )
         assert alone == pytest.approx(together[k], abs=1e-9)
 

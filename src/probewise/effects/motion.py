@@ -10,7 +10,7 @@ from probewise.recordings.plan import Plan
 
 def sign_of_motion(plan: Plan) -> FloatArray:
     """Return the sign of the last motion along X, or along Y where X did not move; 0 without motion, (n_points,)."""
-    along_x, along_y = np.sign(plan.direction).T
+    along_x, along_y = np.sign(plan.direction_of_motion).T
     return np.asarray(np.where(along_x != 0, along_x, along_y))
 
 

@@ -42,8 +42,8 @@ class Backlash(LinearEffect[Poses]):
         half_mm = theta[:, :1] / 2
         return replace(
             value,
-            x_mm=value.x_mm - half_mm * plan.direction[:, 0],
-            y_mm=value.y_mm - half_mm * plan.direction[:, 1],
+            x_mm=value.x_mm - half_mm * plan.direction_of_motion[:, 0],
+            y_mm=value.y_mm - half_mm * plan.direction_of_motion[:, 1],
         )
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:

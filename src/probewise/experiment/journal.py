@@ -29,7 +29,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, shown
-from probewise.recordings.atomic import write_text_atomically, write_to_disk
+from probewise.recordings.atomic import write_and_sync, write_text_atomically
 from probewise.recordings.locking import hold_lock
 from probewise.recordings.patterns import Pattern
 from probewise.recordings.plan import Instrumentation, Plan, Recording
@@ -351,7 +351,7 @@ class JournalWriter:
             "reading": _null_if_nan(reading.value),
             "covariates": {name: _null_if_nan(value) for name, value in reading.covariates.items()},
         }
-        write_to_disk(self._file, self.path, json.dumps(line, allow_nan=False)[:-1].encode())
+        write_and_sync(self._file, self.path, json.dumps(line, allow_nan=False)[:-1].encode())
 
     def write_summary(self, summary: PosteriorSummary) -> None:
         """Write the summary after the last reading written: the rest of its line."""
@@ -361,7 +361,7 @@ class JournalWriter:
             "bits": summary.bits,
             "next": _pose_as_json(summary.next_pose),
         }
-        write_to_disk(self._file, self.path, (_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n").encode())
+        write_and_sync(self._file, self.path, (_SUMMARY_KEY + json.dumps(line, allow_nan=False) + "}\n").encode())
 
     # Old names.
     reading, summary = write_reading, write_summary

@@ -1,4 +1,4 @@
-"""Write a file whole or not at all."""
+"""Writing of files, each whole or not at all."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
             with os.fdopen(handle, "wb", buffering=0) as file:
                 with contextlib.suppress(OSError):  # a file system without locks: others may remove the file
                     try_lock(handle)
-                write_to_disk(file, path, content)
+                write_and_sync(file, path, content)
             # mkstemp makes the file private; give it the permissions of an ordinary new file.
             mask = os.umask(0)
             os.umask(mask)
@@ -67,7 +67,7 @@ def write_text_atomically(path: str | os.PathLike[str], text: str) -> None:
     write_bytes_atomically(path, text.encode("utf-8"))
 
 
-def write_to_disk(file: FileIO, path: Path, content: bytes) -> None:
+def write_and_sync(file: FileIO, path: Path, content: bytes) -> None:
     """Write to the end of an open, unbuffered file, whose name for messages is `path`, and sync it to the disk.
 
     Raises

@@ -1,4 +1,4 @@
-"""Convert a user's columns (arrays, lists, tables) to a plan's numbers, codes and names."""
+"""Conversion of a user's columns (arrays, lists, tables) to a plan's numbers, codes and names."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def columns_by_name(table: TableLike) -> dict[str, Any]:
 
 
 def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
-    """Check one number per reading, shape (n_points,); a single number is repeated if `n_points` is given.
+    """Convert to one number per reading, shape (n_points,); a single number is repeated if `n_points` is given.
 
     Raises ParameterError if a value is not a number, ShapeError if the length is not n_points.
     """
@@ -61,7 +61,7 @@ def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = Non
     return out
 
 
-def parse_texts(values: ArrayLike) -> ArrayLike:
+def texts_to_numbers(values: ArrayLike) -> ArrayLike:
     """Parse a column of texts as a file's: numbers, and "", "nan", "n/a" and the like, which become NaN.
 
     A column without texts, or with a text that is none of these, is returned unchanged.
@@ -70,13 +70,13 @@ def parse_texts(values: ArrayLike) -> ArrayLike:
     if isinstance(cells, str) or cells.ndim != 1 or cells.dtype.kind not in "OUT":
         return values
     try:
-        read = [_number_or_missing(cell) for cell in cells.tolist()]
+        read = [_number_or_nan(cell) for cell in cells.tolist()]
     except ValueError:
         return values
     return np.array(read, dtype=np.float64)
 
 
-def _number_or_missing(cell: Any) -> Any:
+def _number_or_nan(cell: Any) -> Any:
     if not isinstance(cell, str):
         if not (_is_missing(cell) or hasattr(cell, "__float__") or hasattr(cell, "__index__")):
             raise ValueError("no number")
@@ -96,7 +96,7 @@ def dates_to_seconds(values: ArrayLike) -> ArrayLike:
 
 
 def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -> dict[str, FloatArray]:
-    """Check a user's covariates: columns of one number per reading, by name.
+    """Convert a user's covariates to arrays of one number per reading, by name; {} for None.
 
     Raises ParameterError if they have no names, or if a name is that of a recording's own column, such as "x_mm".
     """
@@ -111,7 +111,7 @@ def checked_covariates(columns: Mapping[str, ArrayLike] | None, n_points: int) -
     return {name: numbers_per_reading(name, values, n_points) for name, values in columns.items()}
 
 
-def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
+def selected_row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
     """Convert a selection of rows (row numbers, one truth value per row, or a slice) to row numbers, (n_rows,).
 
     Raises ParameterError if the selection is none of these, or a row does not exist.
@@ -129,20 +129,20 @@ def row_numbers(rows: ArrayLike | slice, n_points: int) -> IntArray:
     return np.asarray(asked, dtype=np.int64)
 
 
-def numeric_covariates(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
-    """Return the numeric columns that are not a plan's own fields, and notes on the columns that are ignored."""
+def numeric_covariates_and_notes(columns: Mapping[str, ArrayLike]) -> tuple[dict[str, FloatArray], tuple[str, ...]]:
+    """Return the numeric columns that are not a plan's own fields, by name, and notes on those without numbers."""
     out, notes = {}, []
     for name, values in columns.items():
         if name in _KNOWN:
             continue
         try:
-            out[name] = numbers_per_reading(name, parse_texts(values))
+            out[name] = numbers_per_reading(name, texts_to_numbers(values))
         except ParameterError:
             notes.append(f"column {name} holds no numbers, ignored")
     return out, tuple(notes)
 
 
-def scan_codes(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:
+def scan_codes_and_names(names: str | Iterable[object] | None, n_points: int) -> tuple[IntArray, tuple[str, ...]]:
     """Assign scan numbers: every change of name begins a new scan, even if the name occurred before.
 
     Returns

@@ -66,34 +66,34 @@ class _CheckedFields:
     def error_at(self, name: str, value: object, allowed: str) -> FileError:
         return FileError(self.path, f"{self.where}.{name} is {_shortened_json(value)}".lstrip("."), allowed)
 
-    def required(self, name: str, allowed: str) -> Any:
+    def required_value(self, name: str, allowed: str) -> Any:
         self.used.add(name)
         if name not in self.content:
             raise FileError(self.path, f"{self.where}.{name} is missing".lstrip("."), allowed)
         return self.content[name]
 
-    def has(self, name: str) -> bool:
+    def has_value(self, name: str) -> bool:
         self.used.add(name)
         return self.content.get(name) is not None
 
     def number(self, name: str, allowed: str = "a finite number", ok: Callable[[float], bool] | None = None) -> float:
-        value = self.required(name, allowed)
+        value = self.required_value(name, allowed)
         if not _is_number(value) or (ok is not None and not ok(float(value))):
             raise self.error_at(name, value, allowed)
         return float(value)
 
-    def positive(self, name: str) -> float:
+    def positive_number(self, name: str) -> float:
         return self.number(name, "a number greater than 0", lambda v: v > 0)
 
     def pair(self, name: str) -> tuple[float, float]:
         allowed = "two finite numbers [x, y]"
-        value = self.required(name, allowed)
+        value = self.required_value(name, allowed)
         if not _is_pair(value):
             raise self.error_at(name, value, allowed)
         return float(value[0]), float(value[1])
 
     def text(self, name: str, allowed: str = "a text") -> str:
-        value = self.required(name, allowed)
+        value = self.required_value(name, allowed)
         if not isinstance(value, str):
             raise self.error_at(name, value, allowed)
         return value
@@ -132,12 +132,12 @@ def _parse_quadrant(f: _CheckedFields) -> Pattern:
 
 
 def _parse_disc(f: _CheckedFields) -> Pattern:
-    return Disc(f.pair("center_mm"), f.positive("radius_mm"), *f.inside_and_outside_albedo())
+    return Disc(f.pair("center_mm"), f.positive_number("radius_mm"), *f.inside_and_outside_albedo())
 
 
 def _parse_polygon(f: _CheckedFields) -> Pattern:
     allowed = "a list of at least three corners [x, y]"
-    vertices = f.required("vertices_mm", allowed)
+    vertices = f.required_value("vertices_mm", allowed)
     if not isinstance(vertices, list) or len(vertices) < 3 or not all(_is_pair(v) for v in vertices):
         raise f.error_at("vertices_mm", vertices, allowed)
     return Polygon(tuple((float(x), float(y)) for x, y in vertices), *f.inside_and_outside_albedo())
@@ -147,7 +147,7 @@ def _parse_stripes(f: _CheckedFields) -> Pattern:
     duty = f.number("duty", "a number from 0 to 1", lambda v: 0 <= v <= 1)
     return Stripes(
         math.radians(f.number("normal_deg")),
-        f.positive("period_mm"),
+        f.positive_number("period_mm"),
         duty,
         f.number("phase_mm"),
         *f.inside_and_outside_albedo(),
@@ -166,7 +166,7 @@ def _parse_image(f: _CheckedFields) -> Pattern:
     picture = f.path.parent / name
     if not picture.is_file():  # the error names the JSON that refers to the picture
         raise f.error_at("file", name, "the name of a PNG or .npy file that lies in the same folder")
-    return Image(read_image(picture), f.positive("pixel_mm"), f.pair("origin_mm"), name)
+    return Image(read_image(picture), f.positive_number("pixel_mm"), f.pair("origin_mm"), name)
 
 
 _KINDS: dict[str, Callable[[_CheckedFields], Pattern]] = {
@@ -203,7 +203,7 @@ def read_description(path: Path) -> Description:
         raise top.error_at("format", content["format"], f'"{FORMAT}"')
     patterns: dict[str, Pattern] = {}
     notes: list[str] = []
-    listed = top.required("patterns", "at least one pattern by name")
+    listed = top.required_value("patterns", "at least one pattern by name")
     for name, fields_of_it in _CheckedFields(path, "patterns", listed).content.items():
         if name != name.strip() or not name.isprintable():
             raise FileError(
@@ -231,22 +231,22 @@ def read_description(path: Path) -> Description:
 def _parse_instrumentation(top: _CheckedFields) -> Instrumentation:
     reading = _CheckedFields(top.path, "reading", top.content.get("reading", {}))
     sensor = _CheckedFields(top.path, "sensor", top.content.get("sensor", {}))
-    low = reading.number("min") if reading.has("min") else None
-    high = reading.number("max") if reading.has("max") else None
+    low = reading.number("min") if reading.has_value("min") else None
+    high = reading.number("max") if reading.has_value("max") else None
     if low is not None and high is not None and low >= high:
         raise reading.error_at("max", high, f"greater than reading.min, {low:g}")
     controls = top.content.get("controls", [])
     if not isinstance(controls, list) or not all(isinstance(name, str) for name in controls):
         raise top.error_at("controls", controls, "a list of texts")
     return Instrumentation(
-        unit=reading.text("unit") if reading.has("unit") else "",
+        unit=reading.text("unit") if reading.has_value("unit") else "",
         min=low,
         max=high,
-        step=reading.positive("step") if reading.has("step") else None,
-        sensor=sensor.text("name") if sensor.has("name") else "",
-        height_mm=sensor.positive("height_mm") if sensor.has("height_mm") else None,
+        step=reading.positive_number("step") if reading.has_value("step") else None,
+        sensor=sensor.text("name") if sensor.has_value("name") else "",
+        height_mm=sensor.positive_number("height_mm") if sensor.has_value("height_mm") else None,
         controls=tuple(controls),
-        description=top.text("description") if top.has("description") else "",
+        description=top.text("description") if top.has_value("description") else "",
     )
 
 

@@ -40,7 +40,7 @@ def read_recording(path: PathLike, *, progress: Progress = silent) -> Recording:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, notes = _read_with_json(_require_csv_path(path), progress)
+    plan, readings, notes = _read_with_json(_checked_csv_path(path), progress)
     if readings is None:
         found = "no such column: this is a plan"
         raise FileError(path, found, "a recording, with a column of readings", row=1, column="reading")
@@ -61,7 +61,7 @@ def read_plan(path: PathLike, *, progress: Progress = silent) -> Plan:
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    return _read_with_json(_require_csv_path(path), progress)[0]
+    return _read_with_json(_checked_csv_path(path), progress)[0]
 
 
 def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tuple[Plan, FloatArray | None]:
@@ -72,7 +72,7 @@ def read_plan_and_readings(path: PathLike, *, progress: Progress = silent) -> tu
     FileError
         If either file cannot be used; it names the file, row and column, what was found and what is allowed.
     """
-    plan, readings, _ = _read_with_json(_require_csv_path(path), progress)
+    plan, readings, _ = _read_with_json(_checked_csv_path(path), progress)
     return plan, readings
 
 
@@ -134,8 +134,8 @@ def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
     return columns | {name: _number_cells(name, values) for name, values in plan.covariates.items()}
 
 
-def _require_csv_path(path: object) -> Path:
-    """Return a file name as a Path; a table in memory is the usual mistake."""
+def _checked_csv_path(path: object) -> Path:
+    """Return a file name as a Path; raise ParameterError for anything else: a table in memory is the usual mistake."""
     allowed = (
         "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), Recording.from_arrays(...)"
     )
@@ -195,7 +195,7 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
         raise FileError(path, "there is no reading at all, only a header", "one row per reading")
     description = read_description(path.with_suffix(".json"))
     notes = list(description.notes)
-    scan, scan_names = _scan_codes_in_file(table)
+    scan, scan_names = _scan_codes_and_names_in_file(table)
     time_s = table.numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     for k, name in enumerate(scan_names):
         if not name.isprintable():
@@ -218,13 +218,13 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
         covariates=_covariate_columns(table, notes),
         instrumentation=description.instrumentation,
     )
-    notes += [*_note_on_far_place(table, "x_mm", plan.x_mm), *_note_on_far_place(table, "y_mm", plan.y_mm)]
+    notes += [*_notes_on_far_place(table, "x_mm", plan.x_mm), *_notes_on_far_place(table, "y_mm", plan.y_mm)]
     readings = _readings_column(table, description) if "reading" in table.columns else None
     return plan, readings, notes
 
 
-def _note_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> list[str]:
-    """Return a note on a place so far from all others that it looks mistyped."""
+def _notes_on_far_place(table: CSVTable, name: str, places_mm: FloatArray) -> list[str]:
+    """Return a note on the farthest place if it looks mistyped, far from all others: a list of one text or none."""
     low, middle, high = np.quantile(places_mm, [0.05, 0.5, 0.95])
     k = int(np.argmax(np.abs(places_mm - middle)))
     if abs(places_mm[k] - middle) <= _FAR_AWAY * max(high - low, 1.0):
@@ -242,7 +242,7 @@ def _readings_column(table: CSVTable, description: Description) -> FloatArray:
     return table.numbers("reading", missing=True, largest=None if bounded else LARGEST)
 
 
-def _scan_codes_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
+def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
     """Assign scan numbers: every change of name begins a new scan, even if the name occurred before."""
     if "scan" not in table.columns:
         return np.zeros(len(table), dtype=np.int64), ("scan",)

@@ -1,4 +1,4 @@
-"""Lock a file against other processes while it is written; the system releases the lock when a process dies."""
+"""Locks on files against other processes; the system releases a lock when its process dies."""
 
 from __future__ import annotations
 

@@ -44,7 +44,7 @@ class Uniform(_CheckedPattern):
 
 @dataclass(frozen=True)
 class HalfPlane(_CheckedPattern):
-    """The half-plane x cos(normal) + y sin(normal) > offset."""
+    """The half-plane x cos(normal) + y sin(normal) > offset: albedo `inside` there, `outside` elsewhere."""
 
     normal_rad: float
     offset_mm: float
@@ -54,7 +54,10 @@ class HalfPlane(_CheckedPattern):
 
 @dataclass(frozen=True)
 class Quadrant(_CheckedPattern):
-    """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0; direction is (dx, dy), each +1 or -1."""
+    """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0; direction is (dx, dy), each +1 or -1.
+
+    The albedo is `inside` there, `outside` elsewhere.
+    """
 
     corner_mm: tuple[float, float]
     direction: tuple[int, int]
@@ -72,7 +75,7 @@ class Quadrant(_CheckedPattern):
 
 @dataclass(frozen=True)
 class Disc(_CheckedPattern):
-    """The inside of a circle."""
+    """A disc: albedo `inside` the circle and `outside` it."""
 
     center_mm: tuple[float, float]
     radius_mm: float
@@ -86,7 +89,7 @@ class Disc(_CheckedPattern):
 
 @dataclass(frozen=True)
 class Polygon(_CheckedPattern):
-    """The inside of a polygon by the even-odd rule."""
+    """A polygon: albedo `inside` it, by the even-odd rule, and `outside` it."""
 
     vertices_mm: tuple[tuple[float, float], ...]
     inside: float = 1.0
@@ -104,7 +107,7 @@ class Polygon(_CheckedPattern):
 
 @dataclass(frozen=True)
 class Stripes(_CheckedPattern):
-    """Stripes where frac((x . n - phase) / period) < duty."""
+    """Stripes where frac((x . n - phase) / period) < duty, n the unit normal: albedo `inside` and `outside` them."""
 
     normal_rad: float
     period_mm: float
@@ -122,7 +125,10 @@ class Stripes(_CheckedPattern):
 
 @dataclass(frozen=True)
 class Ramp(_CheckedPattern):
-    """A linear gradient without bounds: albedo per_mm (x . n). It also describes an encoder, which reads its place."""
+    """A linear gradient without bounds: albedo per_mm (x . n), n the unit normal.
+
+    It also describes an encoder, which reads its place.
+    """
 
     normal_rad: float
     per_mm: float

@@ -21,13 +21,13 @@ from probewise.recordings.columns import (
     dates_to_seconds,
     how_to_describe_pattern,
     numbers_per_reading,
-    numeric_covariates,
-    parse_texts,
+    numeric_covariates_and_notes,
     pattern_codes,
     patterns_by_name,
     require_patterns,
-    row_numbers,
-    scan_codes,
+    scan_codes_and_names,
+    selected_row_numbers,
+    texts_to_numbers,
 )
 from probewise.recordings.patterns import Pattern
 
@@ -189,7 +189,7 @@ class Plan:
         turns = numbers_per_reading("orientation_rad", orientation_rad, n_points)
         warn_of_likely_degrees("orientation_rad", turns)
         described = patterns_by_name(patterns)
-        code, scan_names = scan_codes(scan, n_points)
+        code, scan_names = scan_codes_and_names(scan, n_points)
         return cls(
             x_mm=x,
             y_mm=numbers_per_reading("y_mm", y_mm, n_points),
@@ -212,7 +212,7 @@ class Plan:
         return len(self.x_mm)
 
     @cached_property
-    def direction(self) -> FloatArray:
+    def direction_of_motion(self) -> FloatArray:
         """Unit vector of the last commanded motion within the scan, shape (n_points, 2).
 
         The first reading of a scan takes the direction of the next motion; a repeat keeps that
@@ -233,6 +233,11 @@ class Plan:
         out.flags.writeable = False
         return out
 
+    @property
+    def direction(self) -> FloatArray:
+        """The old name of `direction_of_motion`."""
+        return self.direction_of_motion
+
     def rows_by_scan(self) -> list[IntArray]:
         """Return the row numbers of each scan, in the order they were taken."""
         ends = np.cumsum(np.bincount(self.scan, minlength=len(self.scan_names)))
@@ -245,7 +250,7 @@ class Plan:
 
     def take(self, rows: ArrayLike | slice) -> Plan:
         """Select rows (numbers, truth values or a slice), in the given order (scans and patterns keep their names)."""
-        rows = row_numbers(rows, len(self))
+        rows = selected_row_numbers(rows, len(self))
         kept = np.unique(self.scan[rows])
         return Plan(
             x_mm=self.x_mm[rows],
@@ -290,7 +295,7 @@ class Recording(ShowsItself):
 
     @property
     def relative_sd(self) -> FloatArray:
-        """Declared relative sd of each reading, (n_points,): here 1 for all."""
+        """Declared noise sd of each reading relative to the median, (n_points,): here 1; a subclass may differ."""
         return np.ones(len(self.plan))
 
     @classmethod
@@ -351,7 +356,7 @@ class Recording(ShowsItself):
         """
         sizes = [np.size(places) for places in (x_mm, y_mm) if np.ndim(places) > 0]
         fitting = np.ndim(readings) == 0 or not sizes or np.size(readings) in sizes
-        values = numbers_per_reading("readings", parse_texts(readings), None if fitting else sizes[0])
+        values = numbers_per_reading("readings", texts_to_numbers(readings), None if fitting else sizes[0])
         plan = Plan.from_arrays(
             x_mm=numbers_per_reading("x_mm", x_mm, len(values)),
             y_mm=y_mm,
@@ -425,7 +430,7 @@ class Recording(ShowsItself):
             if "orientation_rad" in columns:
                 raise ParameterError("columns", tuple(columns), "one of orientation_deg and orientation_rad")
             turn_rad = np.radians(numbers_per_reading("orientation_deg", turn_deg))
-        covariates, notes = numeric_covariates(columns)
+        covariates, notes = numeric_covariates_and_notes(columns)
         recording = cls.from_arrays(
             x_mm=columns["x_mm"],
             y_mm=columns["y_mm"],
@@ -491,7 +496,7 @@ class Recording(ShowsItself):
 
     def take(self, rows: ArrayLike | slice) -> Self:
         """Select rows (numbers, truth values or a slice), in the given order."""
-        rows = row_numbers(rows, len(self))
+        rows = selected_row_numbers(rows, len(self))
         return replace(self, plan=self.plan.take(rows), readings=self.readings[rows])
 
 

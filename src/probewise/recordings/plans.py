@@ -98,8 +98,8 @@ def two_way_plan(*, reading_s: float = 1.2, break_s: float = 40.0) -> Plan:
     return _plan_of_scans(scans)
 
 
-def jittered(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
-    """Return the plan with jittered intervals of time and, where it has a battery voltage, measurement noise on it.
+def with_jittered_times(plan: Plan, *, rng: np.random.Generator, share: float = 0.1) -> Plan:
+    """Return the plan with jittered intervals of time and, if it has a battery voltage, with that recomputed and noisy.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Run a user's Python file, with errors in it reported in one line."""
+"""Running of a user's Python file, with errors in it reported in one line."""
 
 from __future__ import annotations
 

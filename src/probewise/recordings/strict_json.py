@@ -29,7 +29,7 @@ def parse_json_file_text(
     Raises
     ------
     FileError
-        If it is not strict JSON; see `strict_json`.
+        If it is not strict JSON; see `parse_strict_json`.
     """
     try:
         return parse_strict_json(text)

@@ -1,4 +1,4 @@
-"""Read files as bytes and as UTF-8 text."""
+"""Reading of files as bytes and as UTF-8 text."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Rows:
         """Build from a plan, as commanded."""
         return cls(
             place_mm=np.stack([plan.x_mm, plan.y_mm], axis=-1),
-            direction=plan.direction,
+            direction=plan.direction_of_motion,
             orientation_rad=plan.orientation_rad,
             time_s=plan.time_s,
             scan=plan.scan,

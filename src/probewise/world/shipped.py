@@ -16,7 +16,7 @@ import numpy as np
 from probewise.errors import ParameterError
 from probewise.recordings.files import write_recording
 from probewise.recordings.plan import Recording
-from probewise.recordings.plans import jittered, paper_plan, two_way_plan
+from probewise.recordings.plans import paper_plan, two_way_plan, with_jittered_times
 from probewise.recordings.shipping import SHIPPED
 from probewise.world.concealed import (
     AmbientGradient,
@@ -75,7 +75,7 @@ def regenerate_recording(name: str) -> Recording:
     _, times, noise = _random_streams(name)
     plan = paper_plan() if name == "paper" else two_way_plan()
     plan = replace(plan, instrumentation=replace(plan.instrumentation, description=_DESCRIPTIONS[name]))
-    recording = truth(name).simulate(jittered(plan, rng=times), rng=noise)
+    recording = truth(name).simulate(with_jittered_times(plan, rng=times), rng=noise)
     return replace(recording, readings=np.round(recording.readings, 3))
 
 

@@ -12,7 +12,7 @@ from probewise.recordings import two_way_plan
 PLAN = two_way_plan()
 N = len(PLAN)
 SIGNAL = 25.0 * (1 + np.tanh(PLAN.x_mm / 8))
-FORTH = np.sign(PLAN.direction[:, 0])
+FORTH = np.sign(PLAN.direction_of_motion[:, 0])
 IN_X = 25.0 / 8 / np.cosh(PLAN.x_mm / 8) ** 2  # the signal's slope in the lab frame
 SLOPE = IN_X * np.where(FORTH == 0, 1.0, FORTH)  # and along the move
 STARTS = np.flatnonzero(np.diff(PLAN.scan, prepend=-1))

@@ -156,7 +156,7 @@ def distinct_scans(plan: Plan) -> list[IntArray]:
     """
     seen: dict[tuple[object, ...], IntArray] = {}
     for rows in plan.rows_by_scan():
-        if rows.size < _LEAST_ROWS or not plan.direction[rows].any():
+        if rows.size < _LEAST_ROWS or not plan.direction_of_motion[rows].any():
             continue
         places = ((round(float(plan.x_mm[r]), 3), round(float(plan.y_mm[r]), 3)) for r in (rows[0], rows[-1]))
         key = (int(plan.pattern[rows[0]]), round(float(plan.orientation_rad[rows[0]]), 4), *sorted(places))

@@ -21,7 +21,11 @@ def slope_along_the_move(predict: Callable[[Plan], FloatArray], plan: Plan) -> F
     """Differentiate predictions of a plan's rows along each one's direction of motion, per mm, shape (n_points,)."""
     step = 0.25
     ahead, behind = (
-        replace(plan, x_mm=plan.x_mm + s * plan.direction[:, 0], y_mm=plan.y_mm + s * plan.direction[:, 1])
+        replace(
+            plan,
+            x_mm=plan.x_mm + s * plan.direction_of_motion[:, 0],
+            y_mm=plan.y_mm + s * plan.direction_of_motion[:, 1],
+        )
         for s in (step, -step)
     )
     # All rows are shifted together, so that directions, and hence backlash, do not change.
@@ -116,7 +120,7 @@ def covariate_of(
 
 def _places_along_larger_change(change: FloatArray, plan: Plan) -> Covariate | None:
     """Return the places along X or Y, for readings approached along it, whichever has the larger change."""
-    along_x, along_y = (np.flatnonzero(plan.direction[:, k] != 0) for k in (0, 1))
+    along_x, along_y = (np.flatnonzero(plan.direction_of_motion[:, k] != 0) for k in (0, 1))
     strength = [float(np.abs(change[rows]).max(initial=0.0)) for rows in (along_x, along_y)]
     rows, values = (along_x, plan.x_mm) if strength[0] >= strength[1] else (along_y, plan.y_mm)
     return Covariate("place", values[rows], rows) if rows.size else None

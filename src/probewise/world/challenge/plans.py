@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.recordings.patterns import Disc, HalfPlane, Pattern, Polygon, Quadrant
 from probewise.recordings.plan import Plan
-from probewise.recordings.plans import jittered, paper_plan, two_way_plan
+from probewise.recordings.plans import paper_plan, two_way_plan, with_jittered_times
 
 PLANS: Mapping[str, Callable[[], Plan]] = {"paper": paper_plan, "two_way": two_way_plan}
 
@@ -32,7 +32,7 @@ def draw_plan(name: str, *, rng: np.random.Generator) -> Plan:
     """Return a plan by name, its patterns displaced at random (and described so), its readings at an arm's times."""
     plan = PLANS[name]()
     patterns = {key: _randomly_displaced_pattern(pattern, rng) for key, pattern in plan.patterns.items()}
-    return jittered(replace(plan, patterns=patterns), rng=rng)
+    return with_jittered_times(replace(plan, patterns=patterns), rng=rng)
 
 
 def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
@@ -42,7 +42,7 @@ def held_out_plans(plan: Plan, *, rng: np.random.Generator) -> dict[str, Plan]:
     or of a triangle if the plan has a disc already. "direction": a boundary crossed from +x to -x where the plan goes
     one way only, or obliquely where it goes both ways.
     """
-    one_way = not (plan.direction[:, 0] < 0).any()
+    one_way = not (plan.direction_of_motion[:, 0] < 0).any()
     line = np.stack([np.linspace(-50, 50, 101), np.zeros(101)], axis=-1)
     boundary = _randomly_displaced_pattern(HalfPlane(0.0, 0.0), rng)
     angle = math.radians(rng.choice([0, 90, 180, 270]) + rng.uniform(25, 65))

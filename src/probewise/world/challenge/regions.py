@@ -53,7 +53,7 @@ def region_of_effect(effect: Concealed, sizer: EffectSizer) -> Region | None:
         case EdgeShadow():
             return Region("edge_distance", 0.0, effect.w * math.sqrt(2 * math.log(2)))
         case AlbedoPatch() | Glint() | PlaceStep():
-            along_x: BoolArray = np.abs(plan.direction[:, 0]) > 0
+            along_x: BoolArray = np.abs(plan.direction_of_motion[:, 0]) > 0
             strength = np.where(along_x, np.abs(sizer.recording(effect).readings - clean), 0.0)
             there = plan.x_mm[strength >= strength.max() / 2]
             return Region("place", float(there.min()), float(there.max()))

@@ -71,7 +71,7 @@ def follow(number: int) -> dict:
         return world.read(hidden.surface, *place, time_s=time_s, rng=noise)
 
     arm = SimulatedArm(light, reach=Reach((field.width_mm, field.height_mm)), scale=None)
-    index = list(experiment.shape.labels).index(hidden.name)
+    index = list(experiment.shape.shape_names).index(hidden.name)
     compared, cpu, last, began = [], [], 0, time.process_time()
     with arm, warnings.catch_warnings():
         warnings.simplefilter("ignore", DoubtfulResultWarning)

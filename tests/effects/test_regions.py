@@ -66,7 +66,7 @@ OUTLINED = {
     "quadrant": QuadrantRegion([[1.0, -2.0]], [[-1.0, 1.0]]),
     "stripes": StripesRegion([0.3], [7.0], [0.35], [1.0]),
     "disc": disc_region([[3.0, 1.0]], [6.0]),
-    "polygon": PolygonRegion.simple(np.array([[[0.0, 0.0], [8.0, 2.0], [3.0, 9.0]]])),
+    "polygon": PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [8.0, 2.0], [3.0, 9.0]]])),
 }
 
 

@@ -163,7 +163,7 @@ class Arrow:
 
     def region(self, theta):
         corners = np.array([[-80.0, -60.0], [80.0, 0.0], [-80.0, 60.0], [-30.0, 0.0]])
-        return PolygonRegion.simple(theta[:, None, :] + corners)
+        return PolygonRegion.from_vertices(theta[:, None, :] + corners)
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,9 @@ def test_a_half_plane_and_a_large_polygon_cover_pixels_alike():
     far = np.array([[0.0, -99.0], [99.0, -99.0], [99.0, 99.0], [0.0, 99.0]]) @ np.array([[c, s], [-s, c]])
     half = HalfPlaneRegion(np.array([0.7]), np.zeros(1))
     assert np.allclose(
-        PolygonRegion.simple(far[None]).coverage(centers, 1.3, turn), half.coverage(centers, 1.3, turn), atol=1e-10
+        PolygonRegion.from_vertices(far[None]).coverage(centers, 1.3, turn),
+        half.coverage(centers, 1.3, turn),
+        atol=1e-10,
     )
 
 
@@ -90,7 +92,7 @@ def test_the_inner_pentagon_of_a_star_is_outside_by_the_even_odd_rule():
 def test_an_edge_traced_twice_bounds_nothing():
     """A square with a whisker out and back: the whisker has the inside on neither side."""
     vertices = np.array([[0.0, 0.0], [2.0, 0.0], [5.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
-    region = PolygonRegion.even_odd(vertices)
+    region = PolygonRegion.from_even_odd_vertices(vertices)
     assert region.edges_mm.shape[1] == 4
     assert region.albedo(np.array([[1.0, 1.0], [3.0, 0.1]])).tolist() == [[1.0, 0.0]]
 
@@ -98,7 +100,7 @@ def test_an_edge_traced_twice_bounds_nothing():
 def test_vertices_in_either_sense_make_the_same_polygon():
     corners = np.array([[[0.0, 0], [5, 0], [5, 3], [0, 3]]])
     points = np.random.default_rng(0).uniform(-2, 7, (100, 2))
-    one, other = PolygonRegion.simple(corners), PolygonRegion.simple(corners[:, ::-1])
+    one, other = PolygonRegion.from_vertices(corners), PolygonRegion.from_vertices(corners[:, ::-1])
     zero = np.zeros(100)
     assert np.array_equal(one.coverage(points, 1.0, zero), other.coverage(points, 1.0, zero))
 
@@ -134,7 +136,7 @@ def test_a_batch_equals_its_members_one_by_one():
         lambda i: HalfPlaneRegion(angle[i], center[i, 0]),
         lambda i: QuadrantRegion(center[i], np.sign(center)[i]),
         lambda i: EllipseRegion(center[i], 5 + np.abs(center)[i], angle[i]),
-        lambda i: PolygonRegion.simple(center[i][:, None] + rng_corners),
+        lambda i: PolygonRegion.from_vertices(center[i][:, None] + rng_corners),
         lambda i: StripesRegion(angle[i], 3 + angle[i], 0.4 + 0 * angle[i], center[i, 0]),
         lambda i: RampRegion(angle[i], center[i, 0]),
     ]
@@ -159,7 +161,7 @@ def test_a_mixture_takes_each_hypothesis_from_its_own_kind():
 
 def test_outlines_lie_on_the_edge():
     ellipse = EllipseRegion(np.array([[1.0, 2.0]]), np.array([[5.0, 3.0]]), np.array([0.4]))
-    square = PolygonRegion.simple(np.array([[[0.0, 0], [4, 0], [4, 4], [0, 4]]]))
+    square = PolygonRegion.from_vertices(np.array([[[0.0, 0], [4, 0], [4, 4], [0, 4]]]))
     mixed = MixtureOfRegions(np.array([1, 0]), (ellipse, square))
     traces = outlines(mixed)
     assert len(traces[0]) == 5
@@ -179,9 +181,12 @@ def test_outlines_lie_on_the_edge():
         (lambda: QuadrantRegion([[0.0, 0.0]], [[1.0, 0.5]]), "direction"),
         (lambda: HalfPlaneRegion([np.nan], [0.0]), r"normal_rad\[0\] is nan"),
         (lambda: HalfPlaneRegion([0.0, 1.0, 2.0], [0.0, 1.0]), "offset_mm has 2 rows"),
-        (lambda: PolygonRegion.simple(np.zeros((1, 2, 2))), "3 or more"),
-        (lambda: PolygonRegion.even_odd(np.zeros((4, 2))), "a polygon whose area is not 0"),
-        (lambda: PolygonRegion.even_odd(np.array([[0.0, 0], [1, 0], [2, 0]])), "polygon whose area is not 0"),
+        (lambda: PolygonRegion.from_vertices(np.zeros((1, 2, 2))), "3 or more"),
+        (lambda: PolygonRegion.from_even_odd_vertices(np.zeros((4, 2))), "a polygon whose area is not 0"),
+        (
+            lambda: PolygonRegion.from_even_odd_vertices(np.array([[0.0, 0], [1, 0], [2, 0]])),
+            "polygon whose area is not 0",
+        ),
         (lambda: ImageRegion(np.zeros((0, 3)), 1.0, (0.0, 0.0)), "not empty"),
         (lambda: region_of("a square"), "a pattern of probewise.recordings.patterns"),
     ],

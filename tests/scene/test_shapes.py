@@ -88,7 +88,7 @@ def test_a_set_of_shapes_takes_each_with_its_weight():
     """10 000 draws: binomial sd 0.005, so 0.02 is passed by chance less than once in 10 000."""
     shape = SHAPES["any"]
     which = shape.shape_index(draws(shape, 10_000))
-    share = {label: Counter(which.tolist())[k] / 10_000 for k, label in enumerate(shape.labels)}
+    share = {label: Counter(which.tolist())[k] / 10_000 for k, label in enumerate(shape.shape_names)}
     assert share == pytest.approx({"circle": 0.5, "rectangle": 0.3, "hexagon": 0.2}, abs=0.02)
 
 

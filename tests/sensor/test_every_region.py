@@ -19,7 +19,7 @@ from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixel
 from probewise.sensor.gaussian import mean_albedo_under_gaussians, seen_by_one
 
 ELLIPSE = EllipseRegion([[3.0, 1.0]], [[14.0, 9.0]], [0.4])
-POLYGON = PolygonRegion.simple(np.array([[[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]]]))
+POLYGON = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]]]))
 KINDS = {
     "UniformRegion": UniformRegion([0.3]),
     "HalfPlaneRegion": HalfPlaneRegion([0.4], [2.0]),

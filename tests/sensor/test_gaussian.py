@@ -166,7 +166,7 @@ def test_the_four_quadrants_about_a_point_fill_the_plane():
 def test_a_polygon_agrees_with_adaptive_quadrature_in_the_plane():
     """A triangle by scipy.integrate.dblquad, 1e-8."""
     cov = covariance(4.0, 3.0, -0.4)
-    triangle = PolygonRegion.simple(np.array([[[0.0, 0.0], [10.0, 0.0], [0.0, 8.0]]]))
+    triangle = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [10.0, 0.0], [0.0, 8.0]]]))
     wanted = over_rows([2.0, 3.0], cov, lambda y: (0.0, 10.0 * (1 - y / 8.0)), 0.0, 8.0)
     assert see(triangle, 2.0, 3.0, cov) == pytest.approx(wanted, abs=1e-8)
 
@@ -174,7 +174,7 @@ def test_a_polygon_agrees_with_adaptive_quadrature_in_the_plane():
 @pytest.mark.parametrize("place", [(0.0, 0.0), (3.0, 0.0), (3.0, 1.0), (5.0, 2.0), (10.0, 0.0), (1.0, 99.0)])
 def test_a_rectangle_of_round_footprint_is_a_product(place):
     """Axis-parallel: differences of cumulatives in x and y; also with the mean on a corner or an edge's line."""
-    box = PolygonRegion.simple(np.array([[[0.0, 0.0], [10.0, 0.0], [10.0, 4.0], [0.0, 4.0]]]))
+    box = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [10.0, 0.0], [10.0, 4.0], [0.0, 4.0]]]))
     cov = np.diag([9.0, 4.0])
     x, y = place
     wanted = (ndtr((10 - x) / 3) - ndtr(-x / 3)) * (ndtr((4 - y) / 2) - ndtr(-y / 2))
@@ -185,7 +185,7 @@ def test_a_rectangle_of_round_footprint_is_a_product(place):
 @pytest.mark.parametrize("beside", [-1.3, -1e-9, 0.4])
 def test_a_corner_that_comes_into_reach_makes_no_step(sds, beside):
     """A product of cumulatives, the near corner at these sds along an edge, the far ones out of reach."""
-    box = PolygonRegion.simple(np.array([[[0.0, 0.0], [90.0, 0.0], [90.0, 60.0], [0.0, 60.0]]]))
+    box = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [90.0, 0.0], [90.0, 60.0], [0.0, 60.0]]]))
     wanted = (ndtr(30 - sds) - ndtr(-sds)) * ndtr(beside / 2)
     assert see(box, 3 * sds, beside, np.diag([9.0, 4.0])) == pytest.approx(wanted, abs=2e-15)
 
@@ -195,7 +195,7 @@ def test_a_polygon_of_many_sides_is_a_disc():
     n = 720
     t = 2 * np.pi * np.arange(n) / n
     radius = 10.0 / np.sqrt(np.sinc(2 / n))  # the same area
-    polygon = PolygonRegion.simple(radius * np.stack([np.cos(t), np.sin(t)], axis=-1)[None])
+    polygon = PolygonRegion.from_vertices(radius * np.stack([np.cos(t), np.sin(t)], axis=-1)[None])
     cov = covariance(4.0, 6.0, 0.3)
     disc = disc_region(np.zeros((1, 2)), np.array([10.0]))
     assert see(polygon, 8.0, 3.0, cov) == pytest.approx(see(disc, 8.0, 3.0, cov), abs=1e-7)
@@ -239,7 +239,7 @@ def test_an_image_of_pixels_is_the_sum_of_its_squares(rho):
     for (row, column), albedo in np.ndenumerate(image.values):
         low = np.array(image.origin_mm) + 2.0 * np.array([column, n_rows - 1 - row])
         square = low + 2.0 * np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-        wanted += albedo * see(PolygonRegion.simple(square[None]), 3.0, -2.0, cov)
+        wanted += albedo * see(PolygonRegion.from_vertices(square[None]), 3.0, -2.0, cov)
     assert see(image, 3.0, -2.0, cov) == pytest.approx(wanted, abs=1e-8)
 
 
@@ -274,7 +274,7 @@ def test_a_batch_of_regions_equals_one_by_one():
         lambda i: QuadrantRegion(centers[i], np.sign(centers)[i]),
         lambda i: disc_region(centers[i], 3 + angles[i]),
         lambda i: EllipseRegion(centers[i], 4 + np.abs(centers)[i], angles[i]),
-        lambda i: PolygonRegion.simple(centers[i][:, None] + corners),
+        lambda i: PolygonRegion.from_vertices(centers[i][:, None] + corners),
     ]
     x, y = rng.normal(size=(2, 1, 5, 1)) * 6
     cov = [np.reshape(value, (1, 1, 1)) for value in (16.0, 9.0, 5.0)]
@@ -318,7 +318,10 @@ def test_turning_scene_and_footprint_together_changes_nothing(turn, x, y, rho):
         (HalfPlaneRegion([0.3], [2.0]), HalfPlaneRegion([0.3 + turn], [2.0])),
         (disc_region(center, [9.0]), disc_region(center @ rotation.T, [9.0])),
         (EllipseRegion(center, [[9.0, 4.0]], [0.2]), EllipseRegion(center @ rotation.T, [[9.0, 4.0]], [0.2 + turn])),
-        (PolygonRegion.simple(corners[None]), PolygonRegion.simple((corners @ rotation.T)[None])),
+        (
+            PolygonRegion.from_vertices(corners[None]),
+            PolygonRegion.from_vertices((corners @ rotation.T)[None]),
+        ),
     ]
     for still, turned in pairs:
         before = see(still, x, y, cov)

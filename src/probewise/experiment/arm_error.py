@@ -144,7 +144,7 @@ def draw_arm_error_shifts(
     """
     moved = rng.standard_normal((len(theta), slopes.shape[1])) @ slopes.T
     if isinstance(experiment.shape, AnyOf):
-        moved[experiment.shape.shape_index(theta) != experiment.shape.labels.index(likely_shape)] = 0.0
+        moved[experiment.shape.shape_index(theta) != experiment.shape.shape_names.index(likely_shape)] = 0.0
     return np.asarray(moved)
 
 
@@ -184,7 +184,7 @@ def _posterior_mean_shifts(
     shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
     columns = np.arange(len(mean))
     if isinstance(shape, AnyOf):
-        columns = shape.prior.columns[shape.labels.index(likely_shape)]
+        columns = shape.prior.columns[shape.shape_names.index(likely_shape)]
     own = np.arange(n_sensor, n_sensor + len(columns))
     thetas, weights, by_error, by_shape = [], [], [], []
     kinds = zip(posterior.kinds, posterior.particles, posterior.probability.tolist(), strict=True)

@@ -52,7 +52,7 @@ def found_shape(run: Exploration) -> FoundShape:
     theta, weight = run.posterior.theta[:, run.experiment.shape_columns], run.posterior.weight
     name = last.likely_shape or _shape_name(shape)
     if isinstance(shape, AnyOf):
-        own = shape.shape_index(theta) == shape.labels.index(name)
+        own = shape.shape_index(theta) == shape.shape_names.index(name)
         theta, weight = theta[own], weight[own]
     low, high = weighted_quantiles(theta, weight, [0.025, 0.975])
     parameters = tuple(
@@ -101,7 +101,7 @@ def samples_csv(run: Exploration) -> str:
     for row in np.flatnonzero(weight > 0).tolist():
         label, held = [], set(columns)
         if isinstance(shape, AnyOf):
-            label = [shape.labels[which[row]]]
+            label = [shape.shape_names[which[row]]]
             held = set(shape.prior.columns[which[row]])
         values = (f"{theta[row, k]:.7g}" if k in held else "" for k in columns)
         rows.append([f"{weight[row]:.7g}", *label, *values])

@@ -38,7 +38,7 @@ def shape_moments_and_probabilities(
         mean = weight @ theta
         return mean, np.sqrt(weight @ (theta - mean) ** 2), {}
     which = experiment.shape.shape_index(theta)
-    share = np.bincount(which, weights=weight, minlength=len(experiment.shape.labels))
+    share = np.bincount(which, weights=weight, minlength=len(experiment.shape.shape_names))
     likely = int(share.argmax())
     columns = experiment.shape.prior.columns[likely]
     own = theta[np.ix_(which == likely, columns)]
@@ -46,7 +46,7 @@ def shape_moments_and_probabilities(
     mean, sd = np.full((2, theta.shape[1]), np.nan)
     mean[columns] = given @ own
     sd[columns] = np.sqrt(given @ (own - mean[columns]) ** 2)
-    return mean, sd, dict(zip(experiment.shape.labels, (float(p) for p in share / share.sum()), strict=True))
+    return mean, sd, dict(zip(experiment.shape.shape_names, (float(p) for p in share / share.sum()), strict=True))
 
 
 def probability_of_length_off(experiment: Experiment, posterior: Weighted, off_mm: float) -> float:

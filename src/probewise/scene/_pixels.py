@@ -7,8 +7,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 
 
-def share_behind_edge(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
-    """Return the share of a square on the positive side of a straight edge.
+def share_inside_half_plane(distance_mm: FloatArray, angle_rad: FloatArray, pixel_mm: float) -> FloatArray:
+    """Return the share of each square pixel on the positive side of a straight edge.
 
     Parameters
     ----------

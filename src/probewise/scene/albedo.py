@@ -28,7 +28,10 @@ class Region(Protocol):
         ...
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
-        """Return the mean albedo over square pixels turned by `turn_rad` (n_points,): -> (n_regions, n_points)."""
+        """Return the mean albedo over each of many square pixels, (n_regions, n_points).
+
+        The pixels have centres `centers_mm` (n_points, 2), side `pixel_mm`, and are turned by `turn_rad` (n_points,).
+        """
         ...
 
 
@@ -59,5 +62,5 @@ class Scene(Protocol):
 
 
 def require_shape(shape: object, name: str = "shape") -> None:
-    """Raise ParameterError unless `shape` has a prior and a region."""
+    """Raise ParameterError unless `shape` has `prior` and `region`."""
     require_like(name, shape, ("prior", "region"), "a shape such as Circle() or Rectangle(), of probewise.scene")

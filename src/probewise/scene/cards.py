@@ -49,7 +49,7 @@ class Card:
     @cached_property
     def region(self) -> PolygonRegion:
         """The area of the card as a region with albedo 1 inside and 0 outside."""
-        return PolygonRegion.simple(self.corners_mm[None])
+        return PolygonRegion.from_vertices(self.corners_mm[None])
 
     @property
     def informative_places_mm(self) -> FloatArray:

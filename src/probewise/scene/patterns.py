@@ -38,7 +38,7 @@ def region_of(pattern: Pattern) -> Region:
         case kinds.Disc(center, radius, inside, outside):
             return disc_region(np.array([center]), np.array([radius]), inside=inside, outside=outside)
         case kinds.Polygon(vertices, inside, outside):
-            return PolygonRegion.even_odd(np.array(vertices), inside=inside, outside=outside)
+            return PolygonRegion.from_even_odd_vertices(np.array(vertices), inside=inside, outside=outside)
         case kinds.Stripes(normal, period, duty, phase, inside, outside):
             return StripesRegion(
                 np.array([normal]), np.array([period]), np.array([duty]), np.array([phase]), inside, outside

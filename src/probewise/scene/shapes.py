@@ -118,7 +118,7 @@ class Circle:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over centre and radius."""
+        """Uniform over radius and centre; with `inside`, over the centres that keep the circle on the field."""
         return PlacedPrior(
             self.field,
             Product({"radius_mm": Uniform(*self.radius_mm)}),
@@ -215,7 +215,7 @@ class Rectangle:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over all five parameters."""
+        """Uniform over all five; with `inside`, over the centres that keep the rectangle on the field."""
         side = Uniform(*self.sides_mm)
         own = Product({"width_mm": side, "height_mm": side, "angle_rad": Uniform(0.0, np.pi / 2)})
         return PlacedPrior(self.field, own, _half_extent_of_rectangle if self.inside else None)
@@ -242,17 +242,20 @@ class RegularPolygon:
 
     @cached_property
     def prior(self) -> PlacedPrior:
-        """Uniform over centre, radius, and angle within the polygon's symmetry."""
+        """Uniform over centre, radius, and angle within the polygon's symmetry.
+
+        With `inside`, the centre is uniform over the places that keep the circumscribed circle on the field.
+        """
         own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
         # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
         return PlacedPrior(self.field, own, _half_extent_of_circle if self.inside else None)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a polygon for each hypothesis, theta (n_samples, 4)."""
-        corners = self._corners() * theta[:, None, 2:3]
+        corners = self._unit_corners() * theta[:, None, 2:3]
         return _turned_polygon(theta[:, :2], corners, theta[:, 3])
 
-    def _corners(self) -> FloatArray:
+    def _unit_corners(self) -> FloatArray:
         t = 2 * np.pi * np.arange(self.n_sides) / self.n_sides
         return np.stack([np.cos(t), np.sin(t)], axis=-1)
 
@@ -262,7 +265,7 @@ def _turned_polygon(center_mm: FloatArray, corners_mm: FloatArray, angle_rad: Fl
     cosine, sine = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]
     x = center_mm[:, :1] + cosine * corners_mm[..., 0] - sine * corners_mm[..., 1]
     y = center_mm[:, 1:] + sine * corners_mm[..., 0] + cosine * corners_mm[..., 1]
-    return PolygonRegion.simple(np.stack([x, y], axis=-1))
+    return PolygonRegion.from_vertices(np.stack([x, y], axis=-1))
 
 
 SHAPES: Mapping[str, Callable[[Field], Shape]] = {
@@ -376,9 +379,11 @@ class AnyOf:
         return _AnyOfPrior(self.shapes, self.weights, ("x_mm", "y_mm") if placed else ())
 
     @property
-    def labels(self) -> tuple[str, ...]:
+    def shape_names(self) -> tuple[str, ...]:
         """Names of the shapes, by index."""
         return tuple(self.shapes)
+
+    labels = shape_names  # its earlier name
 
     def shape_index(self, theta: FloatArray) -> IntArray:
         """Return the index of each hypothesis' shape, (n_samples,)."""

@@ -12,7 +12,7 @@ from probewise.scene.albedo import Region
 
 
 class RegionBatch(Region, Protocol):
-    """Base of regions whose first field has a row for each hypothesis, after `broadcast_fields`."""
+    """Base of regions whose first field has a row for each hypothesis, after `broadcast_and_freeze_fields`."""
 
     @property
     def n_regions(self) -> int:
@@ -21,8 +21,11 @@ class RegionBatch(Region, Protocol):
         return len(getattr(self, first))
 
 
-def broadcast_fields(region: object, **shapes: tuple[int, ...]) -> None:
-    """Broadcast the named arrays of a region to (n_regions, *shape), check that they are finite, and freeze them."""
+def broadcast_and_freeze_fields(region: object, **shapes: tuple[int, ...]) -> None:
+    """Broadcast the named arrays of a region to (n_regions, *shape), check that they are finite, and freeze them.
+
+    Raises ShapeError for a shape that does not broadcast, ParameterError for a number that is not finite.
+    """
     arrays = {name: np.asarray(getattr(region, name), dtype=np.float64) for name in shapes}
     lengths = set()
     for name, shape in shapes.items():
@@ -38,6 +41,9 @@ def broadcast_fields(region: object, **shapes: tuple[int, ...]) -> None:
             raise ShapeError(f"{name} has {len(array)} rows; allowed: {n_regions}, as the other arrays, or 1")
         require_finite(name, array)
         object.__setattr__(region, name, frozen(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
+
+
+broadcast_fields = broadcast_and_freeze_fields  # its earlier name
 
 
 def require_positive(name: str, values: FloatArray) -> None:

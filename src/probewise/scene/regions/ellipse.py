@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import RegionBatch, broadcast_fields, require_positive
+from probewise.scene._pixels import share_inside_half_plane
+from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fields, require_positive
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 
 @dataclass(frozen=True, eq=False)
 class EllipseRegion(RegionBatch):
-    """The inside of an ellipse; a disc has equal semi-axes (paper, eq. 1).
+    """Ellipses, albedo `inside` and `outside` them; a disc has equal semi-axes (paper, eq. 1).
 
     `center_mm` and `semi_axes_mm` have shape (n_regions, 2), `angle_rad` (of the first semi-axis)
     (n_regions,).
@@ -27,7 +27,7 @@ class EllipseRegion(RegionBatch):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        broadcast_fields(self, center_mm=(2,), semi_axes_mm=(2,), angle_rad=())
+        broadcast_and_freeze_fields(self, center_mm=(2,), semi_axes_mm=(2,), angle_rad=())
         require_positive("semi_axes_mm", self.semi_axes_mm)
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
@@ -45,7 +45,7 @@ class EllipseRegion(RegionBatch):
         steepness = np.hypot(along, across) / np.maximum(level, 1e-12)
         distance = (1 - level) / np.maximum(steepness, 1e-12)
         angle = np.arctan2(across, along) + self.angle_rad[:, None]
-        share = share_behind_edge(distance, angle - turn_rad, pixel_mm)
+        share = share_inside_half_plane(distance, angle - turn_rad, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 
     def _unit_circle_coordinates(self, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:

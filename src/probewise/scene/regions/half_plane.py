@@ -7,14 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import RegionBatch, broadcast_fields
+from probewise.scene._pixels import share_inside_half_plane
+from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fields
 from probewise.scene.regions.geometry import edge_distance
 
 
 @dataclass(frozen=True, eq=False)
 class HalfPlaneRegion(RegionBatch):
-    """The half-plane x cos(normal) + y sin(normal) > offset (paper, S_BW); fields (n_regions,)."""
+    """Half-planes x cos(normal) + y sin(normal) > offset (paper, S_BW), fields (n_regions,).
+
+    The albedo is `inside` there, `outside` elsewhere.
+    """
 
     normal_rad: FloatArray
     offset_mm: FloatArray
@@ -22,14 +25,16 @@ class HalfPlaneRegion(RegionBatch):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        broadcast_fields(self, normal_rad=(), offset_mm=())
+        broadcast_and_freeze_fields(self, normal_rad=(), offset_mm=())
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return np.where(self._signed_distance(points_mm) > 0, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
-        share = share_behind_edge(self._signed_distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm)
+        share = share_inside_half_plane(
+            self._signed_distance(centers_mm), self.normal_rad[:, None] - turn_rad, pixel_mm
+        )
         return self.outside + (self.inside - self.outside) * share
 
     def _signed_distance(self, points_mm: FloatArray) -> FloatArray:

@@ -11,16 +11,16 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.errors import ParameterError, ShapeError
 from probewise.scene._pixels import share_inside_polygon
-from probewise.scene.regions.checks import RegionBatch, broadcast_fields
+from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fields
 from probewise.scene.regions.geometry import edge_distance, outlines
 
 
 @dataclass(frozen=True, eq=False)
 class PolygonRegion(RegionBatch):
-    """The inside of a polygon, given by its directed edges, with the inside on their left.
+    """Polygons, albedo `inside` and `outside` them, given by directed edges with the inside on their left.
 
-    `edges_mm` has shape (n_regions, n_edges, 2 ends, 2). Build it with `simple` from the vertices of
-    polygons that do not cross themselves, or with `even_odd` from one polygon that may.
+    `edges_mm` has shape (n_regions, n_edges, 2 ends, 2). Build it with `from_vertices` from the vertices of
+    polygons that do not cross themselves, or with `from_even_odd_vertices` from one polygon that may.
     """
 
     edges_mm: FloatArray
@@ -28,10 +28,10 @@ class PolygonRegion(RegionBatch):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        broadcast_fields(self, edges_mm=(-1, 2, 2))
+        broadcast_and_freeze_fields(self, edges_mm=(-1, 2, 2))
 
     @classmethod
-    def simple(cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0) -> PolygonRegion:
+    def from_vertices(cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0) -> PolygonRegion:
         """Build from vertices (n_regions, n_vertices, 2), clockwise or anticlockwise; edges must not cross."""
         vertices = np.asarray(vertices_mm, dtype=np.float64)
         if vertices.ndim != 3 or vertices.shape[1] < 3 or vertices.shape[2] != 2:
@@ -42,8 +42,12 @@ class PolygonRegion(RegionBatch):
         edges = np.where((area < 0)[:, None, None, None], edges[:, :, ::-1], edges)
         return cls(edges, inside, outside)
 
+    simple = from_vertices  # its earlier name
+
     @classmethod
-    def even_odd(cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0) -> PolygonRegion:
+    def from_even_odd_vertices(
+        cls, vertices_mm: FloatArray, *, inside: float = 1.0, outside: float = 0.0
+    ) -> PolygonRegion:
         """Build one region from the vertices (n_vertices, 2) of a polygon that may cross itself.
 
         Edges are split where they meet; pieces with the inside (even-odd rule) on exactly one
@@ -55,8 +59,10 @@ class PolygonRegion(RegionBatch):
         edges = np.stack([vertices, np.roll(vertices, -1, axis=0)], axis=1)
         return cls(_directed_pieces(edges)[None], inside, outside)
 
+    even_odd = from_even_odd_vertices  # its earlier name
+
     def albedo(self, points_mm: FloatArray) -> FloatArray:
-        return np.where(_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)
+        return np.where(_count_ray_crossings(self.edges_mm, points_mm) % 2 == 1, self.inside, self.outside)
 
     def coverage(self, centers_mm: FloatArray, pixel_mm: float, turn_rad: FloatArray) -> FloatArray:
         """Return the mean albedo over turned square pixels, exact: (n_regions, n_points)."""
@@ -64,7 +70,7 @@ class PolygonRegion(RegionBatch):
         return self.outside + (self.inside - self.outside) * share
 
 
-def _crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArray:
+def _count_ray_crossings(edges_mm: FloatArray, points_mm: FloatArray) -> IntArray:
     """Count the edges that a ray to the right of each point crosses, (n_regions, n_points)."""
     x, y = points_mm[:, 0], points_mm[:, 1]
     count = np.zeros((len(edges_mm), len(points_mm)), dtype=np.int64)
@@ -110,7 +116,7 @@ def _directed_pieces(edges: FloatArray) -> FloatArray:
         ends = np.array([p, q])
         middle, along = ends.mean(axis=0), ends[1] - ends[0]
         left = np.array([-along[1], along[0]]) / np.hypot(*along) * 1e-7 * size
-        sides = _crossings(edges[None], np.stack([middle + left, middle - left]))[0] % 2
+        sides = _count_ray_crossings(edges[None], np.stack([middle + left, middle - left]))[0] % 2
         if sides[0] != sides[1]:
             kept.append(ends if sides[0] else ends[::-1])
     if not kept:

@@ -8,16 +8,17 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.scene.regions.checks import RegionBatch, broadcast_fields
+from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fields
 from probewise.scene.regions.geometry import edge_distance
 from probewise.scene.regions.polygon import PolygonRegion
 
 
 @dataclass(frozen=True, eq=False)
 class QuadrantRegion(RegionBatch):
-    """The quadrant (x - cx) dx > 0 and (y - cy) dy > 0 (paper, S_a to S_d).
+    """Quadrants (x - cx) dx > 0 and (y - cy) dy > 0 (paper, S_a to S_d).
 
-    `corner_mm` and `direction` (entries +1 or -1) have shape (n_regions, 2).
+    `corner_mm` and `direction` (entries +1 or -1) have shape (n_regions, 2). The albedo is `inside` there, `outside`
+    elsewhere.
     """
 
     corner_mm: FloatArray
@@ -26,7 +27,7 @@ class QuadrantRegion(RegionBatch):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        broadcast_fields(self, corner_mm=(2,), direction=(2,))
+        broadcast_and_freeze_fields(self, corner_mm=(2,), direction=(2,))
         if not np.isin(self.direction, (-1.0, 1.0)).all():
             raise ParameterError("direction", self.direction.tolist(), "+1 or -1")
 
@@ -40,7 +41,7 @@ class QuadrantRegion(RegionBatch):
         x, y = self.corner_mm[:, 0], self.corner_mm[:, 1]
         far_x, far_y = x + 2 * reach * self.direction[:, 0], y + 2 * reach * self.direction[:, 1]
         square = np.stack([np.stack(p, axis=-1) for p in ((x, y), (far_x, y), (far_x, far_y), (x, far_y))], axis=1)
-        return PolygonRegion.simple(square, inside=self.inside, outside=self.outside).coverage(
+        return PolygonRegion.from_vertices(square, inside=self.inside, outside=self.outside).coverage(
             centers_mm, pixel_mm, turn_rad
         )
 

@@ -7,18 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.scene.regions.checks import RegionBatch, broadcast_fields
+from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fields
 
 
 @dataclass(frozen=True, eq=False)
 class RampRegion(RegionBatch):
-    """Albedo per_mm (x . n), unbounded; fields (n_regions,)."""
+    """Albedo per_mm (x . n), n the unit normal, unbounded; fields (n_regions,)."""
 
     normal_rad: FloatArray
     per_mm: FloatArray
 
     def __post_init__(self) -> None:
-        broadcast_fields(self, normal_rad=(), per_mm=())
+        broadcast_and_freeze_fields(self, normal_rad=(), per_mm=())
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         normal = self.normal_rad[:, None]

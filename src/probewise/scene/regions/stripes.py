@@ -9,14 +9,17 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
-from probewise.scene._pixels import share_behind_edge
-from probewise.scene.regions.checks import RegionBatch, broadcast_fields, require_positive
+from probewise.scene._pixels import share_inside_half_plane
+from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fields, require_positive
 from probewise.scene.regions.geometry import edge_distance
 
 
 @dataclass(frozen=True, eq=False)
 class StripesRegion(RegionBatch):
-    """Stripes where frac((x . n - phase) / period) < duty; fields (n_regions,)."""
+    """Stripes where frac((x . n - phase) / period) < duty, n the unit normal; fields (n_regions,).
+
+    The albedo is `inside` there, `outside` elsewhere.
+    """
 
     normal_rad: FloatArray
     period_mm: FloatArray
@@ -26,7 +29,7 @@ class StripesRegion(RegionBatch):
     outside: float = 0.0
 
     def __post_init__(self) -> None:
-        broadcast_fields(self, normal_rad=(), period_mm=(), duty=(), phase_mm=())
+        broadcast_and_freeze_fields(self, normal_rad=(), period_mm=(), duty=(), phase_mm=())
         require_positive("period_mm", self.period_mm)
         if ((self.duty < 0) | (self.duty > 1)).any():
             raise ParameterError("duty", self.duty.tolist(), "0 to 1")
@@ -46,8 +49,8 @@ class StripesRegion(RegionBatch):
         reach = 1 + math.ceil(0.75 * pixel_mm / float(self.period_mm.min()))
         for k in range(-reach, reach + 1):
             start = k * period
-            share += share_behind_edge(along - start, angle, pixel_mm)
-            share -= share_behind_edge(along - start - self.duty[:, None] * period, angle, pixel_mm)
+            share += share_inside_half_plane(along - start, angle, pixel_mm)
+            share -= share_inside_half_plane(along - start - self.duty[:, None] * period, angle, pixel_mm)
         return self.outside + (self.inside - self.outside) * share
 
     def _position_along_normal(self, points_mm: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.scene.regions.checks import RegionBatch, broadcast_fields
+from probewise.scene.regions.checks import RegionBatch, broadcast_and_freeze_fields
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +17,7 @@ class UniformRegion(RegionBatch):
     level: FloatArray
 
     def __post_init__(self) -> None:
-        broadcast_fields(self, level=())
+        broadcast_and_freeze_fields(self, level=())
 
     def albedo(self, points_mm: FloatArray) -> FloatArray:
         return np.repeat(self.level[:, None], len(points_mm), axis=1)

@@ -34,7 +34,7 @@ from probewise.experiment import Experiment, Step, experiment_for, explore, read
 from probewise.inquiry import Grid
 from probewise.recordings import Disc, Instrumentation
 from probewise.scene import Circle, Field
-from probewise.sensor import field_of, footprint_of
+from probewise.sensor import footprint_of, mean_ssf_field
 
 FAULTS = {
     "fragment": Faults(fragment=0.5),
@@ -80,7 +80,7 @@ def sensor() -> FittedSensor:
         samples=mean + 1e-4 * np.random.default_rng(0).standard_normal((500, 8)),
         n_gaussians=1,
         noise_sd=np.full(500, 0.6),
-        field=field_of(footprint_of(mean[None, :6], 1), u_mm=axis, v_mm=axis),
+        field=mean_ssf_field(footprint_of(mean[None, :6], 1), u_mm=axis, v_mm=axis),
         instrumentation=Instrumentation(),
     )
 

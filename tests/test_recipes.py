@@ -13,7 +13,7 @@ import numpy as np
 from probewise import nested
 from probewise.priors import Uniform
 from probewise.recordings import paper_plan
-from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels
+from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
 from probewise.sensor.gaussian import mean_albedo_under_gaussians
 from probewise.systems import Noise, RunTable, Simulator, System, read_simulator
 from probewise.systems.forms import ReferenceFit
@@ -53,7 +53,7 @@ def test_a_region_with_its_closed_form():
     region = ring(np.array([[2.0, 1.0]]), np.array([[5.0, 12.0]]))
     grid = np.arange(-25.0, 25.125, 0.25)
     ssf = FixedMixture([1.0], [[0.0, 0.0]], [np.array([[16.0, 3.0], [3.0, 9.0]])])
-    field = field_of(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
+    field = mean_ssf_field(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
     x, y = np.array([[-6.0, 0.0, 2.0, 12.0]]), np.array([[3.0, -2.0, 8.0, 4.0]])
     closed = mean_albedo_under_gaussians(
         region, x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0))

@@ -12,7 +12,7 @@ from probewise.calibration import FittedSensor, write_sensor
 from probewise.cli import main
 from probewise.errors import LinkError
 from probewise.recordings import Instrumentation, paper_plan, read_recording, write_plan, write_recording
-from probewise.sensor import field_of, footprint_of
+from probewise.sensor import footprint_of, mean_ssf_field
 
 DARK_COUNTS = 826  # 10 %
 
@@ -65,7 +65,7 @@ def sensor_file(tmp_path):
         samples=truth + 1e-4 * np.random.default_rng(0).standard_normal((500, 8)),
         n_gaussians=1,
         noise_sd=np.full(500, 0.6),
-        field=field_of(footprint_of(truth[None, :6], 1), u_mm=axis, v_mm=axis),
+        field=mean_ssf_field(footprint_of(truth[None, :6], 1), u_mm=axis, v_mm=axis),
         instrumentation=Instrumentation(),
     )
     write_sensor(sensor, tmp_path / "sensor.json")

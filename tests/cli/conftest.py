@@ -12,7 +12,7 @@ from probewise.calibration import FittedSensor, write_sensor
 from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
 from probewise.report import exploration
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
+from probewise.sensor import Chain, FixedLevels, FixedMixture, footprint_of, mean_ssf_field
 
 NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
 TRUTH = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
@@ -36,7 +36,7 @@ def hand_made_sensor() -> FittedSensor:
         samples=TRUTH + spread * rng.standard_normal((500, 8)),
         n_gaussians=1,
         noise_sd=np.full(500, 0.6),
-        field=field_of(footprint_of(TRUTH[None, :6], 1), u_mm=axis, v_mm=axis),
+        field=mean_ssf_field(footprint_of(TRUTH[None, :6], 1), u_mm=axis, v_mm=axis),
         instrumentation=Instrumentation(),
     )
 

@@ -18,7 +18,7 @@ from probewise.scene.regions import (
     UniformRegion,
     disc_region,
 )
-from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels, mean_albedo_under_gaussians
+from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_albedo_under_gaussians, mean_ssf_field
 
 EDGE = HalfPlaneRegion([0.5], [1.0], 0.9, 0.1)
 CHANGED = {
@@ -52,7 +52,7 @@ def test_a_changed_surface_is_seen_alike_by_closed_form_and_by_the_papers_sum(ki
     cov = np.array([[16.0, 3.0], [3.0, 9.0]])
     ssf = FixedMixture([1.0], [[0.0, 0.0]], [cov])
     grid = np.arange(-25.0, 25.25, 0.5)
-    field = field_of(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
+    field = mean_ssf_field(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
     x, y = np.array([[-6.0, 0.0, 2.0, 7.0]]), np.array([[3.0, -2.0, 1.0, 0.0]])
     discrete = mean_albedo_by_pixels(region, field, Poses(x, y, np.zeros((1, 4))))
     closed = mean_albedo_under_gaussians(

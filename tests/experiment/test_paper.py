@@ -30,7 +30,7 @@ from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording
 from probewise.recordings import Uniform as UniformPattern
 from probewise.scene import AnyOf, Circle, Field
 from probewise.scene.shapes import Rectangle
-from probewise.sensor import FixedLevels, field_of, footprint_of
+from probewise.sensor import FixedLevels, footprint_of, mean_ssf_field
 from probewise.world import Blob, World, gaussian_spot
 
 STUDENT = OneScan(0.3, 50.0)
@@ -192,7 +192,7 @@ def sensor():
         samples=np.tile(PARAMETERS, (500, 1)),
         n_gaussians=1,
         noise_sd=np.full(500, 0.6),
-        field=field_of(footprint_of(PARAMETERS[None, :6], 1), u_mm=axis, v_mm=axis),
+        field=mean_ssf_field(footprint_of(PARAMETERS[None, :6], 1), u_mm=axis, v_mm=axis),
         instrumentation=Instrumentation(unit="LEGO"),
     )
 

@@ -27,7 +27,7 @@ from probewise.report import calibration as calibration_report
 from probewise.report import exploration
 from probewise.report.animation import animated_gif
 from probewise.scene import Circle, HypothesisScene, outlines
-from probewise.sensor import Chain, FixedLevels, FixedMixture, field_of, footprint_of
+from probewise.sensor import Chain, FixedLevels, FixedMixture, footprint_of, mean_ssf_field
 from probewise.world import Blob, World, gaussian_spot
 
 TRUTH = np.array([[600.0, 260.0, 120.0]])
@@ -167,7 +167,7 @@ def hand_made_sensor():
         samples=samples,
         n_gaussians=1,
         noise_sd=np.full(500, 0.6),
-        field=field_of(footprint_of(samples[1:2, :6], 1), u_mm=axis, v_mm=axis),
+        field=mean_ssf_field(footprint_of(samples[1:2, :6], 1), u_mm=axis, v_mm=axis),
         instrumentation=Instrumentation(),
         orders=(OrderEvidence(1, -389.8199, 0.0234), OrderEvidence(2, -394.28, 0.53)),
     )

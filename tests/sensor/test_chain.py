@@ -29,6 +29,7 @@ from probewise.sensor import (
     SceneView,
     Stage,
     field_of,
+    mean_ssf_field,
     footprint_of,
 )
 
@@ -73,7 +74,7 @@ CHAINS = {
     ),
     "field": (
         Chain(
-            DiscreteSSF(field_of(footprint_of(TWO[None], 2), u_mm=U_MM, v_mm=U_MM)),
+            DiscreteSSF(mean_ssf_field(footprint_of(TWO[None], 2), u_mm=U_MM, v_mm=U_MM)),
             FixedLevels(10, 50),
             HypothesisScene(Circle()),
         ),
@@ -176,7 +177,7 @@ def test_turning_scene_and_sensor_together_changes_nothing(turn, seed):
 def test_the_field_route_agrees_with_the_closed_forms():
     """1 mm pixels, 1e-3 of the span of 40."""
     u = np.arange(-40.0, 41.0)
-    field = DiscreteSSF(field_of(footprint_of(TWO[None], 2), u_mm=u, v_mm=u))
+    field = DiscreteSSF(mean_ssf_field(footprint_of(TWO[None], 2), u_mm=u, v_mm=u))
     plan = plan_of(20)
     scene, levels = KnownScene(PATTERNS), FixedLevels(10, 50)
     closed = Chain(FixedMixture.from_parameters(TWO), levels, scene).predict(np.zeros((1, 0)), plan)

@@ -15,8 +15,8 @@ from probewise.scene.regions import (
     StripesRegion,
     UniformRegion,
 )
-from probewise.sensor import FixedMixture, Poses, field_of, mean_albedo_by_pixels
-from probewise.sensor.gaussian import mean_albedo_under_gaussians, seen_by_one
+from probewise.sensor import FixedMixture, Poses, mean_albedo_by_pixels, mean_ssf_field
+from probewise.sensor.gaussian import mean_albedo_under_gaussians, mean_albedo_under_one
 
 ELLIPSE = EllipseRegion([[3.0, 1.0]], [[14.0, 9.0]], [0.4])
 POLYGON = PolygonRegion.from_vertices(np.array([[[0.0, 0.0], [14.0, 2.0], [9.0, 15.0], [4.0, 6.0]]]))
@@ -48,14 +48,14 @@ def test_a_footprint_is_seen_alike_by_closed_form_and_by_the_papers_sum(kind):
     cov = np.array([[16.0, 3.0], [3.0, 9.0]])
     grid = np.arange(-25.0, 25.125, 0.25)
     ssf = FixedMixture([1.0], [[0.0, 0.0]], [cov])
-    field = field_of(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
+    field = mean_ssf_field(ssf.footprint(np.empty((1, 0))), u_mm=grid, v_mm=grid)
     x, y = np.array([[-6.0, 0.0, 2.0, 12.0]]), np.array([[3.0, -2.0, 8.0, 4.0]])
     by_pixels = mean_albedo_by_pixels(KINDS[kind], field, Poses(x, y, np.zeros((1, 4))))
     closed = mean_albedo_under_gaussians(
         KINDS[kind], x[..., None], y[..., None], *(np.full((1, 1, 1), c) for c in (16.0, 9.0, 3.0))
     )
     np.testing.assert_allclose(closed[:, :, 0], by_pixels, atol=2.5e-4)  # its error falls as the pixel squared
-    assert kind in registered(seen_by_one)
+    assert kind in registered(mean_albedo_under_one)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -14,6 +14,7 @@ from probewise.sensor import (
     SSFField,
     field_of,
     footprint_of,
+    mean_ssf_field,
     mean_mixture,
     mixture_names,
     mixture_of_field,
@@ -53,7 +54,7 @@ def test_the_footprint_is_the_papers_formula_normalised():
         [[np.sum(values * (p - mean[i]) * (q - mean[j])) for j, q in enumerate((x, y))] for i, p in enumerate((x, y))]
     )
     assert mixture.cov_mm2 == pytest.approx(cov, abs=1e-7)
-    field = field_of(footprint_of(TWO, 2), u_mm=u, v_mm=u)
+    field = mean_ssf_field(footprint_of(TWO, 2), u_mm=u, v_mm=u)
     assert np.abs(field.values - values).max() < 1e-12
 
 
@@ -87,7 +88,7 @@ def test_the_ssf_integrates_to_one(a, aa, bb, rho, u):
     footprint = footprint_of(theta, 3)
     assert footprint.weight.sum() == pytest.approx(1.0)
     assert FixedMixture.from_parameters(theta[0]).weights.sum() == pytest.approx(1.0)
-    assert field_of(footprint, u_mm=grid(60), v_mm=grid(60)).values.sum() == pytest.approx(1.0)
+    assert mean_ssf_field(footprint, u_mm=grid(60), v_mm=grid(60)).values.sum() == pytest.approx(1.0)
 
 
 def test_only_ratios_of_the_amplitudes_matter():
@@ -108,8 +109,8 @@ def test_many_samples_equal_one_by_one():
 def test_the_mean_field_is_a_mean_of_fields_not_of_parameters():
     theta = np.array([[1.0, -8.0, 0.0, 0.05, 0.05, 0.0], [1.0, 8.0, 0.0, 0.05, 0.05, 0.0]])
     weights = np.array([0.25, 0.75])
-    mean = field_of(footprint_of(theta, 1), u_mm=grid(30), v_mm=grid(30), weights=weights)
-    one, other = (field_of(footprint_of(theta[i : i + 1], 1), u_mm=grid(30), v_mm=grid(30)) for i in (0, 1))
+    mean = mean_ssf_field(footprint_of(theta, 1), u_mm=grid(30), v_mm=grid(30), weights=weights)
+    one, other = (mean_ssf_field(footprint_of(theta[i : i + 1], 1), u_mm=grid(30), v_mm=grid(30)) for i in (0, 1))
     assert np.allclose(mean.values, 0.25 * one.values + 0.75 * other.values)
     assert mean.mean_mm == pytest.approx([4.0, 0.0], abs=1e-6)
 
@@ -124,14 +125,14 @@ def test_a_field_is_normalised_and_knows_its_places():
 
 @pytest.mark.parametrize("n_gaussians", [1, 2])
 def test_the_mixture_of_a_field_keeps_its_moments(n_gaussians):
-    field = field_of(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
+    field = mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
     mixture = mixture_of_field(field, n_gaussians=n_gaussians)
     assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-4)
     assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, rel=1e-4, abs=1e-3)
 
 
 def test_two_gaussians_are_recovered_from_their_field():
-    field = field_of(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
+    field = mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
     assert total_variation(FixedMixture.from_parameters(TWO[0]), field) < 1e-6
     assert total_variation(mixture_of_field(field, n_gaussians=2), field) < 0.01
     assert total_variation(mixture_of_field(field), field) > 0.03
@@ -144,7 +145,7 @@ def test_sampled_mixtures_are_summarised_by_the_law_of_total_covariance():
     theta[:, [1, 2, 7, 8]] += rng.normal(size=(20, 4))
     weights = rng.random(20)
     footprint = footprint_of(theta, 2)
-    field = field_of(footprint, u_mm=grid(60), v_mm=grid(60), weights=weights)
+    field = mean_ssf_field(footprint, u_mm=grid(60), v_mm=grid(60), weights=weights)
     mixture = mean_mixture(footprint, weights=weights)
     assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-6)
     assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, abs=1e-4)
@@ -154,7 +155,7 @@ def test_sampled_mixtures_are_summarised_by_the_law_of_total_covariance():
 
 
 def test_a_known_ssf_has_no_parameters():
-    field = field_of(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
+    field = mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(50), v_mm=grid(50))
     assert DiscreteSSF(field).names == ()
     assert FixedMixture.from_parameters(TWO[0]).names == ()
     assert DiscreteSSF(field).footprint(np.zeros((1, 0))).weight.shape == (1, 1, 1)
@@ -177,8 +178,11 @@ def test_a_known_ssf_has_no_parameters():
         (lambda: SSFField(np.zeros((3, 3)), 1.0, (0.0, 0.0)), "sum of the SSF field is 0.0"),
         (lambda: SSFField(np.ones((3, 3)), 0.0, (0.0, 0.0)), "pixel_mm is 0.0"),
         (lambda: SSFField(np.ones(3), 1.0, (0.0, 0.0)), "SSF field has shape"),
-        (lambda: field_of(footprint_of(TWO, 2), u_mm=grid(5), v_mm=grid(5, 0.5)), "one spacing for both"),
-        (lambda: field_of(footprint_of(TWO, 2), u_mm=grid(5), v_mm=np.zeros(1)), "u_mm has 11 pixels, v_mm 1; allowed"),
+        (lambda: mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(5), v_mm=grid(5, 0.5)), "one spacing for both"),
+        (
+            lambda: mean_ssf_field(footprint_of(TWO, 2), u_mm=grid(5), v_mm=np.zeros(1)),
+            "u_mm has 11 pixels, v_mm 1; allowed",
+        ),
     ],
 )
 def test_an_ssf_that_cannot_be_is_named(build, message):

@@ -11,7 +11,7 @@ from probewise.recordings import patterns as kinds
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene, region_of
 from probewise.sensor import Chain, FixedLevels, FreeMixture, footprint_of, mean_albedo_under_gaussians
-from probewise.sensor.gaussian import probabilities_beyond_corner, turn_into_lab_frame
+from probewise.sensor.gaussian import probabilities_beyond_corner_and_sides, turn_into_lab_frame
 
 EDGES = {
     "edge": kinds.HalfPlane(0.0, 0.0),
@@ -91,7 +91,7 @@ def test_what_lies_beyond_a_corner_is_owens_function():
         slope_1, slope_2 = (z2 / z1 - rho) / free, (z1 / z2 - rho) / free
     apart = np.where(z1 * z2 < 0, 0.5, 0.0)
     wanted = 0.5 * (ndtr(-z1) + ndtr(-z2)) - owens_t(z1, slope_1) - owens_t(z2, slope_2) - apart
-    both, beyond_1, beyond_2 = probabilities_beyond_corner(z1, z2, rho)
+    both, beyond_1, beyond_2 = probabilities_beyond_corner_and_sides(z1, z2, rho)
     known = (z1 != 0) & (z2 != 0)
     np.testing.assert_allclose(both[known], wanted[known], atol=1e-12)
     at_origin = (z1 == 0) & (z2 == 0)

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError, ShapeError
-from probewise.sensor import Footprint, SSFField, field_of, footprint_of
+from probewise.sensor import Footprint, SSFField, footprint_of, mean_ssf_field
 
 _SIGMAS = 5.0
 _MAX_PIXELS_A_SIDE = 301
@@ -138,7 +138,7 @@ def mean_field(
     if widest / pixel_mm > max_pixels - 2:
         pixel_mm = _rounded_up_pixel_mm(widest / (max_pixels - 2))
     u_mm, v_mm = _pixel_centres(low_u, high_u, pixel_mm), _pixel_centres(low_v, high_v, pixel_mm)
-    return replace(field_of(f, u_mm=u_mm, v_mm=v_mm, weights=shares), pixel_mm=pixel_mm)
+    return replace(mean_ssf_field(f, u_mm=u_mm, v_mm=v_mm, weights=shares), pixel_mm=pixel_mm)
 
 
 def _footprint_of_samples(theta: FloatArray, n_gaussians: int) -> Footprint:

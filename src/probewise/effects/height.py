@@ -11,7 +11,7 @@ from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_wor
 from probewise.effects.motion import candidate_scan_groups, scan_indicator
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
-from probewise.sensor.commanded import footprint_at_height
+from probewise.sensor.commanded import footprint_at_height_ratio
 from probewise.sensor.stages import Footprint, Stage
 
 _USUAL_MM = 14.0  # the height assumed where a recording gives none
@@ -39,7 +39,7 @@ class HeightGradient(LinearEffect[Footprint]):
         return cls(typical=0.01 * _nominal_height_mm(extent.plan) / extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_height(value, 1 + theta[:, :1] * plan.x_mm / _nominal_height_mm(plan))
+        return footprint_at_height_ratio(value, 1 + theta[:, :1] * plan.x_mm / _nominal_height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "grows" if mean[0] > 0 else "shrinks"
@@ -69,7 +69,7 @@ class HeightOffset(ScanGroupEffect[Footprint]):
         return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_height(value, 1 + theta * scan_indicator(plan, self.scans) / _nominal_height_mm(plan))
+        return footprint_at_height_ratio(value, 1 + theta * scan_indicator(plan, self.scans) / _nominal_height_mm(plan))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "higher" if mean[0] > 0 else "lower"

@@ -5,9 +5,9 @@ Paper, section "Models Describing a Light Sensor": eq. (modelI) M = I_min + (I_m
 """
 
 from probewise.sensor.chain import Chain, FixedLevels, FreeLevels, Levels, response
-from probewise.sensor.commanded import COMMANDED, footprint_at_height, raised
+from probewise.sensor.commanded import COMMANDED, footprint_at_height_ratio, raised
 from probewise.sensor.discrete import mean_albedo_by_pixels, seen_discrete
-from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bends_of, free_form, is_free_form
+from probewise.sensor.free_form import N_BENDS, N_FREE_FORM, bends_of, free_form_parameters, is_free_form
 from probewise.sensor.gaussian import ACCURATE_NODES, FAST_NODES, mean_albedo_under_gaussians, seen
 from probewise.sensor.naive import NaiveSensor
 from probewise.sensor.ssf import (
@@ -16,9 +16,9 @@ from probewise.sensor.ssf import (
     FreeMixture,
     SSFField,
     SSFModel,
-    field_of,
     footprint_of,
     mean_mixture,
+    mean_ssf_field,
     mixture_names,
     mixture_of_field,
     total_variation,
@@ -61,14 +61,14 @@ __all__ = [
     "Stage",
     "View",
     "bends_of",
-    "field_of",
-    "footprint_at_height",
+    "footprint_at_height_ratio",
     "footprint_of",
-    "free_form",
+    "free_form_parameters",
     "is_free_form",
     "mean_albedo_by_pixels",
     "mean_albedo_under_gaussians",
     "mean_mixture",
+    "mean_ssf_field",
     "mixture_names",
     "mixture_of_field",
     "raised",
@@ -77,6 +77,15 @@ __all__ = [
     "seen_discrete",
     "total_variation",
 ]
+
+footprint_at_height = footprint_at_height_ratio
+"""The old name of `footprint_at_height_ratio`."""
+
+field_of = mean_ssf_field
+"""The old name of `mean_ssf_field`."""
+
+free_form = free_form_parameters
+"""The old name of `free_form_parameters`."""
 
 FieldSSF = DiscreteSSF
 """The old name of `DiscreteSSF`."""

@@ -16,7 +16,7 @@ CENTRE = _CELLS / 2  # position of z = 0, in cells
 _BLOCK = 2**14  # elements that fit the cache together with the table
 
 
-def _values_and_slopes() -> tuple[FloatArray, FloatArray]:
+def _tabulate_normal_cdf() -> tuple[FloatArray, FloatArray]:
     """Tabulate the cumulative and its derivative per cell; the slope is 0 at both ends."""
     z = (np.arange(_CELLS + 1) - CENTRE) / PER_SD
     value, slope = ndtr(z), np.exp(-0.5 * z * z) / (math.sqrt(2 * math.pi) * PER_SD)
@@ -25,10 +25,10 @@ def _values_and_slopes() -> tuple[FloatArray, FloatArray]:
     return value, slope
 
 
-_VALUE, _SLOPE = _values_and_slopes()
+_VALUE, _SLOPE = _tabulate_normal_cdf()
 
 
-def normal_cdf_in_place(cells: FloatArray) -> None:
+def normal_cdf_of_cells_in_place(cells: FloatArray) -> None:
     """Replace z PER_SD + CENTRE by the cumulative of z, in place; `cells` is contiguous float64.
 
     For callers that compute z as a product and can fold the table's scale into it. About the nearest entry z0
@@ -63,5 +63,5 @@ def normal_cdf(z: FloatArray) -> FloatArray:
     out += CENTRE
     flat = out.reshape(-1)
     for start in range(0, flat.size, _BLOCK):
-        normal_cdf_in_place(flat[start : start + _BLOCK])
+        normal_cdf_of_cells_in_place(flat[start : start + _BLOCK])
     return out

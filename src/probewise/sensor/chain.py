@@ -23,7 +23,7 @@ from probewise.sensor.commanded import (
     led_state,
 )
 from probewise.sensor.discrete import mean_albedo_by_pixels
-from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, seen_by_one, turn_into_lab_frame
+from probewise.sensor.gaussian import ACCURATE_NODES, LabGaussian, mean_albedo_under_one, turn_into_lab_frame
 from probewise.sensor.ssf import DiscreteSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
@@ -33,11 +33,11 @@ from probewise.sensor.stages import (
     SceneView,
     Stage,
     View,
-    columns_of_effects,
-    names_of_effects,
+    effects_with_columns,
+    parameter_names_of_effects,
     require_columns,
 )
-from probewise.sensor.straight import StraightCorners, StraightEdges, columns_of_readings
+from probewise.sensor.straight import StraightCorners, StraightEdges, select_reading_columns
 
 _MANY = 8  # Gaussians, from which on it pays to look for hypotheses that share their geometry
 _MOST_NUMBERS = 2_000_000  # held in memory at once of footprints that differ between readings
@@ -96,12 +96,12 @@ class FixedLevels:
 
 
 def require_levels(levels: object, order: str) -> None:
-    """Raise ParameterError unless `levels` has values."""
+    """Raise ParameterError unless `levels` has `names` and `values`."""
     require_like("levels", levels, ("names", "values"), f"FreeLevels() or FixedLevels(i_min, i_max), {order}")
 
 
 def require_scene(scene: object, order: str) -> None:
-    """Raise ParameterError unless `scene` has regions; a bare shape is the usual mistake."""
+    """Raise ParameterError unless `scene` has `names` and `regions`; a bare shape is the usual mistake."""
     allowed = f"a scene such as HypothesisScene(Circle()) or KnownScene(plan.patterns), {order}"
     require_like("scene", scene, ("names", "regions"), allowed)
 
@@ -141,10 +141,10 @@ class Chain:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the free parameters, one per column of theta."""
-        return (*self.ssf.names, *self.levels.names, *self.scene.names, *names_of_effects(self.effects))
+        return (*self.ssf.names, *self.levels.names, *self.scene.names, *parameter_names_of_effects(self.effects))
 
     def with_effects(self, *effects: AnyEffect) -> Chain:
-        """Add effects to the chain."""
+        """Return the chain with these effects added."""
         return replace(self, effects=(*self.effects, *effects))
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -167,7 +167,7 @@ class Chain:
             If the columns of theta do not match `names`.
         ParameterError
             If the plan has a pattern that the scene lacks, theta holds no valid SSF, or a height is commanded of a
-        `DiscreteSSF`.
+            `DiscreteSSF`.
         """
         at_once = self._hypotheses_at_once(theta, plan)
         if at_once < len(theta):
@@ -214,7 +214,7 @@ class Chain:
         return self.simulated_view(theta, plan).seen
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> View:
-        """Compute the sensor's view of the scene: the stages of `predict` before SEEN."""
+        """Compute the sensor's view of the scene: the stages of `predict` before SEEN, with their effects."""
         require_columns(theta, self.names)
         layout = self._layout_under_poses(theta, plan)
         if isinstance(self.ssf, DiscreteSSF):
@@ -223,7 +223,7 @@ class Chain:
             return View(_discrete_response(layout, self.ssf), layout.poses, layout.regions)
         plain = footprint_at_commanded_height(self.ssf.footprint(theta[:, : len(self.ssf.names)]), plan)
         footprint: Footprint = self._stage_applier(theta, plan)(Stage.FOOTPRINT, plain)
-        geometries = self._grouped_by_geometry(theta, footprint)
+        geometries = self._hypotheses_by_geometry(theta, footprint)
         if geometries is None:
             seen = response(layout, footprint, n_nodes=self.n_nodes)
         else:
@@ -239,7 +239,7 @@ class Chain:
         found: Poses = self._stage_applier(theta, plan)(Stage.POSE, told)
         return found
 
-    def _grouped_by_geometry(self, theta: FloatArray, footprint: Footprint) -> _HypothesesByGeometry | None:
+    def _hypotheses_by_geometry(self, theta: FloatArray, footprint: Footprint) -> _HypothesesByGeometry | None:
         """Group hypotheses that differ only in the weights of their Gaussians; None where grouping saves nothing."""
         few = not isinstance(self.ssf, FreeMixture) or self.ssf.n_gaussians < _MANY
         if few or footprint.weight.shape[1] > 1:
@@ -262,7 +262,7 @@ class Chain:
     def _layout_under_poses(self, theta: FloatArray, plan: Plan) -> Layout:
         """Lay out the scene under the poses; cached for the last plan if no parameter moves scene or poses."""
         fixed = not self.scene.names and all(effect.stage > Stage.SCENE for effect in self.effects)
-        known = self._last_layout.get(plan) if fixed else None
+        known = self._layout_cache.get(plan) if fixed else None
         if known is not None:
             return known
         apply = self._stage_applier(theta, plan)
@@ -273,13 +273,13 @@ class Chain:
         x_mm, y_mm = poses.x_mm - view.dx_mm, poses.y_mm - view.dy_mm
         layout = Layout(view.regions, Poses(x_mm, y_mm, poses.orientation_rad), plan)
         if fixed:
-            self._last_layout.clear()
-            self._last_layout[plan] = layout
+            self._layout_cache.clear()
+            self._layout_cache[plan] = layout
         return layout
 
     @cached_property
-    def _last_layout(self) -> dict[Plan, Layout]:
-        """Cache of the last plan's layout, where no parameter changes it."""
+    def _layout_cache(self) -> dict[Plan, Layout]:
+        """Layout of the last plan, by that plan, where no parameter changes it; otherwise empty."""
         return {}
 
     def noise_level(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseLevel:
@@ -305,9 +305,9 @@ class Chain:
 
     @cached_property
     def _effects_and_columns(self) -> list[tuple[AnyEffect, slice]]:
-        """Columns of theta that belong to each effect."""
+        """Each effect with its columns of theta."""
         first = len(self.ssf.names) + len(self.levels.names) + len(self.scene.names)
-        return columns_of_effects(self.effects, first)
+        return effects_with_columns(self.effects, first)
 
 
 @dataclass(frozen=True, eq=False)
@@ -396,15 +396,15 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
         if isinstance(region, UniformRegion):  # whatever the footprint
             level = region.level[:, None]
             for g in range(footprint.weight.shape[2]):
-                out[:, rows] += columns_of_readings(footprint.weight[:, :, g], rows) * level
+                out[:, rows] += select_reading_columns(footprint.weight[:, :, g], rows) * level
             continue
-        x, y, turn = (columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
+        x, y, turn = (select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
         if turn.shape[0] == 1 and (turn == turn[:, :1]).all():
             turn = turn[:, :1]
         for g in range(footprint.weight.shape[2]):
-            one = (columns_of_readings(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in footprint.moments)
-            seen = seen_by_one(region, LabGaussian(x, y, *turn_into_lab_frame(turn, *one)), n_nodes)
-            out[:, rows] += columns_of_readings(footprint.weight[:, :, g], rows) * seen
+            one = (select_reading_columns(a[:, :, g if a.shape[2] > 1 else 0], rows) for a in footprint.moments)
+            seen = mean_albedo_under_one(region, LabGaussian(x, y, *turn_into_lab_frame(turn, *one)), n_nodes)
+            out[:, rows] += select_reading_columns(footprint.weight[:, :, g], rows) * seen
     return out
 
 
@@ -432,12 +432,14 @@ class _HypothesesByGeometry:
         """
         n_samples, n_gaussians = len(self.which), footprint.weight.shape[2]
 
-        def each(array: FloatArray) -> FloatArray:
+        def one_row_per_gaussian(array: FloatArray) -> FloatArray:
             """Make each Gaussian a row: (n_samples or 1, n, n_gaussians) -> (n_geometries n_gaussians, n, 1)."""
             own = np.broadcast_to(array, (n_samples, *array.shape[1:]))[self.first]
             return np.moveaxis(own, 2, 1).reshape(-1, array.shape[1], 1)
 
-        one_each = Footprint(np.ones((len(self.first) * n_gaussians, 1, 1)), *map(each, footprint.moments))
+        one_each = Footprint(
+            np.ones((len(self.first) * n_gaussians, 1, 1)), *map(one_row_per_gaussian, footprint.moments)
+        )
         parts = response(layout, one_each, n_nodes=n_nodes).reshape(-1, n_gaussians, len(layout.plan))
         weight = np.broadcast_to(footprint.weight[:, 0], (n_samples, n_gaussians))
         return np.stack([own @ parts[at] for own, at in zip(weight, self.which, strict=True)])
@@ -446,7 +448,7 @@ class _HypothesesByGeometry:
 def _discrete_response(layout: Layout, ssf: DiscreteSSF) -> FloatArray:
     poses, found = layout.poses, []
     for rows, region in layout.rows_and_regions:
-        there = Poses(*(columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
+        there = Poses(*(select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad)))
         found.append((rows, mean_albedo_by_pixels(region, ssf.field, there)))
     out = np.zeros((max((len(part) for _, part in found), default=1), len(layout.plan)))
     for rows, part in found:

@@ -38,12 +38,12 @@ def height_ratio(plan: Plan) -> FloatArray | None:
 
 
 def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint:
-    """Scale the footprint by the commanded height over the description's; see `footprint_at_height`."""
+    """Scale the footprint by the commanded height over the description's; see `footprint_at_height_ratio`."""
     ratio = height_ratio(plan)
-    return footprint if ratio is None else footprint_at_height(footprint, ratio[None, :])
+    return footprint if ratio is None else footprint_at_height_ratio(footprint, ratio[None, :])
 
 
-def footprint_at_height(footprint: Footprint, ratio: FloatArray) -> Footprint:
+def footprint_at_height_ratio(footprint: Footprint, ratio: FloatArray) -> Footprint:
     """Scale the footprint by h/h0, (n_samples, n_points), and divide its brightness by the square."""
     # A fit may try heights that no arm can take: the result only has to stay finite.
     ratio = np.clip(ratio, 0.1, 10.0)
@@ -59,4 +59,4 @@ def footprint_at_height(footprint: Footprint, ratio: FloatArray) -> Footprint:
     )
 
 
-raised = footprint_at_height  # its earlier name
+footprint_at_height = raised = footprint_at_height_ratio  # its earlier names

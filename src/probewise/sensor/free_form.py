@@ -46,8 +46,8 @@ N_FREE_FORM = 1 + len(_WIDTHS)
 """Number of Gaussians of a free form, the one that sets place and size first."""
 
 
-def free_form(one: FloatArray, bends: FloatArray) -> FloatArray:
-    """Change the form of Gaussians but not their mean and covariance.
+def free_form_parameters(one: FloatArray, bends: FloatArray) -> FloatArray:
+    """Return the parameters of free forms: each a Gaussian bent without a change of its mean and covariance.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def bends_of(theta: FloatArray) -> FloatArray:
 
 
 def is_free_form(theta: FloatArray) -> bool:
-    """Return whether mixtures, (n_samples, 6 n), are free forms, by the number and relative widths of the Gaussians."""
+    """Return whether all of these mixtures, (n_samples, 6 n), are free forms, by number and widths of the Gaussians."""
     if theta.shape[1] != 6 * N_FREE_FORM:
         return False
     blocks = theta.reshape(len(theta), N_FREE_FORM, 6)

@@ -3,7 +3,7 @@
 The first of the two independent routes to the response R (paper, eq. R): exact integrals of each
 Gaussian of the SSF over the region. The other, the paper's sum over pixels, is
 `probewise.sensor.discrete`. A new kind of region may register its closed form with
-`seen_by_one.register`; without one it is integrated numerically from its `coverage`.
+`mean_albedo_under_one.register`; without one it is integrated numerically from its `coverage`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from probewise.scene.regions import (
     StripesRegion,
     UniformRegion,
 )
-from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_in_place
+from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf, normal_cdf_of_cells_in_place
 
 ACCURATE_NODES = 64
 FAST_NODES = 20
@@ -123,7 +123,7 @@ def mean_albedo_under_gaussians(
         x, y, var1, var2, cov = (a[:, :, g] for a in arrays)
         gaussian = LabGaussian(x, y, zero, zero, var_x=var1, var_y=var2, cov_xy=cov)
         shape = np.broadcast_shapes(x.shape, (region.n_regions, 1))
-        layers.append(np.broadcast_to(seen_by_one(region, gaussian, n_nodes), shape))
+        layers.append(np.broadcast_to(mean_albedo_under_one(region, gaussian, n_nodes), shape))
     return np.stack(layers, axis=-1)
 
 
@@ -131,7 +131,7 @@ seen = mean_albedo_under_gaussians  # its earlier name
 
 
 @singledispatch
-def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
+def mean_albedo_under_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return the mean albedo under one Gaussian footprint: broadcasts to (n_samples, n_points).
 
     A region without a registered closed form is summed over square pixels, a quarter of the smaller
@@ -173,6 +173,9 @@ def seen_by_one(region: Region, gaussian: LabGaussian, n_nodes: int) -> FloatArr
     return out
 
 
+seen_by_one = mean_albedo_under_one  # its earlier name
+
+
 def _broadcast_entry(array: FloatArray, i: int, j: int) -> float:
     return float(array[i if array.shape[0] > 1 else 0, j if array.shape[1] > 1 else 0])
 
@@ -183,12 +186,12 @@ def _albedo_by_share_inside(outside: float, inside: float, share: FloatArray) ->
     return outside + (inside - outside) * share
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_uniform(region: UniformRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     return region.level[:, None]
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the cumulative of the Gaussian's projection on the normal."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
@@ -199,7 +202,7 @@ def _mean_albedo_over_half_plane(region: HalfPlaneRegion, gaussian: LabGaussian,
     return _albedo_by_share_inside(region.outside, region.inside, normal_cdf((place + shift) * per_sd))
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Evaluate the field at the Gaussian's mean, which is exact for a linear field."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
@@ -208,7 +211,7 @@ def _mean_albedo_over_ramp(region: RampRegion, gaussian: LabGaussian, n_nodes: i
     )
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_stripes(region: StripesRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum cumulatives or, for stripes finer than the footprint, their Fourier series."""
     cosine, sine = np.cos(region.normal_rad)[:, None], np.sin(region.normal_rad)[:, None]
@@ -242,7 +245,7 @@ _FAR = 26.0  # sds: the mass beyond is 0, and exp is ten times slower where it u
 _TRIANGLE_NODES = 8  # positive half of a 16-node rule: accurate to 1e-12
 
 
-def probabilities_beyond_corner(
+def probabilities_beyond_corner_and_sides(
     z1: FloatArray, z2: FloatArray, rho: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the probabilities that two standard normals exceed z1 and z2, that the first exceeds z1, the second z2.
@@ -277,7 +280,7 @@ def probabilities_beyond_corner(
     return np.clip(opening - sides[0] - sides[1], 0.0, 1.0), beyond[0], beyond[1]
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_quadrant(region: QuadrantRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     corner, direction = region.corner_mm, region.direction
     share = mass_in_quadrant(corner[:, :1], corner[:, 1:], direction[:, :1], direction[:, 1:], gaussian)
@@ -294,10 +297,10 @@ def mass_in_quadrant(
     sd_x, sd_y = np.sqrt(gaussian.var_x), np.sqrt(gaussian.var_y)
     z1 = dx * (corner_x - gaussian.x_mm - gaussian.dx_mm) / sd_x
     z2 = dy * (corner_y - gaussian.y_mm - gaussian.dy_mm) / sd_y
-    return probabilities_beyond_corner(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))[0]
+    return probabilities_beyond_corner_and_sides(z1, z2, dx * dy * gaussian.cov_xy / (sd_x * sd_y))[0]
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Sum Owen's T over the edges, in the frame in which the Gaussian is the unit one."""
     sd_x = np.sqrt(gaussian.var_x)
@@ -327,17 +330,18 @@ def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_no
     return _albedo_by_share_inside(region.outside, region.inside, np.clip(turning / (2 * np.pi), 0.0, 1.0))
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_carded_region(region: CardedRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate over the region and over each card by itself, then lay the cards over the region."""
-    covered = [seen_by_one(card.region, gaussian, n_nodes) for card in region.cards]
-    return mean_albedo_with_cards(seen_by_one(region.region, gaussian, n_nodes), region.cards, covered)
+    covered = [mean_albedo_under_one(card.region, gaussian, n_nodes) for card in region.cards]
+    return mean_albedo_with_cards(mean_albedo_under_one(region.region, gaussian, n_nodes), region.cards, covered)
 
 
 def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the unit Gaussian's mass beyond edges, (n_edges,), in the angle each spans: Owen's T from start to end.
+    """Return the unit Gaussian's mass beyond each edge, seen from the origin, (n_edges,), by Owen's T.
 
-    An end out of reach counts as infinitely far, where T is half the mass beyond the edge's line.
+    `height` is the distance of the edge's line from the origin; `start` and `end` are places along it. An end out of
+    reach counts as infinitely far, where T is half the mass beyond the line.
     """
     half = 0.5 * ndtr(-np.abs(height))
     with np.errstate(over="ignore"):
@@ -358,7 +362,7 @@ def _half_legendre_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
     return node[n_nodes // 2 :], weight[n_nodes // 2 :]
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_ellipse(region: EllipseRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate cumulatives along the normal by quadrature along the tangent, after a map to the unit disc."""
     a, b = region.semi_axes_mm[:, :1], region.semi_axes_mm[:, 1:]
@@ -408,7 +412,7 @@ def _mass_in_unit_disc(
     cc, ss, cs = c * c, s * s, c * s
     cross = 2 * cs * cov_pq
     var_r, var_t = cc * var_p + ss * var_q + cross, ss * var_p + cc * var_q - cross
-    share[near] = _mass_near_edge_in_disc(d, var_r, var_t, cs * (var_q - var_p) + (cc - ss) * cov_pq, reach, n_nodes)
+    share[near] = _mass_in_disc_if_near_edge(d, var_r, var_t, cs * (var_q - var_p) + (cc - ss) * cov_pq, reach, n_nodes)
     return np.clip(share, 0.0, 1.0)
 
 
@@ -421,7 +425,7 @@ def _reach_in_sds(n_nodes: int) -> float:
     return float(np.clip(4.3 + (n_nodes - 20) / 20, 4.0, 6.5))
 
 
-def _mass_near_edge_in_disc(
+def _mass_in_disc_if_near_edge(
     d: FloatArray, var_r: FloatArray, var_t: FloatArray, cov: FloatArray, reach: float, n_nodes: int
 ) -> FloatArray:
     """Integrate Gaussians over the unit disc, mean at (d, 0), radial and tangential variances; (n_pairs,) each.
@@ -452,10 +456,10 @@ def _mass_near_edge_in_disc(
         rows = np.flatnonzero(left & inside & (curvature < most))
         left[rows] = False
         for r in _blocks_of_rows(rows, n):
-            found[r] = _mass_along_skewed_chords(mean_x[r], mean_y[r], sd_y[r], per_sd[r], tilt[r], n)
+            found[r] = _mass_in_disc_by_skewed_chords(mean_x[r], mean_y[r], sd_y[r], per_sd[r], tilt[r], n)
     rule = _half_legendre_rule(n_nodes)
     for r in _blocks_of_rows(np.flatnonzero(left), n_nodes):
-        found[r] = _mass_along_long_axis(d[r], var_r[r], var_t[r], cov[r], reach, rule)
+        found[r] = _mass_in_disc_by_long_chords(d[r], var_r[r], var_t[r], cov[r], reach, rule)
     return found
 
 
@@ -464,18 +468,18 @@ def _blocks_of_rows(rows: IntArray, n_nodes: int) -> Iterator[IntArray]:
     return (rows[start : start + step] for start in range(0, len(rows), step))
 
 
-def _normal_cdf_from_table(z: FloatArray) -> FloatArray:
-    """Look up the normal cumulative in the table, in place, so that no value depends on how many there are."""
+def _normal_cdf_overwriting(z: FloatArray) -> FloatArray:
+    """Replace z by its normal cumulative, from the table whatever the size of z, and return it."""
     z *= PER_SD
     z += CENTRE
-    normal_cdf_in_place(z)
+    normal_cdf_of_cells_in_place(z)
     return z
 
 
-def _mass_along_skewed_chords(
+def _mass_in_disc_by_skewed_chords(
     mean_x: FloatArray, mean_y: FloatArray, sd_y: FloatArray, per_sd: FloatArray, tilt: FloatArray, n_nodes: int
 ) -> FloatArray:
-    """Return the mass of Gaussians in the unit disc.
+    """Return the mass of Gaussians in the unit disc, (n_pairs,), from chords skewed so that few nodes suffice.
 
     Chords are integrated exactly along x, with Gauss-Hermite nodes in y; the mean in x moves by `tilt` conditional sds
     for each sd in y.
@@ -487,16 +491,16 @@ def _mass_along_skewed_chords(
     np.subtract(1.0, along, out=along)
     np.sqrt(along, out=along)
     across = node[:, None] * tilt
-    found = weight @ _normal_cdf_from_table((along - mean_x) * per_sd - across)
+    found = weight @ _normal_cdf_overwriting((along - mean_x) * per_sd - across)
     back = np.flatnonzero(node[-1] * np.abs(tilt) - mean_x * per_sd > -_REACH)
     if back.size:
-        found[back] -= weight @ _normal_cdf_from_table(
+        found[back] -= weight @ _normal_cdf_overwriting(
             (-along[:, back] - mean_x[back]) * per_sd[back] - across[:, back]
         )
     return np.asarray(found)
 
 
-def _mass_along_long_axis(
+def _mass_in_disc_by_long_chords(
     d: FloatArray,
     var_r: FloatArray,
     var_t: FloatArray,
@@ -504,7 +508,11 @@ def _mass_along_long_axis(
     reach: float,
     rule: tuple[FloatArray, FloatArray],
 ) -> FloatArray:
-    """Integrate along the long axis; across it y = sin(4 arctan u), which removes the root at the end of the chords."""
+    """Return the mass of Gaussians in the unit disc, (n_pairs,), from chords along the long axis of each Gaussian.
+
+    The integral along them is exact; across them it is a quadrature in u, where y = sin(4 arctan u) removes the root at
+    the end of the chords.
+    """
     half, spread = 0.5 * (var_r + var_t), 0.5 * (var_r - var_t)
     twist = np.hypot(spread, cov)
     long = np.sqrt(half + twist)
@@ -519,8 +527,8 @@ def _mass_along_long_axis(
     x = 1 - 2 * sine * sine
     y = 2 * sine * (1 - u * u) * widen
     per_long = 1 / long
-    inner = _normal_cdf_from_table((x - mean_x) * per_long)
-    inner -= _normal_cdf_from_table((-x - mean_x) * per_long)
+    inner = _normal_cdf_overwriting((x - mean_x) * per_long)
+    inner -= _normal_cdf_overwriting((-x - mean_x) * per_long)
     y -= mean_y
     y /= short
     inner *= np.exp(-0.5 * y * y) * x * widen
@@ -542,16 +550,16 @@ def _hermite_rule(n_nodes: int) -> tuple[FloatArray, FloatArray]:
     return node, weight / weight.sum()
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_mixture(region: MixtureOfRegions, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Integrate each hypothesis by the rule for its kind of region."""
     out = np.empty(np.broadcast_shapes(gaussian.shape, (region.n_regions, 1)))
     for rows, part in region.rows_and_regions():
-        out[rows] = seen_by_one(part, gaussian.take(rows), n_nodes)
+        out[rows] = mean_albedo_under_one(part, gaussian.take(rows), n_nodes)
     return out
 
 
-@seen_by_one.register
+@mean_albedo_under_one.register
 def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
     """Return an image's mean albedo: exact along x in each row of pixels, by Gauss-Legendre in panels across it."""
     shape = gaussian.shape
@@ -561,7 +569,7 @@ def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes:
         np.broadcast_to(gaussian.y_mm + gaussian.dy_mm, shape),
     )
     for i, j in np.ndindex(*shape):
-        out[i, j] = _mean_albedo_of_image(
+        out[i, j] = _image_albedo_under_one(
             region,
             float(x[i, j]),
             float(y[i, j]),
@@ -572,7 +580,7 @@ def _mean_albedo_over_image(region: ImageRegion, gaussian: LabGaussian, n_nodes:
     return out
 
 
-def _mean_albedo_of_image(region: ImageRegion, x: float, y: float, var_x: float, var_y: float, cov: float) -> float:
+def _image_albedo_under_one(region: ImageRegion, x: float, y: float, var_x: float, var_y: float, cov: float) -> float:
     n_rows, n_columns = region.values.shape
     pixel = region.pixel_mm
     sd_y = float(np.sqrt(var_y))

@@ -229,14 +229,14 @@ class DiscreteSSF:
         return ()
 
     def footprint(self, theta: FloatArray) -> Footprint:
-        """Return the single Gaussian with the field's mean and covariance."""
+        """Return the single Gaussian with the field's mean and covariance, negative values left out."""
         return mixture_of_field(self.field).footprint(theta)
 
 
-def field_of(
+def mean_ssf_field(
     footprint: Footprint, *, u_mm: FloatArray, v_mm: FloatArray, weights: FloatArray | None = None
 ) -> SSFField:
-    """Evaluate sampled SSFs at pixel centres and average these fields (not the parameters) over the samples.
+    """Return the mean field of sampled SSFs, evaluated at pixel centres: a mean of fields, not of parameters.
 
     Parameters
     ----------
@@ -279,8 +279,8 @@ def field_of(
         # Conditioning v on u leaves one exponential per Gaussian and pixel.
         slope = cov[n] / var_u[n]
         var_free = var_v[n] - slope * cov[n]
-        across = _pixels_reached(u_mm, mu[n], np.sqrt(var_u[n]))
-        up = _pixels_reached(v_mm, mv[n], np.sqrt(var_v[n]))
+        across = _reached_slice(u_mm, mu[n], np.sqrt(var_u[n]))
+        up = _reached_slice(v_mm, mv[n], np.sqrt(var_v[n]))
         off_u = u_mm[across] - mu[n]
         own = (v_mm[up] - mv[n])[:, None] - slope * off_u
         own *= own
@@ -293,8 +293,8 @@ def field_of(
     return SSFField(total, pixel, (float(u_mm[0]), float(v_mm[0])))
 
 
-def _pixels_reached(centres: FloatArray, mean: float, sd: float) -> slice:
-    """Find the pixels that a Gaussian reaches."""
+def _reached_slice(centres: FloatArray, mean: float, sd: float) -> slice:
+    """Return the slice of the pixel centres, along one axis, that a Gaussian reaches."""
     return slice(*np.searchsorted(centres, [mean - _REACH * sd, mean + _REACH * sd]))
 
 
@@ -315,7 +315,7 @@ def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_g
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    `total_variation` of the two bounds the error of any response.
+    Negative values of the field count as 0. `total_variation` of the two bounds the error of any response.
     """
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
@@ -355,14 +355,14 @@ def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gauss
     w = w / w.sum()
     flat_covs = covs.reshape(len(w), 4)
 
-    def moments(share: FloatArray) -> tuple[float, FloatArray, FloatArray]:
+    def mass_mean_covariance(share: FloatArray) -> tuple[float, FloatArray, FloatArray]:
         mass = float(share.sum())
         mean = share @ means / mass
         off = means - mean
         cov = (share @ flat_covs).reshape(2, 2) / mass + (share[:, None] * off).T @ off / mass
         return mass, mean, cov
 
-    _, mean, cov = moments(w)
+    _, mean, cov = mass_mean_covariance(w)
     if n_gaussians == 1:
         return FixedMixture(np.ones(1), mean[None], cov[None])
     # Start from Gaussians of increasing width, spread along the principal axis.
@@ -387,7 +387,7 @@ def _merge_gaussians(w: FloatArray, means: FloatArray, covs: FloatArray, n_gauss
         alive = shares.sum(axis=0) > 1e-9
         shares = shares[:, alive]
         n_gaussians = int(alive.sum())
-        fitted = [moments(shares[:, k]) for k in range(n_gaussians)]
+        fitted = [mass_mean_covariance(shares[:, k]) for k in range(n_gaussians)]
         weights = np.array([f[0] for f in fitted])
         centers = np.array([f[1] for f in fitted])
         shapes = np.array([f[2] for f in fitted]) + floor

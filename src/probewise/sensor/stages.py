@@ -155,12 +155,12 @@ AnyEffect = Effect[Any]
 E = TypeVar("E", bound=AnyEffect)
 
 
-def names_of_effects(effects: Iterable[AnyEffect]) -> Iterator[str]:
-    """Name the parameters of effects as "effect.parameter", one per column of theta."""
+def parameter_names_of_effects(effects: Iterable[AnyEffect]) -> Iterator[str]:
+    """Return the names of the effects' parameters as "effect.parameter", one per column of theta."""
     return (f"{effect.name}.{name}" for effect in effects for name in effect.prior.names)
 
 
-def columns_of_effects(effects: Sequence[E], first: int = 0) -> list[tuple[E, slice]]:
+def effects_with_columns(effects: Sequence[E], first: int = 0) -> list[tuple[E, slice]]:
     """Return each effect with its columns of theta, which follow one another from column `first` on."""
     ends = accumulate((len(effect.prior.names) for effect in effects), initial=first)
     return [(effect, slice(*both)) for effect, both in zip(effects, pairwise(ends), strict=True)]

@@ -13,8 +13,13 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.scene.regions import HalfPlaneRegion, QuadrantRegion
-from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf_in_place
-from probewise.sensor.gaussian import LabGaussian, mass_in_quadrant, probabilities_beyond_corner, turn_into_lab_frame
+from probewise.sensor._normal import CENTRE, PER_SD, normal_cdf_of_cells_in_place
+from probewise.sensor.gaussian import (
+    LabGaussian,
+    mass_in_quadrant,
+    probabilities_beyond_corner_and_sides,
+    turn_into_lab_frame,
+)
 from probewise.sensor.stages import Footprint, Poses
 
 _BLOCK = 2**14  # elements at a time: they fit the cache
@@ -51,7 +56,7 @@ class StraightEdges:
         of = np.repeat(np.arange(len(parts)), [len(r) for r, _ in parts])
         normal = np.array([region.normal_rad[0] for _, region in parts])[of]
         offset = np.array([region.offset_mm[0] for _, region in parts])[of]
-        x, y, orientation = (columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
+        x, y, orientation = (select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))
         return cls(
             rows,
             np.broadcast_to(normal - orientation[0], rows.shape),
@@ -87,29 +92,29 @@ class StraightEdges:
         weight, *moments = (self._own_columns(a) for a in (footprint.weight, *footprint.moments))
         varies = _varies_with_reading(footprint)
         angles, which = (self.turn_rad, None) if varies else np.unique(self.turn_rad, return_inverse=True)
-        per_sd, shift = np.broadcast_arrays(*_projected_on_axes(angles[:, None], *moments))
+        per_sd, shift = np.broadcast_arrays(*_inverse_sd_and_mean_on_axes(angles[:, None], *moments))
         share[:] = 0.0
         step = max(1, _BLOCK // len(self.rows))
         for start in range(0, len(share), step):
             block = slice(start, start + step)
-            distance = _hypotheses_in_block(self.distance_mm, block)
+            distance = _select_hypotheses(self.distance_mm, block)
             for g in range(footprint.weight.shape[2]):
                 own_shift, own_per_sd = (
-                    _hypotheses_in_block(shift, block)[:, :, g],
-                    _hypotheses_in_block(per_sd, block)[:, :, g],
+                    _select_hypotheses(shift, block)[:, :, g],
+                    _select_hypotheses(per_sd, block)[:, :, g],
                 )
                 if which is not None:
                     own_shift, own_per_sd = own_shift[:, which], own_per_sd[:, which]
                 cells = own_shift + distance
                 cells = cells * (own_per_sd * PER_SD)
                 cells += CENTRE
-                normal_cdf_in_place(cells)
-                share[block] += cells * _hypotheses_in_block(weight, block)[:, :, g]
+                normal_cdf_of_cells_in_place(cells)
+                share[block] += cells * _select_hypotheses(weight, block)[:, :, g]
 
     def _own_columns(self, array: FloatArray) -> FloatArray:
         """Select the columns of these readings, as a view where they are contiguous."""
         if self._contiguous_rows is None or array.shape[1] == 1:
-            return columns_of_readings(array, self.rows)
+            return select_reading_columns(array, self.rows)
         return array[:, self._contiguous_rows]
 
 
@@ -152,8 +157,8 @@ class _DistinctEdgeViews:
 
         Gaussians are projected once per angle and mapped to the views by a matrix product, block by block.
         """
-        weight, *moments = _with_samples_last(footprint)
-        per_sd, shift = _projected_on_axes(self.angle_rad[:, None, None], *moments)
+        weight, *moments = _weight_and_moments_samples_last(footprint)
+        per_sd, shift = _inverse_sd_and_mean_on_axes(self.angle_rad[:, None, None], *moments)
         n_angles, n_gaussians, n_samples = np.broadcast(per_sd, shift, weight).shape
         both = np.empty((2 * n_angles, n_gaussians, n_samples))
         both[:n_angles] = per_sd * PER_SD
@@ -169,7 +174,7 @@ class _DistinctEdgeViews:
             else:
                 cells = here[..., self.which] * self.distance_mm
                 cells += here[..., n_angles + self.which]
-            normal_cdf_in_place(cells)
+            normal_cdf_of_cells_in_place(cells)
             cells *= weight[:, start : start + step]
             seen = cells.sum(axis=0).take(self.view, axis=1, mode="clip")  # "clip" spares the check of bounds
             seen *= self.gain
@@ -198,7 +203,7 @@ class StraightCorners:
             np.concatenate([region.direction for _, region in parts])[of],
             np.array([region.inside for _, region in parts])[of],
             np.array([region.outside for _, region in parts])[of],
-            Poses(*(columns_of_readings(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))),
+            Poses(*(select_reading_columns(a, rows) for a in (poses.x_mm, poses.y_mm, poses.orientation_rad))),
         )
 
     @cached_property
@@ -213,14 +218,14 @@ class StraightCorners:
             out[:, self.rows] = self._distinct_views.response(footprint)
             return
         moved = turn_into_lab_frame(
-            poses.orientation_rad[..., None], *(columns_of_readings(a, self.rows) for a in footprint.moments)
+            poses.orientation_rad[..., None], *(select_reading_columns(a, self.rows) for a in footprint.moments)
         )
         gaussians = LabGaussian(
             poses.x_mm[..., None], poses.y_mm[..., None], *moved
         )  # (n_samples, n_rows, n_gaussians)
         (corner_x, corner_y), (to_x, to_y) = self.corner_mm.T[..., None], self.direction.T[..., None]
         found = mass_in_quadrant(corner_x, corner_y, to_x, to_y, gaussians)
-        share = (found * columns_of_readings(footprint.weight, self.rows)).sum(axis=2)
+        share = (found * select_reading_columns(footprint.weight, self.rows)).sum(axis=2)
         out[:, self.rows] = self.outside + (self.inside - self.outside) * share
 
 
@@ -257,11 +262,11 @@ class _DistinctCornerViews:
 
     def response(self, footprint: Footprint) -> FloatArray:
         """Compute the responses to a footprint that is the same at all readings, (n_samples or 1, n_rows)."""
-        weight, *moments = _with_samples_last(footprint)
+        weight, *moments = _weight_and_moments_samples_last(footprint)
         turn, x, y = (a[:, None, None] for a in (self.turn_rad, self.x_mm, self.y_mm))
         dx, dy, var_x, var_y, cov_xy = turn_into_lab_frame(turn, *moments)
         sd_x, sd_y = np.sqrt(var_x), np.sqrt(var_y)
-        shares = probabilities_beyond_corner((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
+        shares = probabilities_beyond_corner_and_sides((x - dx) / sd_x, (y - dy) / sd_y, cov_xy / (sd_x * sd_y))
         # Sum over the Gaussians: (n_views, n_gaussians, n_samples) each -> (3 n_views, n_samples).
         beyond = np.concatenate([(share * weight).sum(axis=1) for share in shares])
         return np.asarray(beyond.T @ self.readings_from_masses + self.low)
@@ -272,25 +277,25 @@ def _varies_with_reading(footprint: Footprint) -> bool:
     return any(a.shape[1] > 1 for a in (footprint.weight, *footprint.moments))
 
 
-def _with_samples_last(footprint: Footprint) -> tuple[FloatArray, ...]:
+def _weight_and_moments_samples_last(footprint: Footprint) -> tuple[FloatArray, ...]:
     """Return weight and moments of a footprint that is the same at all readings, (n_gaussians, n_samples or 1) each."""
     return tuple(a[:, 0].T for a in (footprint.weight, *footprint.moments))
 
 
-def _projected_on_axes(
+def _inverse_sd_and_mean_on_axes(
     angle_rad: FloatArray, u_mm: FloatArray, v_mm: FloatArray, var_u: FloatArray, var_v: FloatArray, cov_uv: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Project Gaussians on axes at these angles; return 1/sd and mean; the arrays broadcast."""
+    """Return 1/sd and mean of Gaussians projected on axes at these angles; the arrays broadcast."""
     c, s = np.cos(angle_rad), np.sin(angle_rad)
     variance = c * c * var_u + s * s * var_v + 2 * c * s * cov_uv
     return np.asarray(1 / np.sqrt(variance)), c * u_mm + s * v_mm
 
 
-def _hypotheses_in_block(array: FloatArray, block: slice) -> FloatArray:
+def _select_hypotheses(array: FloatArray, block: slice) -> FloatArray:
     """Select a block of hypotheses from an array whose sample axis may be 1."""
     return array if array.shape[0] == 1 else array[block]
 
 
-def columns_of_readings(array: FloatArray, rows: IntArray) -> FloatArray:
+def select_reading_columns(array: FloatArray, rows: IntArray) -> FloatArray:
     """Select the columns of the readings `rows` from an array whose point axis may be 1."""
     return array if array.shape[1] == 1 else array[:, rows]

@@ -21,7 +21,7 @@ from probewise.recordings.plan import Plan
 from probewise.recordings.prediction import prediction_summary
 from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import NoiseLevel, Stage
-from probewise.sensor.stages import columns_of_effects
+from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
@@ -292,7 +292,7 @@ def _noise_level(
         typical = float(np.median(values[np.isfinite(values) & (values > 0)]))
         sd = sd * relative_sds_of_column(table, declared, typical)
     level = NoiseLevel(sd, np.zeros((1, 1)), seen=seen)
-    for effect, columns in columns_of_effects(chain.effects, chain.system.n_params):
+    for effect, columns in effects_with_columns(chain.effects, chain.system.n_params):
         if effect.stage is Stage.NOISE:
             level = effect.apply(level, theta[:, columns], cast(Any, table))
     return level

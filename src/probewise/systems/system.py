@@ -16,7 +16,7 @@ from probewise.effects import NamedEffect
 from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
-from probewise.sensor.stages import columns_of_effects, names_of_effects
+from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 from probewise.systems.all_steps import TrajectoryCache, integrate_near, steps_of
 from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.mistakes import user_function_error
@@ -307,7 +307,7 @@ class SystemChain:
     @property
     def names(self) -> tuple[str, ...]:
         """The system's parameters, then each effect's as "effect.parameter"."""
-        return (*self.system.prior.names, *names_of_effects(self.effects))
+        return (*self.system.prior.names, *parameter_names_of_effects(self.effects))
 
     def predict(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Return noise-free readings: theta (n_samples, n_params) -> (n_samples, n_points)."""
@@ -395,4 +395,4 @@ class SystemChain:
 
     @cached_property
     def _columns_of_effects(self) -> list[tuple[AnyEffect, slice]]:
-        return columns_of_effects(self.effects, self.system.n_params)
+        return effects_with_columns(self.effects, self.system.n_params)

@@ -17,7 +17,7 @@ from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.effects import NamedEffect
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import FAST_NODES, footprint_of
-from probewise.sensor.stages import columns_of_effects
+from probewise.sensor.stages import effects_with_columns
 
 _STEP = 1e-5  # of a coordinate, for forward differences: predictions are smooth to about 1e-12
 _AT_ONCE = 300_000  # predictions per batch, to fit a processor's cache
@@ -66,7 +66,7 @@ class Model:
 
     def coordinates_of(self, name: str) -> slice:
         """Return the slice of one effect's coordinates."""
-        return {effect.name: own for effect, own in columns_of_effects(self.effects, self.sensor.n_params)}[name]
+        return {effect.name: own for effect, own in effects_with_columns(self.effects, self.sensor.n_params)}[name]
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to the chain's parameters."""

@@ -19,7 +19,7 @@ from probewise.diagnosis.fitting.coordinates import (
     natural_to_theta,
     theta_to_natural,
 )
-from probewise.sensor import N_BENDS, N_FREE_FORM, bends_of, free_form
+from probewise.sensor import N_BENDS, N_FREE_FORM, bends_of, free_form_parameters
 
 _SHARE = 0.1  # prior sd of each weight, as a share of the mass
 
@@ -64,7 +64,7 @@ class FreeForm(CalibratedSensor):
     def from_natural(self, natural: FloatArray) -> FloatArray:
         """Map natural coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
         one = natural_to_theta(natural[:, :-N_BENDS], 1)
-        return np.concatenate([free_form(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
+        return np.concatenate([free_form_parameters(one[:, :6], natural[:, -N_BENDS:]), one[:, 6:]], axis=1)
 
     def to_natural(self, theta: FloatArray) -> FloatArray:
         """Invert `from_natural`."""

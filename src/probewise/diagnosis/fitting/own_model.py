@@ -19,7 +19,7 @@ from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Prior, require_prior
 from probewise.recordings.plan import Plan
 from probewise.sensor import AnyEffect, Stage
-from probewise.sensor.stages import columns_of_effects, names_of_effects
+from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
 
 Parameters: TypeAlias = Mapping[str, FloatArray]
 """Parameters by name, each (n_samples, 1)."""
@@ -106,7 +106,7 @@ class _OwnChain:
     @property
     def names(self) -> tuple[str, ...]:
         """The model's parameters, then each effect's as "effect.parameter"."""
-        return (*self.model.prior.names, *names_of_effects(self.effects))
+        return (*self.model.prior.names, *parameter_names_of_effects(self.effects))
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
@@ -139,4 +139,4 @@ class _OwnChain:
     @cached_property
     def _theta_columns(self) -> list[tuple[AnyEffect, slice]]:
         """Columns of theta that belong to each effect."""
-        return columns_of_effects(self.effects, self.model.n_params)
+        return effects_with_columns(self.effects, self.model.n_params)

@@ -15,7 +15,7 @@ from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
 from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
-from probewise.sensor.stages import NoiseLevel, columns_of_effects
+from probewise.sensor.stages import NoiseLevel, effects_with_columns
 
 _FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
 _MANY = 12  # nodes of one effect above which they are thinned before combination with another's
@@ -67,7 +67,7 @@ class NoiseModel:
 
     def columns_of(self, name: str) -> slice:
         """Return the columns of one effect's settings."""
-        return {effect.name: own for effect, own in columns_of_effects(self.effects)}[name]
+        return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
     def every_third(self) -> dict[str, tuple[FloatArray, FloatArray]]:
         """Thin the nodes of each effect with more than twelve to every third, for `likely`."""
@@ -119,7 +119,7 @@ class NoiseModel:
         everywhere = np.zeros((1, len(plan)))
         everywhere[0, usable] = seen
         level = NoiseLevel(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
-        for effect, own in columns_of_effects(self.effects):
+        for effect, own in effects_with_columns(self.effects):
             level = effect.apply(level, settings[:, own], plan)
         return level
 

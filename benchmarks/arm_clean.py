@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import binomtest
 
-from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of, shipped_geometry
+from probewise.arm import ReadingScale, carry_out, read_geometry, recording_of, shipped_geometry_path
 from probewise.cli._bench import Bench
 from probewise.cli._plans import plan_for_lego_arm
 from probewise.diagnosis import diagnose
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     given = parser.parse_args()
     document: dict[str, object] = {"seeds": given.seeds}
-    text = shipped_geometry().read_text(encoding="utf-8")
+    text = shipped_geometry_path().read_text(encoding="utf-8")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         for label, play in (("with play", None), ("without play", "0")):

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from probewise.arm import LegoArm, Pose, Reading, read_geometry, shipped_geometry
+from probewise.arm import LegoArm, Pose, Reading, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link, Timing
 from probewise.calibration import FittedSensor
 from probewise.emulator import Bench, Faults, SensorPose, VirtualClock, VirtualLine, set_up_bench
@@ -59,7 +59,7 @@ FAULTS = {
 """More often than on a bad day; the battery is empty after six minutes."""
 
 TRUTH = (600.0, 250.0, 120.0)
-GEOMETRY = read_geometry(shipped_geometry())
+GEOMETRY = read_geometry(shipped_geometry_path())
 MAX_READINGS = 60
 MAX_SESSIONS = 200
 QUIET_S = 10.0  # the longest limited move, with its run-on
@@ -199,7 +199,7 @@ def bench_with(faults: Faults, clock: VirtualClock, *, seed: int) -> tuple[Bench
     log = BrickLog()
     circle = Disc(TRUTH[:2], TRUTH[2])
     log.bench = set_up_bench(
-        read_numbers(shipped_geometry()), WORLD, circle, clock, seed=seed, faults=faults, trace=log
+        read_numbers(shipped_geometry_path()), WORLD, circle, clock, seed=seed, faults=faults, trace=log
     )
     return log.bench, log
 

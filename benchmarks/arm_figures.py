@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
+from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import JOINTS
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.emulator import VirtualClock, VirtualLine, set_up_bench
@@ -32,14 +32,16 @@ class AnySide(BrickMachine):
     """Comes to each count from the side it happens to be on, as one who knows nothing of the play would."""
 
     def move_to(self, joint, goal, side):
-        super().move_to(joint, goal, 1 if goal >= self.limits.counts[joint] else -1)
+        super().move_to(joint, goal, 1 if goal >= self.limits.last_counts[joint] else -1)
 
 
 def run(machine_type: type[BrickMachine], places_mm: np.ndarray, *, seed: int) -> dict[str, float]:
     """Measure at every place; return means over the measurements, errors as root mean squares."""
     clock = VirtualClock()
-    bench = set_up_bench(read_numbers(shipped_geometry()), truth("paper"), Disc((524.0, 260.0), 80.0), clock, seed=seed)
-    geometry = read_geometry(shipped_geometry())
+    bench = set_up_bench(
+        read_numbers(shipped_geometry_path()), truth("paper"), Disc((524.0, 260.0), 80.0), clock, seed=seed
+    )
+    geometry = read_geometry(shipped_geometry_path())
     if machine_type is AnySide:
         rigid = {name: replace(joint, play_rad=0.0) for name, joint in zip(JOINTS, geometry.joints, strict=True)}
         geometry = replace(geometry, lowest_mm=1.0, **rigid)  # from below it comes lower
@@ -84,7 +86,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     rng = np.random.default_rng(arguments.seed)
-    geometry = read_geometry(shipped_geometry())
+    geometry = read_geometry(shipped_geometry_path())
     anywhere = rng.uniform((0.0, 0.0), geometry.field_mm, (20 * arguments.readings, 2))
     places = anywhere[geometry.contains(anywhere)][: arguments.readings]
     line = np.column_stack([np.linspace(474.0, 574.0, arguments.readings), np.full(arguments.readings, 260.0)])

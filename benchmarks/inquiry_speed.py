@@ -100,7 +100,7 @@ def other_shape(name: str, run: int) -> list[dict[str, float]]:
         place = replace(place, x_mm=np.array([pose.x_mm]), y_mm=np.array([pose.y_mm]))
         return float(chain.predict(truth, place)[0, 0] + rng.standard_normal())
 
-    return follow(SimulatedArm(light, reach=Reach.everywhere(), scale=None), experiment, run)
+    return follow(SimulatedArm(light, reach=Reach.over_whole_field(), scale=None), experiment, run)
 
 
 def medians(rows: list[dict[str, float]]) -> dict[str, float]:

@@ -105,7 +105,7 @@ def test_both_say_and_hear_the_same(call, command, body, ours):
     heard = call(Brick(socket))
     (sent,) = socket.sent
     assert encode(command, wants_reply=not sent[0] & 0x80) == sent
-    assert ours(command.answer(decode(bytes([2, command.OPCODE, 0]) + socket.body))) == heard
+    assert ours(command.decode_answer(decode(bytes([2, command.OPCODE, 0]) + socket.body))) == heard
 
 
 def test_every_command_was_compared():

@@ -14,7 +14,7 @@ from probewise.arm.nxt import (
     SensorError,
     SerialPort,
     TelegramError,
-    normalized_of,
+    normalized_from_counts,
 )
 from probewise.errors import LinkError, LowBatteryWarning, ParameterError
 
@@ -44,22 +44,22 @@ def test_whole_percent_are_the_fine_ones_without_their_fraction():
 
 
 def test_only_697_values_occur():
-    assert len({normalized_of(raw) for raw in range(1024)}) == 697
+    assert len({normalized_from_counts(raw) for raw in range(1024)}) == 697
 
 
 @pytest.mark.parametrize("raw", [-1, 1024])
 def test_counts_that_no_converter_gives_are_refused(raw):
     with pytest.raises(ParameterError, match="0 to 1023"):
-        normalized_of(raw)
+        normalized_from_counts(raw)
 
 
 def test_a_reading_that_is_not_valid_yet_is_left_out(brick, paper_brick):
     """For a while after a change of type the brick shows the old value; here it is 1000 counts."""
     light = brick.light(1)
-    light.light_up()
+    light.set_led()
     assert light.read().raw_counts == 500
     assert paper_brick.input[:2] == [5, 0]
-    light.light_up(False)
+    light.set_led(False)
     assert light.read().raw_counts == 500
     assert paper_brick.input[:2] == [6, 0]
 
@@ -71,7 +71,7 @@ def test_the_led_is_on_unless_it_was_switched_off(brick, paper_brick):
 
 def test_a_sensor_that_a_program_has_reset_is_set_up_again(brick, paper_brick, clock):
     light = brick.light(1)
-    light.light_up(False)
+    light.set_led(False)
     paper_brick.input = [0, 0, 0.0]
     assert light.read().raw_counts == 500
     assert paper_brick.input[:2] == [6, 0]
@@ -79,7 +79,7 @@ def test_a_sensor_that_a_program_has_reset_is_set_up_again(brick, paper_brick, c
 
 def test_a_sensor_that_never_becomes_valid_is_told_of(paper_brick, clock):
     light = Light(Link(paper_brick, clock=clock), 1, clock=clock)
-    light.light_up()
+    light.set_led()
     paper_brick.input[2] = 1e9
     with pytest.raises(SensorError, match=r"input 2 gave no valid reading for 1 s; is the light sensor plugged in\?"):
         light.read()
@@ -97,14 +97,14 @@ def test_a_byte_of_a_reading_that_was_changed_on_its_way_changes_no_reading(bric
     light = brick.light(1)
     assert light.read().raw_counts == 500
     paper_brick.alter[len(paper_brick.commands)] = changed(at, byte)
-    assert light.read().normalized == normalized_of(500)
+    assert light.read().normalized == normalized_from_counts(500)
 
 
 def test_a_sensor_beyond_its_converter_s_range_is_a_link_error(brick, paper_brick, clock):
     """It keeps the run: see `test_runs`. The question is asked three times, then given up."""
     paper_brick.raw_counts = 1024
     light = brick.light(1)
-    light.light_up()
+    light.set_led()
     clock.sleep(1.0)
     before = len([body for body in paper_brick.commands if body[1] == 0x07])
     with pytest.raises(TelegramError, match=r"input 2 says .* 1024 counts; allowed: 0 or 1, 0, 0 to 1023"):
@@ -179,7 +179,7 @@ def test_leaving_the_block_stops_and_releases_the_motors_and_switches_the_led_of
     """Each once without an answer, which needs nothing to be heard, and once to be sure."""
     with brick:
         brick.motor(0).move_to(500, 1)
-        brick.light(2).light_up()
+        brick.light(2).set_led()
     dark = bytes.fromhex("05 02 00 00")
     ends = [(body[0], body[1:]) for body in paper_brick.commands[-4:]]
     assert ends == [(0x80, ALL_COAST), (0x80, dark), (0x00, ALL_COAST), (0x00, dark)]
@@ -192,7 +192,7 @@ def test_leaving_the_block_stops_and_releases_the_motors_and_switches_the_led_of
 def test_a_refusal_of_one_end_keeps_nothing_from_the_other(brick, paper_brick, refused):
     def run():
         with brick:
-            brick.light(2).light_up()
+            brick.light(2).set_led()
             paper_brick.motors[1].command(100.0, 50, 0x20, 0)
             paper_brick.statuses = {refused: 0xDE}
 
@@ -208,7 +208,7 @@ def test_motors_and_led_are_off_also_where_no_answer_comes(brick, paper_brick):
 
     def run():
         with brick:
-            brick.light(2).light_up()
+            brick.light(2).set_led()
             paper_brick.motors[1].command(100.0, 50, 0x20, 0)
             paper_brick.lose = dict.fromkeys(range(len(paper_brick.commands), 10**3), "answer")
 

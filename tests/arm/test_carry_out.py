@@ -6,11 +6,11 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import DryRun, LegoArm, Pose, Reading, carry_out, read_geometry, recording_of, shipped_geometry
+from probewise.arm import DryRun, LegoArm, Pose, Reading, carry_out, read_geometry, recording_of, shipped_geometry_path
 from probewise.errors import ParameterError, ReachError
 from probewise.recordings import paper_plan, read_recording, two_way_plan, write_recording
 
-GEOMETRY = read_geometry(shipped_geometry())
+GEOMETRY = read_geometry(shipped_geometry_path())
 ORIGIN = (524.0, 260.0)
 
 

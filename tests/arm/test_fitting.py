@@ -6,14 +6,14 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import read_geometry, shipped_geometry
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.fitting import MarksDisagreeError, fit_geometry
-from probewise.arm.geometry_file import with_fitted
-from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
+from probewise.arm.geometry_file import text_with_fitted_values
+from probewise.arm.mark_file import TouchedMark, read_turns_and_places, write_marks
 from probewise.arm.marks import places_of_marks
 from probewise.errors import FileError, ParameterError, ShapeError
 
-GEOMETRY = read_geometry(shipped_geometry())
+GEOMETRY = read_geometry(shipped_geometry_path())
 BLOCK_MM = 32.0
 
 
@@ -48,7 +48,7 @@ def touched(true, *, noise_mm=0.0, rng=None, marks=None):
 
 def errors_mm(fitted, true):
     """Where the sensor really is, less where it is sent, all over the field: (n, 3)."""
-    places = GEOMETRY.places_over_field_mm
+    places = GEOMETRY.reachable_grid_mm
     places = places[fitted.contains(places)]
     angles = fitted.angles_rad(places, GEOMETRY.read_height_mm) - homes(fitted) + homes(true)
     return true.position_mm(angles) - np.column_stack([places, np.full(len(places), GEOMETRY.read_height_mm)])
@@ -121,9 +121,9 @@ def test_marks_that_do_not_determine_the_geometry_are_refused():
 
 
 def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
-    text = shipped_geometry().read_text(encoding="utf-8")
+    text = shipped_geometry_path().read_text(encoding="utf-8")
     fitted = fit_geometry(GEOMETRY, *touched(built())).geometry
-    (tmp_path / "arm.toml").write_text(with_fitted(text, fitted), encoding="utf-8")
+    (tmp_path / "arm.toml").write_text(text_with_fitted_values(text, fitted), encoding="utf-8")
     back = read_geometry(tmp_path / "arm.toml")
     assert "# shoulder to elbow" in (tmp_path / "arm.toml").read_text(encoding="utf-8")
     assert back.accuracy.marks == len(places_of_marks(GEOMETRY))
@@ -136,27 +136,27 @@ def test_the_file_keeps_its_comments_and_reads_back_as_fitted(tmp_path):
     # What a motor may turn is as it was: limits are counted from home.
     for was, is_ in zip(GEOMETRY.joints, back.joints, strict=True):
         assert is_.high_rad - is_.home_rad == pytest.approx(was.high_rad - was.home_rad, abs=1e-5)
-    again = with_fitted((tmp_path / "arm.toml").read_text(encoding="utf-8"), fitted)
+    again = text_with_fitted_values((tmp_path / "arm.toml").read_text(encoding="utf-8"), fitted)
     assert again.count("[accuracy]") == 1
 
 
 def test_marks_come_back_from_their_file(tmp_path):
     marks = [TouchedMark((0.1, -0.2, 0.3), (100.0, 60.0, 32.0)), TouchedMark((0.4, 0.5, -0.6), (520.0, 60.0, math.nan))]
     write_marks(marks, tmp_path / "m.csv")
-    turned, places = read_marks(tmp_path / "m.csv")
+    turned, places = read_turns_and_places(tmp_path / "m.csv")
     np.testing.assert_allclose(turned, [mark.turned_rad for mark in marks], atol=1e-6)
     np.testing.assert_array_equal(places, [mark.place_mm for mark in marks])
     (tmp_path / "m.csv").write_text("x_mm,y_mm\n1,2\n")
     with pytest.raises(FileError, match="base_turned_deg"):
-        read_marks(tmp_path / "m.csv")
+        read_turns_and_places(tmp_path / "m.csv")
 
 
 def test_what_a_wrong_home_costs_is_told_from_the_geometry():
     """Both links two degrees off, worked out by moving them; a fitted geometry knows better."""
-    places = GEOMETRY.places_over_field_mm
+    places = GEOMETRY.reachable_grid_mm
     angles = GEOMETRY.angles_rad(places, 14.0)
     lower = angles - np.radians([0.0, 2.0, 2.0])
     sinks = 14.0 - GEOMETRY.position_mm(lower)[:, 2]
-    assert GEOMETRY.height_doubt_mm == pytest.approx(sinks.max(), rel=0.05)
+    assert GEOMETRY.max_height_error_mm == pytest.approx(sinks.max(), rel=0.05)
     fitted = fit_geometry(GEOMETRY, *touched(built())).geometry
-    assert fitted.height_doubt_mm == 2 * fitted.accuracy.height_sd_mm < 6
+    assert fitted.max_height_error_mm == 2 * fitted.accuracy.height_sd_mm < 6

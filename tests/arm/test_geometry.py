@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from probewise.arm import Geometry, Joint, read_geometry, shipped_geometry
+from probewise.arm import Geometry, Joint, read_geometry, shipped_geometry_path
 from probewise.errors import FileError, ParameterError, ShapeError
 
-SHIPPED = read_geometry(shipped_geometry())
+SHIPPED = read_geometry(shipped_geometry_path())
 RELATIVE = dataclasses.replace(
     SHIPPED, elbow_is_relative=True, elbow=dataclasses.replace(SHIPPED.elbow, low_rad=-3.1, high_rad=0.0)
 )
@@ -160,7 +160,7 @@ SPOILED = [
 
 @pytest.mark.parametrize(("line", "instead", "says"), SPOILED, ids=[f"{k} {s[1]!r}" for k, s in enumerate(SPOILED)])
 def test_a_file_that_cannot_be_used_is_refused_with_the_entry_named(tmp_path, line, instead, says):
-    text = shipped_geometry().read_text()
+    text = shipped_geometry_path().read_text()
     assert line in text
     path = tmp_path / "mine.toml"
     path.write_text(text.replace(line, instead, 1))
@@ -178,10 +178,10 @@ def test_a_file_that_is_not_there_or_not_text_is_refused(tmp_path):
 
 
 def test_the_examples_hold_the_shipped_file():
-    example = shipped_geometry().parents[3] / "examples" / "lego_arm.toml"
+    example = shipped_geometry_path().parents[3] / "examples" / "lego_arm.toml"
     if not example.exists():
         pytest.skip("no examples beside an installed package")
-    assert example.read_text() == shipped_geometry().read_text()
+    assert example.read_text() == shipped_geometry_path().read_text()
 
 
 @pytest.mark.parametrize(
@@ -207,6 +207,6 @@ def test_the_count_at_a_stop_has_the_play_on_its_side(stop_rad, side, counts):
 
 
 def test_a_stop_is_read_from_the_file(tmp_path):
-    text = shipped_geometry().read_text().replace("play_deg = 0.3", "play_deg = 0.3\nstop_deg = -193")
+    text = shipped_geometry_path().read_text().replace("play_deg = 0.3", "play_deg = 0.3\nstop_deg = -193")
     (tmp_path / "mine.toml").write_text(text)
     assert read_geometry(tmp_path / "mine.toml").base.stop_rad == pytest.approx(math.radians(-193))

@@ -17,12 +17,12 @@ from probewise.arm import (
     SimulatedArm,
     SoftLimits,
     read_geometry,
-    shipped_geometry,
+    shipped_geometry_path,
 )
 from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
 from probewise.errors import LinkError, ReachError
 
-SHIPPED = read_geometry(shipped_geometry())
+SHIPPED = read_geometry(shipped_geometry_path())
 PLACES = [(300.0, 200.0), (800.0, 450.0), (524.0, 60.0), (524.0, 320.0), (60.0, 300.0)]
 
 
@@ -307,10 +307,10 @@ def test_no_command_passes_the_guard(make_paper_brick, data):
 def test_the_guard_lets_a_joint_that_is_outside_come_back():
     limits = SoftLimits(SHIPPED)
     outside = SHIPPED.base.counts_at(SHIPPED.base.low_rad) - 50
-    limits.record(0, outside)
-    limits.check(0, outside, outside + 30)
+    limits.record_counts(0, outside)
+    limits.require_allowed_move(0, outside, outside + 30)
     with pytest.raises(ReachError):
-        limits.check(0, outside, outside - 1)
+        limits.require_allowed_move(0, outside, outside - 1)
 
 
 def test_a_rehearsal_says_the_moves_and_makes_none():

@@ -14,7 +14,7 @@ from probewise.arm import (
     SimulatedArm,
     Speed,
     read_geometry,
-    shipped_geometry,
+    shipped_geometry_path,
 )
 from probewise.errors import ParameterError, ReachError, ShapeError
 
@@ -39,7 +39,7 @@ def test_the_arm_reaches_all_but_the_two_far_corners_and_what_is_too_near():
 
 def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
     """Two routes to one reach, a ring to the mm, and the joints of the shipped geometry with room for their motors."""
-    shipped, ring = read_geometry(shipped_geometry()), Reach()
+    shipped, ring = read_geometry(shipped_geometry_path()), Reach()
     away = np.hypot(*(GRID - ring.axis_mm).T)
     apart = (abs(away - ring.nearest_mm) > 1) & (abs(away - ring.farthest_mm) > 1)
     np.testing.assert_array_equal(ring.contains(GRID[apart]), shipped.contains(GRID[apart]))
@@ -47,7 +47,7 @@ def test_the_simulated_arm_reaches_what_the_arm_that_ships_reaches():
 
 
 def test_a_longer_arm_reaches_everywhere():
-    assert Reach.everywhere().contains(GRID).all()
+    assert Reach.over_whole_field().contains(GRID).all()
 
 
 def test_reach_agrees_with_trigonometry():

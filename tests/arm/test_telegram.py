@@ -105,7 +105,7 @@ def test_a_command_has_the_bytes_that_the_protocol_gives_it(vector):
 )
 def test_an_answer_says_what_the_protocol_says_it_does(vector):
     command, _, _, received, says = vector
-    assert command.answer(decode(unframed(received))) == says
+    assert command.decode_answer(decode(unframed(received))) == says
 
 
 def test_the_vectors_cover_every_command():
@@ -117,14 +117,14 @@ def test_the_vectors_cover_every_command():
 )
 def test_a_refusal_is_an_error_that_says_why_whatever_its_length(command, received, status):
     with pytest.raises(BrickError, match=f"{command.name} with status {status:02X}: ") as caught:
-        command.answer(decode(unframed(received)))
+        command.decode_answer(decode(unframed(received)))
     assert caught.value.status == status
 
 
 def test_every_status_but_zero_is_a_clear_error():
     for status in range(1, 256):
         with pytest.raises(BrickError) as caught:
-            t.KeepAlive().answer(Reply(0x0D, status, b""))
+            t.KeepAlive().decode_answer(Reply(0x0D, status, b""))
         assert MEANINGS.get(status, "no known meaning") in str(caught.value)
         assert str(pickle.loads(pickle.dumps(caught.value))) == str(caught.value)
 
@@ -167,18 +167,18 @@ def test_bytes_that_are_no_reply_are_refused_and_shown(telegram):
 @pytest.mark.parametrize("body", ["", "F4", "F4 1C 00"])
 def test_an_answer_of_another_length_is_refused(body):
     with pytest.raises(TelegramError, match=r"BatteryLevel has 2 bytes; there are \d: "):
-        t.GetBatteryLevel().answer(Reply(0x0B, 0, bytes.fromhex(body)))
+        t.GetBatteryLevel().decode_answer(Reply(0x0B, 0, bytes.fromhex(body)))
 
 
 def test_a_reply_to_another_command_is_no_answer():
     with pytest.raises(TelegramError, match="a reply to opcode 0D came for GETBATTERYLEVEL"):
-        t.GetBatteryLevel().answer(Reply(0x0D, 0, bytes(2)))
+        t.GetBatteryLevel().decode_answer(Reply(0x0D, 0, bytes(2)))
 
 
 @pytest.mark.parametrize(("command", "body"), [(t.GetOutputState(1), bytes(22)), (t.GetInputValues(3), bytes(13))])
 def test_an_answer_about_another_port_is_no_answer(command, body):
     with pytest.raises(TelegramError, match="an answer about port 0 came for"):
-        command.answer(Reply(command.OPCODE, 0, body))
+        command.decode_answer(Reply(command.OPCODE, 0, body))
 
 
 def test_garbage_behind_the_end_of_a_text_is_left_out():
@@ -206,7 +206,7 @@ def test_any_bytes_are_a_reply_or_a_clear_error(telegram):
 @given(st.sampled_from([vector[0] for vector in VECTORS]), st.integers(0, 255), st.binary(max_size=70))
 def test_any_reply_to_any_command_is_an_answer_or_a_clear_error(command, status, body):
     try:
-        answer = command.answer(Reply(command.OPCODE, status, body))
+        answer = command.decode_answer(Reply(command.OPCODE, status, body))
     except (TelegramError, BrickError):
         return
     assert not status

@@ -2,7 +2,7 @@
 
 import pytest
 
-from probewise.arm import shipped_geometry
+from probewise.arm import shipped_geometry_path
 from probewise.arm.nxt import Brick, Link
 from probewise.cli import main
 
@@ -23,7 +23,7 @@ def test_check_says_and_draws_how_far_the_arm_reaches(tmp_path, capsys):
 
 def test_check_names_what_is_wrong_with_a_file(tmp_path, capsys):
     path = tmp_path / "mine.toml"
-    path.write_text(shipped_geometry().read_text().replace("gear_ratio = 21", "gear_ratio = 0"))
+    path.write_text(shipped_geometry_path().read_text().replace("gear_ratio = 21", "gear_ratio = 0"))
     error = said(capsys, "arm", "check", "--geometry", path, status=2).err
     assert error.count("\n") == 1
     assert "mine.toml: joints.base.gear_ratio is 0.0" in error
@@ -64,7 +64,7 @@ def test_check_of_a_simulated_arm_is_refused_before_anything_is_drawn(tmp_path, 
 
 def test_an_arm_that_reaches_no_place_of_its_field_is_no_arm(tmp_path, capsys):
     path = tmp_path / "far.toml"
-    path.write_text(shipped_geometry().read_text().replace("y_mm = 580", "y_mm = 5800"))
+    path.write_text(shipped_geometry_path().read_text().replace("y_mm = 580", "y_mm = 5800"))
     assert "nowhere on the field" in said(capsys, "arm", "check", "--geometry", path, status=2).err
 
 

@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from probewise.arm import shipped_geometry
+from probewise.arm import shipped_geometry_path
 from probewise.cli import main
 from probewise.recordings import paper_plan, write_plan
 
@@ -122,7 +122,7 @@ def test_a_campaign_that_is_none_is_refused(verb, name, first, what, refused, tm
 
 @pytest.mark.parametrize("what", [*TEXTS, "a huge number", "deep lists", "a huge text"])
 def test_a_geometry_that_is_none_is_refused(what, refused, tmp_path):
-    shipped = shipped_geometry().read_text().encode()
+    shipped = shipped_geometry_path().read_text().encode()
     instead = {"a huge number": b"9" * 400, "deep lists": b"[" * 100_000, "a huge text": b'"' + b"a" * 100_000 + b'"'}
     at = shipped.index(b"= ", shipped.index(b"\nx_mm")) + 2
     harmed = shipped[:at] + instead[what] + shipped[shipped.index(b"\n", at) :] if what in instead else TEXTS[what]
@@ -198,7 +198,7 @@ def test_a_byte_order_mark_is_taken_wherever_text_is_read(sensor_file, tmp_path,
     plan = paper_plan()
     write_plan(plan.take(np.arange(4)), tmp_path / "plan.csv")
     geometry = tmp_path / "arm.toml"
-    geometry.write_bytes(shipped_geometry().read_bytes())
+    geometry.write_bytes(shipped_geometry_path().read_bytes())
     for path in (sensor_file, tmp_path / "plan.csv", tmp_path / "plan.json", geometry):
         path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert main(["predict", str(sensor_file), str(tmp_path / "plan.csv"), "--out", str(tmp_path / "p.csv")]) == 0

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from probewise.arm import ReadingScale, Request
+from probewise.arm import ReadingScale, RequestToPerson
 from probewise.calibration import predict, read_sensor
 from probewise.cli import main
 from probewise.cli._bench import Bench, shifted_pattern, world_and_instrumentation
@@ -64,7 +64,7 @@ def test_a_bench_does_what_a_person_would_be_asked_for():
     with bench.open_simulated_arm(None) as arm:
         place = type(arm.pose)(*ORIGIN)
         white = arm.measure(place).value
-        bench.carry_out_request({"dark": Uniform(0.0)}, ORIGIN, Request("put it there", pattern="dark"))
+        bench.carry_out_request({"dark": Uniform(0.0)}, ORIGIN, RequestToPerson("put it there", pattern="dark"))
         assert arm.measure(place).value < white
     assert bench.open_simulated_arm(None, start_s=70.0).time_s == 70.0
 

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from probewise.arm import DryRun, LegoArm, Request, read_geometry, shipped_geometry
+from probewise.arm import DryRun, LegoArm, RequestToPerson, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.cli import main
 from probewise.cli._arm import warn_if_place_sd_large
@@ -25,7 +25,7 @@ OFF = {"x_mm": 3, "y_mm": -3, "shoulder_forward_mm": 3, "shoulder_height_mm": -3
 @pytest.fixture
 def true_toml(tmp_path):
     """The shipped arm, its lengths 3 mm and its home angles 2 degrees off."""
-    text = shipped_geometry().read_text(encoding="utf-8")
+    text = shipped_geometry_path().read_text(encoding="utf-8")
     for name, by in OFF.items():
         text = re.sub(
             rf"^{name} = (\d+)", lambda found, by=by, name=name: f"{name} = {int(found[1]) + by}", text, flags=re.M
@@ -74,7 +74,7 @@ def test_an_arm_that_is_built_otherwise_is_fitted_and_records_without_touching_t
 
 
 def test_an_arm_that_is_known_less_well_than_a_shape_is_to_be_says_so_before_it_moves(capsys):
-    shipped = read_geometry(shipped_geometry())
+    shipped = read_geometry(shipped_geometry_path())
     for place_sd_mm, warned in ((4.5, True), (0.6, False)):
         rows = tuple((0.0,) * 9 for _ in range(9))
         warn_if_place_sd_large(dataclasses.replace(shipped, accuracy=Accuracy(8, place_sd_mm, 1.0, 0.01, rows)), 4.0)
@@ -97,7 +97,7 @@ def test_fitting_needs_an_arm_or_marks_and_keeps_what_stands_there(tmp_path, cap
 
 
 def test_a_person_moves_the_sensor_in_words_and_is_told_what_cannot_be_done():
-    geometry = read_geometry(shipped_geometry())
+    geometry = read_geometry(shipped_geometry_path())
     arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
     said, answers = [], iter(["", "x 4 y -2", "sideways", "down 55", "up 3", "ok"])
     with arm:
@@ -178,7 +178,7 @@ def test_a_scene_is_typed_as_it_is_read(scene):
 
 
 def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet(monkeypatch, capsys):
-    geometry = read_geometry(shipped_geometry())
+    geometry = read_geometry(shipped_geometry_path())
     arm = LegoArm(DryRun(geometry, lambda text: None), geometry)
     values = iter([12.0, 57.0])
     monkeypatch.setattr(arm, "measure", lambda pose: dataclasses.replace(_reading(pose), value=next(values)))
@@ -188,8 +188,8 @@ def test_the_prompt_says_what_to_type_at_the_emulator_and_warns_of_a_wrong_sheet
         hands = PersonAtBench(
             arm, plan, (524.0, 260.0), SheetCheck(plan, white_is_bright=True), check_sheets=True, emulated=True
         )
-        hands(Request("lay sheet 'quadrant_c'", pattern="quadrant_c"))
-        hands(Request("turn the sensor", turned_rad=math.pi / 2))
+        hands(RequestToPerson("lay sheet 'quadrant_c'", pattern="quadrant_c"))
+        hands(RequestToPerson("turn the sensor", turned_rad=math.pi / 2))
     said = capsys.readouterr().err
     assert "in the emulator's terminal: corner:528,264,1,1" in said
     assert "in the emulator's terminal: turn 90" in said

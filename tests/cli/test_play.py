@@ -12,19 +12,19 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from probewise.arm import Pose, read_geometry, shipped_geometry
+from probewise.arm import Pose, read_geometry, shipped_geometry_path
 from probewise.cli import main
 from probewise.cli._arm import open_emulated_arm_and_bench
 from probewise.recordings import Disc
 from probewise.world.shipped import truth
 
-SHIPPED = read_geometry(shipped_geometry())
+SHIPPED = read_geometry(shipped_geometry_path())
 KNOWN_DEG = 0.3
 BASE_MM = (524.0, 580.0)
 
 
 def built_with(play_deg, path):
-    text = Path(shipped_geometry()).read_text(encoding="utf-8")
+    text = Path(shipped_geometry_path()).read_text(encoding="utf-8")
     known = f"play_deg = {KNOWN_DEG}"
     assert text.count(known) == 1
     path.write_text(text.replace(known, f"play_deg = {play_deg}"), encoding="utf-8")

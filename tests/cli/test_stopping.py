@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from probewise._signals import ENDING, SAME_S, defer_signals
-from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry
+from probewise.arm import LegoArm, Pose, read_geometry, shipped_geometry_path
 from probewise.arm.nxt import Brick, BrickMachine, Link
 from probewise.cli import _stopping, main
 from probewise.cli._stopping import Stopped, raise_if_stopped, reporting_what_is_kept, stoppable
@@ -22,7 +22,7 @@ from probewise.recordings import Uniform
 from probewise.report import exploration
 from probewise.world.shipped import truth
 
-GEOMETRY = read_geometry(shipped_geometry())
+GEOMETRY = read_geometry(shipped_geometry_path())
 
 
 @pytest.mark.parametrize("number", ENDING, ids=lambda number: number.name)
@@ -131,7 +131,7 @@ def strike(number, frame):
 def struck_session(n):
     """Measure once, struck at the n-th telegram; return the emulated brick, and how many telegrams came."""
     clock = VirtualClock()
-    bench = set_up_bench(read_numbers(shipped_geometry()), truth("paper"), Uniform(0.5), clock, seed=1)
+    bench = set_up_bench(read_numbers(shipped_geometry_path()), truth("paper"), Uniform(0.5), clock, seed=1)
     send, sent = bench.radio.send, []
 
     def struck(data):

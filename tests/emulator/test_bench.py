@@ -22,7 +22,7 @@ from probewise.emulator import (
     parse_scene,
     read_geometry,
     set_up_bench,
-    shipped_geometry,
+    shipped_geometry_path,
 )
 from probewise.errors import FileError, ParameterError
 from probewise.recordings import Disc, HalfPlane, Polygon, Quadrant, Uniform
@@ -34,7 +34,7 @@ CIRCLE = Disc((524.0, 300.0), 100.0)
 
 @pytest.fixture
 def geometry() -> Geometry:
-    return read_geometry(shipped_geometry())
+    return read_geometry(shipped_geometry_path())
 
 
 def posed(geometry: Geometry, *angles_deg: float) -> SensorPose:
@@ -170,9 +170,9 @@ def test_a_person_turns_the_sensor_and_changes_what_lies_there(clock: VirtualClo
     world = World(gaussian_spot([Blob(1.0, (0.0, 6.0), (1.0, 1.0))]), noise_sd=0.0)
     look = LightModel(world, table, lambda: SensorPose(0.0, 0.0, 14.0, 0.0), read_height_mm=14.0, seed=1, clock=clock)
     assert look(True) == pytest.approx(60.5)
-    table.carry_out("turn 180")
+    table.carry_out_line("turn 180")
     assert look(True) == pytest.approx(10.5)
-    table.carry_out("uniform:0.5")
+    table.carry_out_line("uniform:0.5")
     assert look(True) == pytest.approx(35.5)
 
 
@@ -180,7 +180,7 @@ def test_what_a_person_cannot_do_changes_nothing() -> None:
     table = Tabletop(CIRCLE)
     for wish in ("turn", "turn round", "turn nan", "hexagon", ""):
         with pytest.raises(ParameterError, match="turn DEGREES"):
-            table.carry_out(wish)
+            table.carry_out_line(wish)
     assert table == Tabletop(CIRCLE)
 
 
@@ -199,7 +199,7 @@ def test_what_a_person_cannot_do_changes_nothing() -> None:
     ],
 )
 def test_a_geometry_that_cannot_be_used_says_where(tmp_path: Path, old: str, new: str, found: str) -> None:
-    text = shipped_geometry().read_text(encoding="utf-8")
+    text = shipped_geometry_path().read_text(encoding="utf-8")
     file = tmp_path / "arm.toml"
     changed, n_changed = re.subn(old, new, text, count=1)
     assert n_changed == 1

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from probewise.arm import shipped_geometry
+from probewise.arm import shipped_geometry_path
 from probewise.cli import main
 
 pytestmark = pytest.mark.slow
@@ -32,7 +32,7 @@ def built_otherwise(text):
 
 def test_an_arm_that_is_built_otherwise_finds_the_circle_and_never_touches_the_table(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    text = shipped_geometry().read_text(encoding="utf-8")
+    text = shipped_geometry_path().read_text(encoding="utf-8")
     (tmp_path / "my_arm.toml").write_text(text, encoding="utf-8")
     (tmp_path / "true.toml").write_text(built_otherwise(text), encoding="utf-8")
     arm = ("--arm", "emulator:true.toml")

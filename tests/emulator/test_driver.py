@@ -11,7 +11,15 @@ import pytest
 
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link
-from probewise.emulator import Bench, Faults, VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry
+from probewise.emulator import (
+    Bench,
+    Faults,
+    VirtualClock,
+    VirtualLine,
+    read_geometry,
+    set_up_bench,
+    shipped_geometry_path,
+)
 from probewise.errors import LinkError
 from probewise.recordings import Disc
 from probewise.world.shipped import truth
@@ -22,7 +30,7 @@ WORLD, CIRCLE = truth("paper"), Disc((600.0, 250.0), 80.0)
 
 def measured(bench: Bench, clock: VirtualClock, places_mm: np.ndarray) -> list[arm.Reading]:
     """Read at each place, in one session."""
-    geometry = arm.read_geometry(arm.shipped_geometry())
+    geometry = arm.read_geometry(arm.shipped_geometry_path())
     link = Link(VirtualLine(bench.radio, clock), clock=clock)
     with arm.LegoArm(BrickMachine(Brick(link, clock=clock), geometry), geometry, clock=clock) as lego:
         standing = lego.orientation_rad(places_mm)
@@ -35,7 +43,7 @@ def measured(bench: Bench, clock: VirtualClock, places_mm: np.ndarray) -> list[a
 def some_places(n: int) -> np.ndarray:
     """Draw places within reach, none where a millimetre more or less matters."""
     rng = np.random.default_rng(SEED)
-    geometry = arm.read_geometry(arm.shipped_geometry())
+    geometry = arm.read_geometry(arm.shipped_geometry_path())
     places = np.stack([rng.uniform(100, 950, 20 * n), rng.uniform(50, 480, 20 * n)], axis=1)
     from_edge = np.hypot(places[:, 0] - 600, places[:, 1] - 250) - 80
     # Half of them over the circle, which is small.
@@ -47,7 +55,7 @@ def some_places(n: int) -> np.ndarray:
 
 
 def bench_over_circle(clock: VirtualClock) -> Bench:
-    return set_up_bench(read_geometry(shipped_geometry()), WORLD, CIRCLE, clock, seed=SEED)
+    return set_up_bench(read_geometry(shipped_geometry_path()), WORLD, CIRCLE, clock, seed=SEED)
 
 
 @pytest.mark.slow
@@ -62,7 +70,7 @@ def test_readings_are_those_of_the_simulated_arm_with_the_same_seed(clock: Virtu
         rng = np.random.default_rng([SEED, next(number)])
         return WORLD.read(CIRCLE, pose.x_mm, pose.y_mm, pose.orientation_rad, time_s=time_s, rng=rng)
 
-    simulated = arm.SimulatedArm(light, reach=arm.Reach.everywhere())
+    simulated = arm.SimulatedArm(light, reach=arm.Reach.over_whole_field())
     same = np.array([simulated.measure(arm.Pose(*place)).value for place in places])
     found = np.array([reading.value for reading in readings])
     assert (abs(found - same) <= 1 + 0.05 * same).all()
@@ -74,7 +82,7 @@ def test_joints_stand_where_their_counters_say_but_for_half_a_count(
     clock: VirtualClock, tmp_path: Path, play: bool
 ) -> None:
     """Neither more on one side than on the other: a bias of half a count is an edge that lies 0.15 mm elsewhere."""
-    text = arm.shipped_geometry().read_text(encoding="utf-8")
+    text = arm.shipped_geometry_path().read_text(encoding="utf-8")
     file = tmp_path / "arm.toml"
     file.write_text(text if play else re.sub(r"play_deg = [\d.]+", "play_deg = 0", text), encoding="utf-8")
     bench = set_up_bench(read_geometry(file), WORLD, CIRCLE, clock, seed=SEED)

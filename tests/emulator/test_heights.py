@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from probewise.arm import read_geometry, shipped_geometry
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
 from probewise.cli._arm import open_emulated_arm_and_bench
 from probewise.recordings import Uniform
@@ -18,14 +18,14 @@ HANGS = re.compile(r"it hangs ([\d.]+) ± ([\d.]+) mm (higher|lower)")
 def built(tmp_path, home_deg):
     """Write the file of an arm whose elbow stands otherwise at home."""
     file = tmp_path / "true.toml"
-    head, mark, rest = shipped_geometry().read_text(encoding="utf-8").partition("[joints.elbow]")
+    head, mark, rest = shipped_geometry_path().read_text(encoding="utf-8").partition("[joints.elbow]")
     file.write_text(head + mark + rest.replace("home_deg = -20", f"home_deg = {home_deg}", 1), encoding="utf-8")
     return file
 
 
 def true_off_mm(file):
     """Look where the sensor of that arm hangs, relative to the first place."""
-    geometry = read_geometry(shipped_geometry())
+    geometry = read_geometry(shipped_geometry_path())
     lego, bench = open_emulated_arm_and_bench(geometry, file, truth("paper"), Uniform(1.0), seed=1)
     off = []
     with lego as arm:

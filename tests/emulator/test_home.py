@@ -10,11 +10,19 @@ import pytest
 
 from probewise import arm
 from probewise.arm.nxt import Brick, BrickMachine, Link, MotorError
-from probewise.emulator import Bench, Faults, VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry
+from probewise.emulator import (
+    Bench,
+    Faults,
+    VirtualClock,
+    VirtualLine,
+    read_geometry,
+    set_up_bench,
+    shipped_geometry_path,
+)
 from probewise.recordings import Disc
 from probewise.world.shipped import truth
 
-SHIPPED = arm.read_geometry(arm.shipped_geometry())
+SHIPPED = arm.read_geometry(arm.shipped_geometry_path())
 STOPS_DEG = {"base": -193.0, "shoulder": 163.0, "elbow": 43.0}  # 3 degrees outside the limits, as the emulator has them
 HOME_DEG = 0.2 + 0.15  # half the play, and nearly two of the twelve counts to a degree
 
@@ -28,14 +36,16 @@ def with_stops(*names: str) -> arm.Geometry:
 
 def lost(clock: VirtualClock, **turned_deg: float) -> Bench:
     """Set up an arm whose joints were turned by hand while its counters showed 0."""
-    bench = set_up_bench(read_geometry(shipped_geometry()), truth("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1)
+    bench = set_up_bench(
+        read_geometry(shipped_geometry_path()), truth("paper"), Disc((600.0, 250.0), 80.0), clock, seed=1
+    )
     names = ("base", "shoulder", "elbow")
     for joint, name in zip(bench.arm.joints, names, strict=True):
         joint.bring_to(joint.numbers.home_deg + turned_deg.get(name, 0.0))
     clock.sleep(0.01)
     bench.radio.brick.advance()
     for port in bench.radio.brick.outputs.ports:
-        port.reset(block=False)
+        port.reset_counter(block=False)
     return bench
 
 

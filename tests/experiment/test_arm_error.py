@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import ndtr
 
-from probewise.arm import read_geometry, shipped_geometry
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.fitting import fit_geometry
 from probewise.arm.geometry import Accuracy
 from probewise.arm.marks import places_of_marks
@@ -16,7 +16,7 @@ from probewise.arm.uncertainty import FITTED, RULER_SDS, places_at_values, slope
 from probewise.errors import FileError, ParameterError
 from probewise.experiment import FittedArm, explore, found_shape, result_json, run, run_with_arm_error, samples_csv
 
-ARM = dataclasses.replace(read_geometry(shipped_geometry()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0))
+ARM = dataclasses.replace(read_geometry(shipped_geometry_path()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0))
 LEVELS = DARK, WHITE = 10.0, 60.0
 
 

@@ -11,7 +11,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from probewise import scene
-from probewise.arm import Pose, Reading, read_geometry, shipped_geometry
+from probewise.arm import Pose, Reading, read_geometry, shipped_geometry_path
 from probewise.arm.geometry import Accuracy
 from probewise.arm.uncertainty import FITTED
 from probewise.calibration import FittedSensor, mean_field
@@ -262,7 +262,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
     covariance = np.diag([0.2**2 if name == "base x" else 0.0 for name in FITTED])
     accuracy = Accuracy(8, 1.0, 1.0, 0.001, tuple(map(tuple, covariance.tolist())))
     geometry = replace(
-        read_geometry(shipped_geometry()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0), accuracy=accuracy
+        read_geometry(shipped_geometry_path()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0), accuracy=accuracy
     )
 
     def slopes(kinds):

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.text import Text
 from PIL import Image
 
-from probewise.arm.geometry_file import read_geometry, shipped_geometry
+from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
 from probewise.challenge import Bin
 from probewise.challenge.estimates import share
 from probewise.errors import ShapeError
@@ -117,7 +117,7 @@ FIGURES = {
     "audit_matrix": lambda s: plots.audit_matrix(
         EFFECTS, ["fine", "aliased", "invisible"] * 8, np.full((24, 24), 0.995), alias=0.99
     ),
-    "arm_and_sensor": lambda s: plots.arm_and_sensor(read_geometry(shipped_geometry()), (600.0, 260.0)),
+    "arm_and_sensor": lambda s: plots.arm_and_sensor(read_geometry(shipped_geometry_path()), (600.0, 260.0)),
     "sensor_orientations": lambda s: plots.sensor_orientations(s.recording),
     "quadrant_patterns": lambda s: plots.quadrant_patterns(s.recording),
     "residuals_by_scan": lambda s: plots.residuals_by_scan(

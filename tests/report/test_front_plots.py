@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from matplotlib.patches import Circle, Rectangle
 
-from probewise.arm import read_geometry, shipped_geometry
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.errors import ParameterError, ReachError
 from probewise.recordings import Recording, read_recording, shipped, two_way_plan
 from probewise.report import plots
@@ -18,7 +18,7 @@ def recording():
 
 @pytest.fixture(scope="module")
 def geometry():
-    return read_geometry(shipped_geometry())
+    return read_geometry(shipped_geometry_path())
 
 
 def test_the_arm_is_drawn_with_its_sensor_at_the_height_at_which_it_reads(geometry):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.arm import read_geometry, shipped_geometry
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.report.plots import reach_map
 
 X, Y = np.linspace(0.0, 1048.0, 27), np.linspace(0.0, 520.0, 14)
@@ -12,7 +12,7 @@ X, Y = np.linspace(0.0, 1048.0, 27), np.linspace(0.0, 520.0, 14)
 @pytest.mark.parametrize("mounted_deg", [180.0, 0.0, 77.0])
 def test_the_colours_span_the_angles_that_there_are_also_across_180_degrees(mounted_deg):
     """The sensor turns by less than half a turn over the field, however it is mounted."""
-    geometry = read_geometry(shipped_geometry())
+    geometry = read_geometry(shipped_geometry_path())
     places = np.stack(np.meshgrid(X, Y), axis=-1).reshape(-1, 2)
     standing = geometry.orientation_rad(places) + np.radians(mounted_deg - 180.0)
     held = np.where(geometry.contains(places), (standing + np.pi) % (2 * np.pi) - np.pi, np.nan).reshape(Y.size, X.size)

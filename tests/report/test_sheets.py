@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 import pytest
 
-from probewise.arm import read_geometry, shipped_geometry
+from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.cli import main
 from probewise.errors import ParameterError
 from probewise.recordings import paper_plan, two_way_plan
@@ -167,7 +167,7 @@ def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
 
 @pytest.mark.slow
 def test_marks_and_targets_are_at_their_places_of_the_field():
-    geometry = read_geometry(shipped_geometry())
+    geometry = read_geometry(shipped_geometry_path())
     sheet = marks_sheet(geometry)
     assert len(sheet.crosses_mm) == 8
     assert geometry.contains(sheet.crosses_mm).all()
@@ -197,7 +197,7 @@ def crosses_in(pdf, sheet, first):
 
 @pytest.mark.parametrize("elbow_is_relative", [False, True])
 def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is_relative):
-    shipped = read_geometry(shipped_geometry())
+    shipped = read_geometry(shipped_geometry_path())
     elbow = dataclasses.replace(shipped.elbow, home_rad=np.radians(-120.0 if elbow_is_relative else -30.0))
     arm = dataclasses.replace(
         shipped, elbow=elbow, elbow_is_relative=elbow_is_relative, links_mm=(150.0, 120.0), shoulder_mm=(40.0, 60.0)
@@ -219,7 +219,7 @@ def test_the_jig_holds_the_joints_where_the_kinematics_put_them_at_home(elbow_is
 
 
 def test_the_jigs_beams_are_as_wide_as_lego_and_its_pages_have_a_ruler():
-    side, above = jig_sheets(read_geometry(shipped_geometry()))
+    side, above = jig_sheets(read_geometry(shipped_geometry_path()))
     pages = pages_of(sheets_pdf([side, above], paper="a4", title="t"))
     assert len(pages) == 1 + len(tiles_of(side, "a4")) + len(tiles_of(above, "a4"))
     beam = side.strokes_mm[0]

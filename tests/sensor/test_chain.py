@@ -28,9 +28,8 @@ from probewise.sensor import (
     NoiseLevel,
     SceneView,
     Stage,
-    field_of,
-    mean_ssf_field,
     footprint_of,
+    mean_ssf_field,
 )
 
 PATTERNS = {

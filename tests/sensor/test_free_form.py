@@ -16,11 +16,10 @@ from probewise.sensor import (
     FreeLevels,
     FreeMixture,
     bends_of,
-    field_of,
     footprint_of,
     free_form_parameters,
-    mean_ssf_field,
     is_free_form,
+    mean_ssf_field,
 )
 from probewise.sensor import chain as chain_module
 

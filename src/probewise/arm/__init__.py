@@ -1,14 +1,14 @@
 """Instruments that take readings: one interface, a simulated arm and the LEGO arm (paper, "Robotic Arm Test Bed")."""
 
-from probewise.arm.carry_out import Request, carry_out, readings_of, recording_of
+from probewise.arm.carry_out import RequestToPerson, carry_out, readings_of_recording, recording_of
 from probewise.arm.geometry import Geometry, Joint
-from probewise.arm.geometry_file import read_geometry, shipped_geometry
+from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm, in_lego_units
 from probewise.arm.limits import SoftLimits
 from probewise.arm.machine import DryRun, Machine
 from probewise.arm.own_instrument import Measures, OwnInstrument, instrument_of
-from probewise.arm.reach import FIELD_MM, Reach, Workspace, require_reach
+from probewise.arm.reach import FIELD_MM, Reach, Workspace, require_within_reach
 from probewise.arm.scale import ReadingScale
 from probewise.arm.simulated import Light, SimulatedArm, Speed
 
@@ -27,7 +27,7 @@ __all__ = [
     "Reach",
     "Reading",
     "ReadingScale",
-    "Request",
+    "RequestToPerson",
     "SimulatedArm",
     "SoftLimits",
     "Speed",
@@ -36,11 +36,23 @@ __all__ = [
     "in_lego_units",
     "instrument_of",
     "read_geometry",
-    "readings_of",
+    "readings_of_recording",
     "recording_of",
-    "require_reach",
-    "shipped_geometry",
+    "require_within_reach",
+    "shipped_geometry_path",
 ]
+
+readings_of = readings_of_recording
+"""The old name of `readings_of_recording`."""
+
+Request = RequestToPerson
+"""The old name of `RequestToPerson`."""
+
+require_reach = require_within_reach
+"""The old name of `require_within_reach`."""
+
+shipped_geometry = shipped_geometry_path
+"""The old name of `shipped_geometry_path`."""
 
 recorded = recording_of
 """The old name of `recording_of`."""

@@ -1,4 +1,4 @@
-"""Carry out a plan with an arm, row by row; a person turns the sensor and changes the pattern."""
+"""Execution of a plan by an arm, row by row; a person turns the sensor and changes the pattern."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.arm.instrument import Instrument, Pose, Reading
 from probewise.arm.lego import LegoArm
 from probewise.arm.own_instrument import Measures, OwnInstrument, instrument_of
-from probewise.arm.reach import Bounds, require_reach
+from probewise.arm.reach import ReachablePlaces, require_within_reach
 from probewise.arm.simulated import SimulatedArm
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan, Recording
@@ -23,7 +23,7 @@ _SAME_TURN_RAD = math.radians(0.5)
 BY_HAND_S = 30.0  # to lay a sheet or to turn the sensor
 
 
-class Request(str):
+class RequestToPerson(str):
     """A request to the person at the bench, as a sentence; a simulated bench uses its attributes.
 
     Attributes
@@ -39,7 +39,7 @@ class Request(str):
     pattern: str | None
     turned_rad: float | None
 
-    def __new__(cls, text: str, *, pattern: str | None = None, turned_rad: float | None = None) -> Request:
+    def __new__(cls, text: str, *, pattern: str | None = None, turned_rad: float | None = None) -> RequestToPerson:
         """Build a request from its sentence."""
         request = super().__new__(cls, text)
         request.pattern, request.turned_rad = pattern, turned_rad
@@ -51,7 +51,7 @@ def carry_out(
     plan: Plan,
     *,
     origin_mm: tuple[float, float],
-    ask: Callable[[Request], None],
+    ask: Callable[[RequestToPerson], None],
     first: int = 0,
 ) -> Iterator[Reading]:
     """Take a plan's readings, in order.
@@ -69,7 +69,7 @@ def carry_out(
     origin_mm
         Place of the plan's origin on the field, lab frame.
     ask
-        Function that shows a `Request` (a str) to a person and returns when it is done.
+        Function that shows a `RequestToPerson` (a str) to a person and returns when it is done.
     first
         First row to read; earlier rows have been taken.
 
@@ -87,7 +87,7 @@ def carry_out(
     """
     arm = instrument_of(arm, name="arm")
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
-    require_reach(reach_of(arm), places, "row of the plan", way_out="; move the plan's origin")
+    require_within_reach(reach_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
     row_reader = _LegoRowReader(arm) if isinstance(arm, LegoArm) else _OwnRowReader(arm)
     turns = row_reader.hand_turns_rad(plan, places)
@@ -98,19 +98,21 @@ def carry_out(
             name = plan.pattern_names[lying]
             where = f"its origin at ({origin_mm[0]:g}, {origin_mm[1]:g}) mm of the field, its x axis along the field's"
             shown = f": {where_white_in_words(plan.patterns[name])}" if name in plan.patterns else ""
-            ask(Request(f"lay sheet {name!r}, {where}{shown}", pattern=name))
+            ask(RequestToPerson(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
             mounted = float(turns[row])
             text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {row_reader.from_where}"
-            ask(Request(text, turned_rad=mounted))
+            ask(RequestToPerson(text, turned_rad=mounted))
         x_mm, y_mm = places[row].tolist()
         reading = row_reader.read_row(x_mm, y_mm, mounted, plan, row)
-        there = _place_in_plan(reading, plan, row, origin_mm)
+        there = _place_in_plan_frame_mm(reading, plan, row, origin_mm)
         yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
 
 
 def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], first: int = 0) -> float:
-    """Estimate the duration of a plan: the arm's travel and readings, and half a minute for each step by hand.
+    """Estimate the duration of a plan in seconds: travel, readings, and half a minute for each step by hand.
+
+    Every change of the pattern or of the planned orientation counts as a step by hand, and so does the start.
 
     Parameters
     ----------
@@ -129,8 +131,10 @@ def duration_s(arm: Instrument, plan: Plan, *, origin_mm: tuple[float, float], f
     return seconds + BY_HAND_S * float(by_hand)
 
 
-def _place_in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]) -> tuple[float, float]:
-    """Return the place of a reading in the plan's frame, rounded to a micron; the planned place if it was reached."""
+def _place_in_plan_frame_mm(
+    reading: Reading, plan: Plan, row: int, origin_mm: tuple[float, float]
+) -> tuple[float, float]:
+    """Return x and y of a reading in the plan's frame: exactly the planned ones if taken there, else to a micron."""
     x_mm, y_mm = float(plan.x_mm[row]), float(plan.y_mm[row])
     if (reading.pose.x_mm, reading.pose.y_mm) == (x_mm + origin_mm[0], y_mm + origin_mm[1]):
         return x_mm, y_mm
@@ -138,7 +142,7 @@ def _place_in_plan(reading: Reading, plan: Plan, row: int, origin_mm: tuple[floa
 
 
 class _LegoRowReader:
-    """Reads a plan's rows with the LEGO arm: its base turns the sensor, and a person by right angles on its mount."""
+    """Reader of a plan's rows for the LEGO arm: its base turns the sensor; a person turns it by right angles."""
 
     from_where = "anticlockwise seen from above, from where the geometry has it"
 
@@ -159,13 +163,13 @@ class _LegoRowReader:
 
 
 class _OwnRowReader:
-    """Reads a plan's rows with a user's own instrument or the simulated arm; it turns the sensor, or a person does."""
+    """Reader of a plan's rows for a user's own instrument or the simulated arm, which may turn the sensor itself."""
 
     from_where = "anticlockwise seen from above, from how it stands by itself"
 
     def __init__(self, arm: OwnInstrument | SimulatedArm) -> None:
         self._arm = arm
-        self._turns, self._lifts = _can_turn_and_lift(arm)
+        self._turns, self._lifts = _can_turn(arm), _can_lift(arm)
 
     def hand_turns_rad(self, plan: Plan, places_mm: FloatArray) -> FloatArray:
         """Return the angle to which the sensor is to be turned by hand for each row, (n_points,)."""
@@ -181,9 +185,14 @@ class _OwnRowReader:
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))
 
 
-def _can_turn_and_lift(arm: OwnInstrument | SimulatedArm) -> tuple[bool, bool]:
-    """Return whether an arm can turn its sensor, and whether it can read at a requested height."""
-    return (True, True) if isinstance(arm, SimulatedArm) else (arm.turns, arm.lifts)
+def _can_turn(arm: OwnInstrument | SimulatedArm) -> bool:
+    """Return whether an arm can turn its sensor."""
+    return isinstance(arm, SimulatedArm) or arm.can_turn
+
+
+def _can_lift(arm: OwnInstrument | SimulatedArm) -> bool:
+    """Return whether an arm can read at a requested height."""
+    return isinstance(arm, SimulatedArm) or arm.can_lift
 
 
 def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
@@ -210,8 +219,8 @@ def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
     return Recording(taken, np.array([reading.value for reading in readings]))
 
 
-def readings_of(recording: Recording) -> list[Reading]:
-    """Convert a recording to readings with pose, time and covariates: the inverse of `recording_of`."""
+def readings_of_recording(recording: Recording) -> list[Reading]:
+    """Return a recording's readings, each with its pose, time and covariates: the inverse of `recording_of`."""
     rows = recording.plan
     return [
         Reading(
@@ -224,8 +233,11 @@ def readings_of(recording: Recording) -> list[Reading]:
     ]
 
 
-def reach_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> Bounds:
-    """Return what says which places an arm can reach: its geometry, its `Reach`, or the instrument itself."""
+def reach_of(arm: LegoArm | OwnInstrument | SimulatedArm) -> ReachablePlaces:
+    """Return the object whose `contains` says which places an arm can reach.
+
+    It is the LEGO arm's geometry, the simulated arm's `reach`, or a user's instrument itself.
+    """
     match arm:
         case LegoArm():
             return arm.geometry
@@ -240,7 +252,7 @@ def _require_feasible_settings(arm: LegoArm | OwnInstrument | SimulatedArm, plan
     there = {"led": 1.0}
     if isinstance(arm, LegoArm):
         there["height_mm"] = arm.geometry.read_height_mm
-    elif not _can_turn_and_lift(arm)[1] and plan.instrumentation.height_mm is not None:
+    elif not _can_lift(arm) and plan.instrumentation.height_mm is not None:
         there["height_mm"] = plan.instrumentation.height_mm
     for name, value in there.items():
         wanted = plan.covariates.get(name, np.empty(0))

@@ -1,4 +1,4 @@
-"""Calibrate an arm's geometry from marks to which its sensor was brought: home angles, links, base.
+"""Calibration of an arm's geometry from marks to which its sensor was brought: home angles, links, base.
 
 Each mark gives the sensor's place and, if touched, its height, with the angles of the joints from home. The current
 geometry file counts as a measurement by ruler and eye (`RULER_SDS`); the fit is by least squares.
@@ -24,7 +24,7 @@ MOST_PLACE_SD_MM, MOST_HEIGHT_SD_MM = 4.0, 5.0  # largest sds of a geometry that
 
 
 class MarksDisagreeError(ProbewiseError, ValueError):
-    """Raised if no geometry explains the marks."""
+    """Raised if the best fit of a geometry to marks has a p-value below 0.001."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,12 +76,12 @@ class FittedGeometry:
 def fit_geometry(
     geometry: Geometry, turned_rad: FloatArray, marks_mm: FloatArray, *, touch_mm: float = 1.0
 ) -> FittedGeometry:
-    """Fit home angles, links and base to marks.
+    """Fit home angles, links and base to marks; return the fitted geometry with its errors.
 
     Parameters
     ----------
     geometry
-        The current geometry.
+        The current geometry: start of the fit, and its prior mean.
     turned_rad
         Angle of each joint from home at each mark, (n_marks, 3): base, shoulder, elbow.
     marks_mm
@@ -106,7 +106,7 @@ def fit_geometry(
     if len(marks) < LEAST_MARKS:
         raise ParameterError("marks", len(marks), f"{LEAST_MARKS} or more")
     before = values_of_fitted(geometry)
-    values, total, jacobian = _most_probable_parameters(geometry, before, turned, marks, touch_mm)
+    values, total, jacobian = _least_squares_fit(geometry, before, turned, marks, touch_mm)
     n = int(np.isfinite(marks).sum())
     p_value = float(chdtrc(n, total))
     residuals = marks - places_at_values(geometry, values, turned)
@@ -128,7 +128,7 @@ def fit_geometry(
     )
 
 
-def _most_probable_parameters(
+def _least_squares_fit(
     geometry: Geometry, before: FloatArray, turned: FloatArray, marks: FloatArray, touch_mm: float
 ) -> tuple[FloatArray, float, FloatArray]:
     """Return the most probable parameters, chi-square there, and the Jacobian of the residuals, (n_residuals, 9)."""
@@ -155,7 +155,7 @@ def _disagreement_message(
     off = f"the marks disagree: {rms:.1f} mm root mean square, where each is good to {touch_mm:g} mm"
     for k in np.argsort(-np.nansum(residuals**2, axis=-1)) if len(marks) > LEAST_MARKS else ():
         others = np.arange(len(marks)) != k
-        values, total, _ = _most_probable_parameters(geometry, before, turned[others], marks[others], touch_mm)
+        values, total, _ = _least_squares_fit(geometry, before, turned[others], marks[others], touch_mm)
         if chdtrc(int(np.isfinite(marks[others]).sum()), total) >= LEAST_P:
             away = float(np.sqrt(np.nansum((marks[k] - places_at_values(geometry, values, turned[[k]])[0]) ** 2)))
             return f"{off}; all but mark {k + 1} agree, and it is {away:.0f} mm off: bring the sensor there again"
@@ -167,7 +167,7 @@ def _disagreement_message(
 
 def _accuracy_of_fit(geometry: Geometry, covariance: FloatArray, n_marks: int) -> Accuracy:
     """Propagate the parameters' covariance, (9, 9), to sds of place, height and scale over the field."""
-    places = geometry.places_over_field_mm
+    places = geometry.reachable_grid_mm
     if not len(places):
         raise ParameterError("marks", n_marks, "marks that leave the field within reach; touch them again")
     slopes = slopes_mm(geometry, places)

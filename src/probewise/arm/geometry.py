@@ -40,7 +40,7 @@ class Joint:
     low_rad, high_rad
         Limits of the angle.
     play_rad
-        Play: range of the joint while the motor holds; 0 if its weight keeps it on one side.
+        Backlash: range over which the joint is loose while its motor holds; 0 if its weight keeps it on one side.
     stop_rad
         Angle of a mechanical stop, at or beyond a limit, used to find home; None without one.
     """
@@ -60,11 +60,13 @@ class Joint:
             raise ParameterError("gear_ratio", self.gear_ratio, "a finite number, 0.1 or more in magnitude")
         if not -2 * math.pi <= self.low_rad < self.high_rad <= 2 * math.pi:
             raise ParameterError(
-                "low_deg, high_deg", _degrees(self.low_rad, self.high_rad), "-360 to 360, the low one below the high"
+                "low_deg, high_deg",
+                _rounded_degrees(self.low_rad, self.high_rad),
+                "-360 to 360, the low one below the high",
             )
         if not self.low_rad <= self.home_rad <= self.high_rad:
             allowed = "an angle between low_deg and high_deg, {:g} to {:g}".format(
-                *_degrees(self.low_rad, self.high_rad)
+                *_rounded_degrees(self.low_rad, self.high_rad)
             )
             raise ParameterError("home_deg", math.degrees(self.home_rad), allowed)
         if not 0 <= self.play_rad < self.high_rad - self.low_rad:
@@ -83,7 +85,7 @@ class Joint:
 
     @property
     def stop_side(self) -> Side | None:
-        """Direction of its stop, 1 upwards or -1 downwards; None without one."""
+        """1 for a stop at or beyond the upper limit, -1 at or beyond the lower one; None without a stop."""
         if self.stop_rad is None:
             return None
         return 1 if self.stop_rad >= self.high_rad else -1
@@ -178,7 +180,7 @@ class Geometry:
     links_mm
         Shoulder to elbow, elbow to wrist.
     elbow_is_relative
-        Whether the elbow's angle is measured between the links, or from the horizontal.
+        Whether the elbow's angle is measured from the direction of the upper link; otherwise, from the horizontal.
     sensor_port
         0 to 3, for inputs 1 to 4.
     sensor_mm
@@ -241,7 +243,7 @@ class Geometry:
             if height_mm < self.travel_height_mm:
                 raise ParameterError(
                     "stop_deg",
-                    _degrees(*ends[0]),
+                    _rounded_degrees(*ends[0]),
                     f"stops of the links at which the sensor is {self.travel_height_mm:g} mm up or more, "
                     f"not {height_mm:.0f} mm: on the way there nothing else guards it",
                 )
@@ -253,12 +255,12 @@ class Geometry:
 
     @property
     def nearest_mm(self) -> float:
-        """Smallest distance from the axis at which the sensor can read."""
+        """Smallest distance from the axis at which the sensor can read, in whole mm; NaN if there is none."""
         return float(self._radii_with_room_mm()[0])
 
     @property
     def farthest_mm(self) -> float:
-        """Largest distance from the axis at which the sensor can read."""
+        """Largest distance from the axis at which the sensor can read, in whole mm; NaN if there is none."""
         return float(self._radii_with_room_mm()[1])
 
     @property
@@ -269,7 +271,7 @@ class Geometry:
         return float(x_mm), float(y_mm)
 
     @property
-    def height_doubt_mm(self) -> float:
+    def max_height_error_mm(self) -> float:
         """Largest amount by which the sensor may be lower than commanded.
 
         Two sds of the height if the geometry was fitted; otherwise the effect of an error of two degrees in both
@@ -277,15 +279,19 @@ class Geometry:
         """
         if self.accuracy is not None:
             return 2 * self.accuracy.height_sd_mm
-        rises = np.abs(self.height_slopes_mm_rad(self.angles_rad(self.places_over_field_mm, self.read_height_mm)))
+        rises = np.abs(self.height_slopes_mm_rad(self.angles_rad(self.reachable_grid_mm, self.read_height_mm)))
         return float(rises.sum(axis=-1).max(initial=0.0) * UNMEASURED_RAD)
 
+    height_doubt_mm = max_height_error_mm  # its old name
+
     @property
-    def places_over_field_mm(self) -> FloatArray:
-        """Places all over the field at which the sensor can read, (n, 2)."""
+    def reachable_grid_mm(self) -> FloatArray:
+        """Places of a grid over the field at which the sensor can read, (n, 2); the grid has 12 by 12."""
         sides = [np.linspace(0.0, side, FIELD_STEPS + 1)[:-1] + side / (2 * FIELD_STEPS) for side in self.field_mm]
         places = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
         return places[self.contains(places)]
+
+    places_over_field_mm = reachable_grid_mm  # its old name
 
     def position_mm(self, angles_rad: FloatArray) -> FloatArray:
         """Compute place and height of the sensor's face in the lab frame from joint angles, both (n, 3)."""
@@ -338,10 +344,10 @@ class Geometry:
         return angles
 
     def contains(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, shape (n, 2), are on the field with room for the motors to approach: shape (n,)."""
+        """Return which places, (n, 2), are on the field and in reach with room for the motors to approach, (n,)."""
         places = _checked_rows(places_mm, 2)
         on_field = ((places >= 0) & (places <= self.field_mm)).all(axis=-1)
-        return np.asarray(on_field & self._leaves_room_to_approach(places))
+        return np.asarray(on_field & self._room_to_approach_mask(places))
 
     holds = contains
     """The old name of `contains`."""
@@ -371,8 +377,8 @@ class Geometry:
             f"{self.farthest_mm:.0f} mm from the arm's axis at ({x_mm:g}, {y_mm:g}) mm, within its joints' limits"
         )
 
-    def _leaves_room_to_approach(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, (n, 2), leave the motors room to approach at both heights, shape (n,)."""
+    def _room_to_approach_mask(self, places_mm: FloatArray) -> BoolArray:
+        """Return which places, (n, 2), leave the motors room to approach, at reading and at travel height, (n,)."""
         room = np.array([ROOM_COUNTS / abs(joint.counts_per_rad) for joint in self.joints])
         read, travel = (self.angles_rad(places_mm, height) for height in (self.read_height_mm, self.travel_height_mm))
         roomy = [self.are_within_joint_limits(angles + sign * room) for angles in (read, travel) for sign in (-1, 1)]
@@ -383,7 +389,7 @@ class Geometry:
         middle = (self.base.low_rad + self.base.high_rad) / 2
         away = np.arange(1.0, self.shoulder_mm[0] + sum(self.links_mm) + self.sensor_mm[0] + 1.0)
         places = self.axis_mm + away[:, None] * [math.cos(middle), math.sin(middle)]
-        within = away[self._leaves_room_to_approach(places)]
+        within = away[self._room_to_approach_mask(places)]
         return (float(within[0]), float(within[-1])) if within.size else (math.nan, math.nan)
 
 
@@ -410,11 +416,12 @@ def wrapped_to_pi(angle_rad: FloatArray) -> FloatArray:
 
 
 def _checked_rows(values: FloatArray, n: int) -> FloatArray:
+    """Return values as an array; raise ShapeError unless it has shape (any, n)."""
     rows = np.asarray(values, dtype=np.float64)
     if rows.ndim != 2 or rows.shape[1] != n:
         raise ShapeError(f"the rows have shape {rows.shape}; allowed: (n, {n})")
     return rows
 
 
-def _degrees(*angles_rad: float) -> tuple[float, ...]:
+def _rounded_degrees(*angles_rad: float) -> tuple[float, ...]:
     return tuple(round(math.degrees(angle), 6) for angle in angles_rad)

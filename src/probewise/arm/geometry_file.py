@@ -22,7 +22,7 @@ _ENTRY = re.compile(r"(\s*(\w+)\s*=\s*)([-+\w.]+)(.*)")
 LARGEST = 1e6
 
 
-def shipped_geometry() -> Path:
+def shipped_geometry_path() -> Path:
     """Return the path of the shipped file: a LEGO arm over the paper's field, with plausible, not measured, values."""
     return Path(str(resources.files("probewise"))) / "data" / "lego_arm.toml"
 
@@ -87,8 +87,8 @@ def read_geometry(path: str | Path) -> Geometry:
     return geometry
 
 
-def with_fitted(text: str, geometry: Geometry) -> str:
-    """Replace the fitted values and their accuracy in the text of a geometry file.
+def text_with_fitted_values(text: str, geometry: Geometry) -> str:
+    """Return the text of a geometry file with the fitted values and their accuracy replaced.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def with_fitted(text: str, geometry: Geometry) -> str:
 
 
 class _TomlTable:
-    """One table of the file; entries are removed as they are read, and none may remain."""
+    """One table of the file; entries are ticked off as they are read, and none may be left."""
 
     def __init__(self, path: Path, where: str, content: dict[str, Any]) -> None:
         self.path, self.where, self.content = path, where, content
@@ -165,7 +165,7 @@ class _TomlTable:
             raise self.error_at(name, f"a number of magnitude up to {LARGEST:g}")
         return float(value)
 
-    def matrix(self, name: str) -> tuple[tuple[float, ...], ...]:
+    def rows_of_numbers(self, name: str) -> tuple[tuple[float, ...], ...]:
         rows = self.take_entry(name)
         if not isinstance(rows, list) or not all(isinstance(row, list) for row in rows):
             raise self.error_at(name, "rows of numbers, [[...], [...], ...]")
@@ -202,7 +202,7 @@ def _parse_accuracy(table: _TomlTable) -> Accuracy:
     if "covariance" not in table.content:
         again = "what `arm fit-geometry` writes: fit the marks again (--marks MARKS.csv), or leave [accuracy] out"
         raise FileError(table.path, "accuracy.covariance is missing", again)
-    covariance = table.matrix("covariance")
+    covariance = table.rows_of_numbers("covariance")
     try:
         return Accuracy(marks, place, height, scale, covariance)
     except ParameterError as error:

@@ -1,4 +1,4 @@
-"""Check the sensor's height by its light: over white, a lower sensor reads more.
+"""A check of the sensor's height by its light: over white, a lower sensor reads more.
 
 The decrease of the reading with height is measured at one place. A reading elsewhere over the same white then gives the
 sensor's height there, to be compared with that of the counters. An inverse-square law is only a first approximation: it
@@ -87,29 +87,31 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     # The logarithm by that of the height: light that falls with its square is a straight line, other light bends it.
     lowest_mm, y = float(height.min()), np.log(value)
 
-    def fitted(error: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def fit_curve(error: FloatArray) -> tuple[FloatArray, FloatArray]:
         design = np.vander(np.log(height / lowest_mm), _DEGREE + 1)
         covariance = np.asarray(np.linalg.inv(design.T @ (design / error[:, None] ** 2)), dtype=np.float64)
         return covariance @ design.T @ (y / error**2), covariance
 
-    def steepness(coefficients: FloatArray, height_mm: FloatArray) -> FloatArray:
+    def log_slope_per_mm(coefficients: FloatArray, height_mm: FloatArray) -> FloatArray:
         within = np.clip(height_mm, lowest_mm, height[high])  # beyond the curve it goes on as it ends
         return np.asarray(np.polyval(np.polyder(coefficients), np.log(within / lowest_mm)) / height_mm)
 
     # Whole counts leave the heights of the curve open too.
     own = error / value
-    coefficients, covariance = fitted(np.hypot(own, ROUNDING_MM * steepness(fitted(own)[0], height)))
-    if (steepness(coefficients, height) >= 0).any():
+    coefficients, covariance = fit_curve(np.hypot(own, ROUNDING_MM * log_slope_per_mm(fit_curve(own)[0], height)))
+    if (log_slope_per_mm(coefficients, height) >= 0).any():
         raise _uninformative_readings_error(curve[low], curve[high], noise)
     told, read = (np.array([getattr(look, name) for look in others]) for name in ("height_mm", "value"))
-    steep = steepness(coefficients, told)
+    steep = log_slope_per_mm(coefficients, told)
     basis = np.vander(np.log(told / lowest_mm), _DEGREE + 1)
     off = (np.log(read) - basis @ coefficients) / steep
     shared = basis / steep[:, None]
     own = np.array([look.error for look in others]) / read / steep
     joint = shared @ covariance @ shared.T + np.diag(own**2 + ROUNDING_MM**2)
     p_value = float(chdtrc(len(off), off @ np.linalg.solve(joint, off)))
-    return HeightCheck(float(-steepness(coefficients, height[[low]])[0]), off, np.sqrt(np.diagonal(joint)), p_value)
+    return HeightCheck(
+        float(-log_slope_per_mm(coefficients, height[[low]])[0]), off, np.sqrt(np.diagonal(joint)), p_value
+    )
 
 
 def _uninformative_readings_error(low: HeightReading, high: HeightReading, noise: float) -> ParameterError:

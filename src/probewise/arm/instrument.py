@@ -71,11 +71,11 @@ class Instrument(Protocol):
         ...
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Return the seconds to move to each place and read there, shape (n_places,)."""
+        """Return the seconds to move from `start` to each place, (n_places, 2), and read there: shape (n_places,)."""
         ...
 
     def measure(self, pose: Pose) -> Reading:
-        """Move to a pose, lower, read, raise.
+        """Move to a pose, lower the sensor, read it and raise it; return the reading.
 
         Raises
         ------

@@ -17,7 +17,7 @@ from probewise.arm.basics import Clock, Side
 from probewise.arm.geometry import ROOM_COUNTS, Geometry, wrapped_to_pi
 from probewise.arm.instrument import Pose, Reading
 from probewise.arm.machine import Machine
-from probewise.arm.reach import require_reach
+from probewise.arm.reach import require_within_reach
 from probewise.arm.scale import ReadingScale
 from probewise.errors import LinkError, ReachError
 
@@ -97,7 +97,7 @@ class LegoArm:
     @property
     def angles_rad(self) -> FloatArray:
         """Joint angles by the motors' counters, shape (3,)."""
-        joints, counts = self.geometry.joints, self._machine.limits.counts
+        joints, counts = self.geometry.joints, self._machine.limits.last_counts
         return np.array([joints[k].angle_at(counts[k], self._arrived[k]) for k in (BASE, SHOULDER, ELBOW)])
 
     @property
@@ -122,7 +122,7 @@ class LegoArm:
         return np.asarray(moves.sum(axis=-1) + READ_S)
 
     def measure(self, pose: Pose) -> Reading:
-        """Move to a pose, lower, read, raise.
+        """Move to a pose, lower the sensor, read it, and raise it.
 
         Returns
         -------
@@ -136,7 +136,7 @@ class LegoArm:
             If the brick does not answer, or a motor does not move.
         """
         place = np.array([[pose.x_mm, pose.y_mm]])
-        require_reach(self.geometry, place, "pose")
+        require_within_reach(self.geometry, place, "pose")
         if pose.height_mm not in (None, self.geometry.read_height_mm):
             raise ReachError(
                 "height_mm", pose.height_mm, f"{self.geometry.read_height_mm:g}, at which this arm reads, or None"
@@ -170,7 +170,7 @@ class LegoArm:
         goals = self._goals_at_place(x_mm, y_mm, self.geometry.travel_height_mm)
         self.rise()
         self._turn_joint_to(BASE, goals[BASE])
-        for joint in self._link_order(goals):
+        for joint in self._choose_link_order(goals):
             self._move_joint_near(joint, goals[joint].counts)
 
     def go_down(self, x_mm: float, y_mm: float, height_mm: float | None = None) -> None:
@@ -197,7 +197,7 @@ class LegoArm:
         self.rise()
         self._turn_joint_to(BASE, goals[BASE])
         self._is_down = True
-        for joint in self._link_order(goals):
+        for joint in self._choose_link_order(goals):
             self._turn_joint_to(joint, goals[joint])
 
     def rise(self) -> None:
@@ -211,7 +211,7 @@ class LegoArm:
         for _ in range(N_RISES):
             if self.position_mm[2] >= self.geometry.travel_height_mm - NEAR_TRAVEL_MM:
                 break
-            ways = [way for joint in (SHOULDER, ELBOW) if (way := self._single_link_rise(joint)) is not None]
+            ways = [way for joint in (SHOULDER, ELBOW) if (way := self._plan_rise_by_link(joint)) is not None]
             if not ways:
                 stand = np.degrees(self.angles_rad).round(1).tolist()
                 raise ReachError("joints", stand, "angles from which the sensor can rise; bring the arm home by hand")
@@ -244,7 +244,7 @@ class LegoArm:
             for side in self._approach_sides_of(np.array([joint.home_rad for joint in self.geometry.joints]))
         ]
         self._turn_joint_to(BASE, goals[BASE])
-        for joint in self._link_order(goals):
+        for joint in self._choose_link_order(goals):
             self._turn_joint_to(joint, goals[joint])
         if stopped:
             self._machine.reset(stopped)
@@ -262,7 +262,7 @@ class LegoArm:
         return in_lego_units(self._machine.read_percent(), self.geometry)
 
     def brightness(self) -> float:
-        """Read the sensor at its current place, 0 to 100, at its full resolution."""
+        """Read the sensor at its current place, in percent, 0 to 100, at its full resolution."""
         return self._machine.read_percent()
 
     def battery_mv(self) -> float:
@@ -274,7 +274,7 @@ class LegoArm:
         self._machine.keep_awake()
 
     def turn(self, joint: int, by_rad: float) -> None:
-        """Turn one joint by an angle, subject to the limits."""
+        """Turn one joint (0 to 2: base, shoulder, elbow) by an angle; ReachError if it would leave the limits."""
         angles = self.angles_rad
         angles[joint] += by_rad
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
@@ -310,11 +310,11 @@ class LegoArm:
         _, shoulder, elbow = self.geometry.height_slopes_mm_rad(angles_rad[None, :])[0]
         return 1, (-1 if shoulder > 0 else 1), (-1 if elbow > 0 else 1)
 
-    def _link_order(self, goals: Sequence[Goal]) -> tuple[int, int]:
-        """Choose in which order to move the two links, so that the sensor stays as high as possible.
+    def _choose_link_order(self, goals: Sequence[Goal]) -> tuple[int, int]:
+        """Return in which order to move the two links, so that the sensor stays as high as possible.
 
         The sensor is far down while the lower link swings through the vertical. If neither order leaves enough room,
-        this raises the upper link and puts its move last.
+        this first moves the upper link, to the vertical, and then puts its move last.
         """
         orders = [(SHOULDER, ELBOW), (ELBOW, SHOULDER)]
         ways = [[(joint, goals[joint].counts) for joint in order] for order in orders]
@@ -327,15 +327,15 @@ class LegoArm:
 
     def _heights_along_mm(self, way: Sequence[tuple[int, int]]) -> FloatArray:
         """Return the heights of the sensor along a path from the current counts through successive counts."""
-        counts = list(self._machine.limits.counts)
+        counts = list(self._machine.limits.last_counts)
         heights = []
         for joint, goal in way:
-            heights.append(self._machine.limits.heights_mm(counts, joint, goal))
+            heights.append(self._machine.limits.heights_along_move_mm(counts, joint, goal))
             counts[joint] = goal
         return np.concatenate(heights)
 
-    def _single_link_rise(self, joint: int) -> tuple[int, int, int] | None:
-        """Find how one link alone can raise the sensor: counts to turn, joint, target count; None if it cannot."""
+    def _plan_rise_by_link(self, joint: int) -> tuple[int, int, int] | None:
+        """Return how one link alone can raise the sensor: counts to turn, joint, target count; None if it cannot."""
         mechanics, stand = self.geometry.joints[joint], self.angles_rad
         up = mechanics.low_rad if self._approach_sides_of(stand)[joint] > 0 else mechanics.high_rad
         angles = np.tile(stand, (N_TRIED, 1))
@@ -343,7 +343,7 @@ class LegoArm:
         high_enough = np.flatnonzero(self.geometry.position_mm(angles)[:, 2] >= self.geometry.travel_height_mm)
         if not high_enough.size:
             return None
-        here = self._machine.limits.counts[joint]
+        here = self._machine.limits.last_counts[joint]
         way = mechanics.counts_at(float(angles[high_enough[0], joint]), self._arrived[joint]) - here
         # A coarse move shorter than the motor's overrun would not be made.
         far = int(math.copysign(max(abs(way), ROOM_COUNTS), way))

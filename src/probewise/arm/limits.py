@@ -1,4 +1,4 @@
-"""Soft limits: refuse every motor command that would take a joint or the sensor out of its allowed range."""
+"""Soft limits: they refuse every motor command that would take a joint or the sensor out of its allowed range."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ N_CHECKED = 33  # points checked along a move
 
 
 class SoftLimits:
-    """Limits of the joints and of the sensor's height, checked from the motors' last counts.
+    """Allowed range of each joint and of the sensor's height; moves are checked from the motors' last counts.
 
     Parameters
     ----------
@@ -27,19 +27,21 @@ class SoftLimits:
         self._geometry = geometry
         self._counts = [0, 0, 0]
 
-    def record(self, joint: int, counts: int) -> None:
+    def record_counts(self, joint: int, counts: int) -> None:
         """Record the present count of a joint's motor."""
         self._counts[joint] = counts
 
-    stands = record  # its old name
+    record = stands = record_counts  # its old names
 
     @property
-    def counts(self) -> tuple[int, int, int]:
-        """Last recorded counts of the motors: base, shoulder, elbow."""
+    def last_counts(self) -> tuple[int, int, int]:
+        """Last recorded counts of the motors: base, shoulder, elbow; 0 at the start."""
         base, shoulder, elbow = self._counts
         return base, shoulder, elbow
 
-    def heights_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
+    counts = last_counts  # its old name
+
+    def heights_along_move_mm(self, counts: Sequence[int], joint: int, to: int, here: int | None = None) -> FloatArray:
         """Return the sensor's height at points along a move of one joint, shape (n,).
 
         Parameters
@@ -58,10 +60,12 @@ class SoftLimits:
         way[:, joint] = np.linspace(start, joints[joint].angle_at(to), N_CHECKED)
         return np.asarray(self._geometry.position_mm(way)[:, 2])
 
-    def check(self, joint: int, here: int, to: int) -> None:
-        """Refuse a move of one joint, the others at rest, that leaves the allowed range.
+    heights_mm = heights_along_move_mm  # its old name
 
-        A joint that is already outside may move back.
+    def require_allowed_move(self, joint: int, here: int, to: int) -> None:
+        """Raise ReachError if a move of one joint, the others at rest, leaves the allowed range.
+
+        A joint that is already outside may move back. `here` and `to` are the counts of its motor at start and end.
 
         Raises
         ------
@@ -77,7 +81,7 @@ class SoftLimits:
                 f"{math.degrees(angle):.1f} degrees",
                 f"{math.degrees(mechanics.low_rad):g} to {math.degrees(mechanics.high_rad):g} degrees",
             )
-        heights = self.heights_mm(self.counts, joint, to, here)
+        heights = self.heights_along_move_mm(self.last_counts, joint, to, here)
         floor = min(geometry.lowest_mm, float(heights[0]))
         if heights.min() < floor:
             raise ReachError(
@@ -85,3 +89,5 @@ class SoftLimits:
                 f"{heights.min():.0f} mm",
                 f"{geometry.lowest_mm:g} mm or more; is the arm where its counters say? home it",
             )
+
+    check = require_allowed_move  # its old name

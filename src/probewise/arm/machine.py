@@ -78,30 +78,30 @@ class DryRun:
         self.release()
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Print the command."""
-        self._print_move(joint, goal, "up" if side > 0 else "down")
+        """Print the move and record its count; ReachError if it would leave the limits."""
+        self._check_and_print_move(joint, goal, "up" if side > 0 else "down")
 
     def move_near(self, joint: int, goal: int) -> None:
-        """Print the command."""
-        self._print_move(joint, goal, "roughly")
+        """Print the move and record its count; ReachError if it would leave the limits."""
+        self._check_and_print_move(joint, goal, "roughly")
 
     def release(self) -> None:
         """Print the command."""
         self._say("release all motors")
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Print the command."""
-        self.limits.record(joint, self._geometry.joints[joint].stop_counts)
+        """Print the command and record the count of the stop."""
+        self.limits.record_counts(joint, self._geometry.joints[joint].stop_counts)
         self._say(f"{JOINTS[joint]:<8} {'up' if side > 0 else 'down'} to its stop")
 
     def reset(self, joints: Sequence[int]) -> None:
-        """Print that these counters are set to 0."""
+        """Print that these counters are set to 0, and record it."""
         for joint in joints:
-            self.limits.record(joint, 0)
+            self.limits.record_counts(joint, 0)
         self._say(f"set to 0 the counters of {', '.join(JOINTS[joint] for joint in joints)}")
 
     def read_percent(self) -> float:
-        """Print the command; nothing is read."""
+        """Print the command and return NaN: nothing is read."""
         self._say("read the light sensor")
         return math.nan
 
@@ -112,10 +112,10 @@ class DryRun:
     def keep_awake(self) -> None:
         """Do nothing."""
 
-    def _print_move(self, joint: int, goal: int, how: str) -> None:
-        here = self.limits.counts[joint]
-        self.limits.check(joint, here, goal)
-        self.limits.record(joint, goal)
+    def _check_and_print_move(self, joint: int, goal: int, how: str) -> None:
+        here = self.limits.last_counts[joint]
+        self.limits.require_allowed_move(joint, here, goal)
+        self.limits.record_counts(joint, goal)
         if goal != here:
             angle = math.degrees(self._geometry.joints[joint].angle_at(goal))
             self._say(f"{JOINTS[joint]:<8} to {angle:7.1f} degrees, motor from {here} to {goal} counts, {how}")

@@ -26,7 +26,7 @@ class TouchedMark:
     place_mm: tuple[float, float, float]
 
 
-def read_marks(path: Path) -> tuple[FloatArray, FloatArray]:
+def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
     """Read marks: turns in radians and places in mm, both (n_marks, 3).
 
     Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty.
@@ -39,7 +39,7 @@ def read_marks(path: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def write_marks(marks: Sequence[TouchedMark], path: Path) -> None:
-    """Write marks as `read_marks` reads them, angles in degrees and places in mm, atomically."""
+    """Write marks as `read_turns_and_places` reads them, angles in degrees and places in mm, atomically."""
     turned = np.degrees([mark.turned_rad for mark in marks]).reshape(-1, 3).round(4)
     place = np.array([mark.place_mm for mark in marks]).reshape(-1, 3).round(4)
     columns = dict(zip((*_TURNED, *_PLACE), np.concatenate([turned, place], axis=1).T.tolist(), strict=True))

@@ -118,14 +118,18 @@ class OwnInstrument:
             )
 
     @property
-    def turns(self) -> bool:
+    def can_turn(self) -> bool:
         """Whether it turns its sensor to `pose.orientation_rad`, as declared by `turns = True`."""
         return bool(getattr(self._own, "turns", False))
 
+    turns = can_turn  # its old name
+
     @property
-    def lifts(self) -> bool:
+    def can_lift(self) -> bool:
         """Whether it reads at a given `pose.height_mm`, as declared by `lifts = True`."""
         return bool(getattr(self._own, "lifts", False))
+
+    lifts = can_lift  # its old name
 
     def sentence(self) -> str:
         """Describe the allowed places in words."""
@@ -137,7 +141,7 @@ class OwnInstrument:
         if own is None:
             return np.ones(len(places_mm), dtype=np.bool_)
         with self._errors_located("reachable"):
-            held = np.asarray(_per_place("reachable", own(places_mm), len(places_mm), "True or False"))
+            held = np.asarray(_array_per_place("reachable", own(places_mm), len(places_mm), "True or False"))
             if held.dtype.kind not in "biu":
                 raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
             return held.astype(np.bool_)
@@ -154,17 +158,17 @@ class OwnInstrument:
         own = getattr(self._own, "orientation_rad", 0.0)
         with self._errors_located("orientation_rad"):
             angles = own(places_mm) if callable(own) else own
-            return _finite_per_place("orientation_rad", angles, len(places_mm), "a finite number of radians")
+            return _finite_array_per_place("orientation_rad", angles, len(places_mm), "a finite number of radians")
 
     def travel_s(self, start: Pose, places_mm: FloatArray) -> FloatArray:
-        """Return the seconds to move from `start` to each place and read; default: from distance: shape (n_places,)."""
+        """Return the seconds to move from `start` to each place and read, (n_places,); by default, by distance."""
         own = getattr(self._own, "travel_s", None)
         if own is None:
             away = np.hypot(places_mm[:, 0] - start.x_mm, places_mm[:, 1] - start.y_mm)
             return np.asarray(away / self._speed.move_mm_s + self._speed.read_s)
         with self._errors_located("travel_s"):
             allowed = "seconds, finite, 0 or more; nan out of reach"
-            seconds = _floats_per_place("travel_s", own(start, places_mm), len(places_mm), allowed)
+            seconds = _float_array_per_place("travel_s", own(start, places_mm), len(places_mm), allowed)
             wrong = ~((seconds >= 0) & (seconds < math.inf))
             if wrong.any() and (wrong[self.reachable(places_mm)].any() or (seconds[wrong] < math.inf).any()):
                 raise ParameterError("what travel_s returned", float(seconds[wrong][0]), allowed)
@@ -260,7 +264,7 @@ def require_measures(name: str, own: object) -> None:
 
 
 def _checked_value(name: str, found: object) -> float:
-    """Return a reading as a float; NumPy scalars and arrays of one element are accepted."""
+    """Return a reading as a float; NumPy scalars and arrays without dimensions are accepted."""
     number = found.item() if isinstance(found, np.generic | np.ndarray) and np.ndim(found) == 0 else found
     if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
         raise ParameterError(name, found, _A_READING)
@@ -278,8 +282,8 @@ def _checked_covariate(name: object, number: object) -> float:
     return float(number)
 
 
-def _per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
-    """Return one value per place, or one for all, as an array (n_places,)."""
+def _array_per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
+    """Return one value per place, or one for all repeated, as an array (n_places,); ShapeError for another shape."""
     array = np.asarray(found)
     if array.ndim == 0:
         array = np.full(n_places, array)
@@ -288,15 +292,15 @@ def _per_place(name: str, found: object, n_places: int, allowed: str) -> Any:
     return array
 
 
-def _floats_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
-    array = _per_place(name, found, n_places, allowed)
+def _float_array_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+    array = _array_per_place(name, found, n_places, allowed)
     if array.dtype.kind not in "biuf":
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
     return np.asarray(array, dtype=np.float64)
 
 
-def _finite_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
-    array = _floats_per_place(name, found, n_places, allowed)
+def _finite_array_per_place(name: str, found: object, n_places: int, allowed: str) -> FloatArray:
+    array = _float_array_per_place(name, found, n_places, allowed)
     if not np.isfinite(array).all():
         raise ParameterError(f"what {name} returned", found, f"{allowed}, for each place or one for all")
     return array

@@ -15,7 +15,7 @@ FIELD_MM = (1048.0, 520.0)
 """Width and height of the paper's playing field, 131 x 65 LEGO units of 8 mm."""
 
 
-class Bounds(Protocol):
+class ReachablePlaces(Protocol):
     """The set of reachable places of an arm."""
 
     def contains(self, places_mm: FloatArray) -> BoolArray:
@@ -48,7 +48,7 @@ class Workspace(Protocol):
         ...
 
 
-def require_reach(workspace: Bounds, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
+def require_within_reach(workspace: ReachablePlaces, places_mm: FloatArray, of: str, *, way_out: str = "") -> None:
     """Raise ReachError if any place is out of reach, before anything moves.
 
     Parameters
@@ -131,11 +131,13 @@ class Reach:
             )
 
     @classmethod
-    def everywhere(cls, field_mm: tuple[float, float] = FIELD_MM) -> Self:
+    def over_whole_field(cls, field_mm: tuple[float, float] = FIELD_MM) -> Self:
         """Return the reach of an arm long enough for the whole field."""
         width, height = field_mm
         beyond = 60.0
         return cls(field_mm, beyond, 0.0, math.hypot(width / 2, height + beyond) + 1.0)
+
+    everywhere = over_whole_field  # its old name
 
     @property
     def axis_mm(self) -> tuple[float, float]:

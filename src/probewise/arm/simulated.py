@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray, floats
 from probewise._kinds import require_callable, require_like, require_number
 from probewise.arm.instrument import Pose, Reading, require_pose
-from probewise.arm.reach import Reach, Workspace, require_reach
+from probewise.arm.reach import Reach, Workspace, require_within_reach
 from probewise.arm.scale import ReadingScale
 from probewise.errors import ParameterError, ReachError, ShapeError
 
@@ -126,7 +126,7 @@ class SimulatedArm:
         return np.asarray(away / self.speed.move_mm_s + self.speed.read_s, dtype=np.float64)
 
     def measure(self, pose: Pose) -> Reading:
-        """Move to a pose, lower, read, raise; the reading's time is that of its completion.
+        """Simulate moving to a pose, lowering, reading and raising; the reading's time is that of its completion.
 
         Raises
         ------
@@ -135,7 +135,7 @@ class SimulatedArm:
         """
         require_pose(pose)
         place = np.array([[pose.x_mm, pose.y_mm]])
-        require_reach(self.reach, place, "pose")
+        require_within_reach(self.reach, place, "pose")
         if not math.isfinite(pose.orientation_rad):
             raise ReachError("orientation_rad", pose.orientation_rad, "a finite orientation")
         height_mm = self._height_mm if pose.height_mm is None else pose.height_mm

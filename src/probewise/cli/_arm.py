@@ -43,9 +43,9 @@ def add_geometry(parser: argparse.ArgumentParser, default: str = "the file that 
 
 def geometry_of(arguments: argparse.Namespace) -> Geometry:
     """Read the geometry given, or the shipped one."""
-    from probewise.arm import read_geometry, shipped_geometry
+    from probewise.arm import read_geometry, shipped_geometry_path
 
-    return read_geometry(arguments.geometry or shipped_geometry())
+    return read_geometry(arguments.geometry or shipped_geometry_path())
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,10 @@ def open_emulated_arm_and_bench(
     The clock runs as fast as possible. The emulator reads its own true geometry: `geometry_file`, or the shipped one.
     """
     from probewise.arm.nxt import Brick, BrickMachine, Link
-    from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry
+    from probewise.emulator import VirtualClock, VirtualLine, read_geometry, set_up_bench, shipped_geometry_path
 
     clock = VirtualClock()
-    numbers = read_geometry(geometry_file or shipped_geometry())
+    numbers = read_geometry(geometry_file or shipped_geometry_path())
     bench = set_up_bench(numbers, world, surface, clock, seed=seed, sleep_min=0)
     brick = Brick(Link(VirtualLine(bench.radio, clock), clock=clock), clock=clock)
     machine = BrickMachine(brick, geometry)
@@ -143,7 +143,7 @@ def arm_reporting_table_contact(
 
 def warn_if_clearance_doubtful(geometry: Geometry) -> None:
     """Warn if the sensor may touch the table: if its height may be wrong by more than the reading height."""
-    doubt_mm = geometry.height_doubt_mm
+    doubt_mm = geometry.max_height_error_mm
     if doubt_mm < geometry.read_height_mm:
         return
     known = (
@@ -244,8 +244,8 @@ def require_turns_and_lifts(
     if not isinstance(arm, OwnInstrument):
         return
     wanted = (
-        ("--orientations", orientations_deg, arm.turns, "turn its sensor to pose.orientation_rad; turns"),
-        ("--heights", heights_mm, arm.lifts, "read at pose.height_mm; lifts"),
+        ("--orientations", orientations_deg, arm.can_turn, "turn its sensor to pose.orientation_rad; turns"),
+        ("--heights", heights_mm, arm.can_lift, "read at pose.height_mm; lifts"),
     )
     for option, values, can, what in wanted:
         if values and not can:

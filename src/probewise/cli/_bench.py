@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from probewise.arm import LegoArm, OwnInstrument, Reading, ReadingScale, Request, SimulatedArm
+from probewise.arm import LegoArm, OwnInstrument, Reading, ReadingScale, RequestToPerson, SimulatedArm
 from probewise.cli._arm import SCENE, ArmName, open_emulated_arm_and_bench, open_nxt_arm, open_own_instrument
 from probewise.cli._common import DEFAULT_SEED
 from probewise.emulator import Tabletop, parse_scene
@@ -100,9 +100,9 @@ class Bench:
 
     def carry_out_request(self, patterns: Mapping[str, Pattern], origin_mm: tuple[float, float], request: str) -> None:
         """Carry out a request of `carry_out`: lay a pattern with its origin at `origin_mm`, or turn the sensor."""
-        if isinstance(request, Request) and request.pattern is not None:
+        if isinstance(request, RequestToPerson) and request.pattern is not None:
             self._table.surface = shifted_pattern(patterns[request.pattern], origin_mm)
-        if isinstance(request, Request) and request.turned_rad is not None:
+        if isinstance(request, RequestToPerson) and request.turned_rad is not None:
             self._table.turned_rad = request.turned_rad
 
 

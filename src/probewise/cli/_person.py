@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from probewise.arm import Pose
-from probewise.arm.carry_out import Request, reach_of
+from probewise.arm.carry_out import RequestToPerson, reach_of
 from probewise.cli._arm import prompter_for_answer
 from probewise.cli._bench import shifted_pattern
 from probewise.cli._common import print_warning
@@ -59,7 +59,7 @@ class PersonAtBench:
         self._check_sheets = check_sheets
         self._answer = prompter_for_answer(arm)
 
-    def __call__(self, request: Request) -> None:
+    def __call__(self, request: RequestToPerson) -> None:
         """Prompt, and check the sheet until it is right or the person overrides the check."""
         text = f"{request[0].upper()}{request[1:]}{self._hint_for_emulator_terminal(request)}"
         self._answer(f"{text}, then press Enter: ")
@@ -73,7 +73,7 @@ class PersonAtBench:
             if said.lower() == "go":
                 break
 
-    def _hint_for_emulator_terminal(self, request: Request) -> str:
+    def _hint_for_emulator_terminal(self, request: RequestToPerson) -> str:
         """Return a hint on what to type in the emulator's terminal to carry out the request; "" without an emulator."""
         if not self._emulated:
             return ""

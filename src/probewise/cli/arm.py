@@ -45,7 +45,7 @@ from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
 if TYPE_CHECKING:
-    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Reading, Request, SimulatedArm
+    from probewise.arm import Geometry, Instrument, LegoArm, OwnInstrument, Reading, RequestToPerson, SimulatedArm
     from probewise.cli._bench import Bench
     from probewise.recordings import Plan
 
@@ -237,7 +237,7 @@ def _report_geometry_and_reach(arguments: argparse.Namespace, geometry: Geometry
     else:
         known = f"fitted to {geometry.accuracy.marks} marks; by 2 sds the sensor may hang"
     print_result(
-        f"height       reads {geometry.read_height_mm:g} mm up; {known} {geometry.height_doubt_mm:.1f} mm lower",
+        f"height       reads {geometry.read_height_mm:g} mm up; {known} {geometry.max_height_error_mm:.1f} mm lower",
         quiet=arguments.quiet,
     )
     if not held.any():
@@ -315,13 +315,13 @@ def _bring_home(arguments: argparse.Namespace, geometry: Geometry) -> None:
 
 
 def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
-    from probewise.arm import shipped_geometry
+    from probewise.arm import shipped_geometry_path
     from probewise.arm.fitting import fit_geometry
-    from probewise.arm.geometry_file import read_geometry, with_fitted
-    from probewise.arm.mark_file import read_marks
+    from probewise.arm.geometry_file import read_geometry, text_with_fitted_values
+    from probewise.arm.mark_file import read_turns_and_places
     from probewise.recordings import write_text_atomically
 
-    source = arguments.geometry or shipped_geometry()
+    source = arguments.geometry or shipped_geometry_path()
     out = checked_output_file(arguments.out, *([] if arguments.geometry is None else [arguments.geometry]))
     if arguments.dry_run:
         raise ParameterError("--dry-run", True, "none with fit-geometry: a person directs its moves")
@@ -332,10 +332,10 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
     kept = out.with_suffix(".marks.csv") if arguments.marks is None else arguments.marks
     if arguments.arm is not None:
         _touch_and_save_marks(arguments, geometry, checked_output_file(kept))
-    turned, marks = read_marks(kept)
+    turned, marks = read_turns_and_places(kept)
     fitted = fit_geometry(geometry, turned, marks, touch_mm=arguments.touch_mm)
     print_result(fitted.summary(), quiet=arguments.quiet)
-    text = with_fitted(source.read_text(encoding="utf-8-sig"), fitted.geometry)
+    text = text_with_fitted_values(source.read_text(encoding="utf-8-sig"), fitted.geometry)
     write_text_atomically(out, text)
     read_geometry(out)  # check that edits by hand have not hidden a number
     print_result(f"written      {out}; give it as --geometry from now on", quiet=arguments.quiet)
@@ -344,7 +344,7 @@ def _fit_geometry(arguments: argparse.Namespace, geometry: Geometry) -> None:
 def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kept: Path) -> None:
     """Bring the sensor to one mark after another as a person directs; save each at once to the file `kept`."""
     from probewise.arm import LegoArm
-    from probewise.arm.mark_file import TouchedMark, read_marks, write_marks
+    from probewise.arm.mark_file import TouchedMark, read_turns_and_places, write_marks
     from probewise.arm.marks import places_of_marks
     from probewise.cli._marks import bring_to_mark
 
@@ -355,7 +355,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
         raise FileError(kept, "the file exists already", "--resume to continue it, or another --marks")
     taken: list[TouchedMark] = []
     if kept.exists():
-        rows = zip(*(array.tolist() for array in read_marks(kept)), strict=True)
+        rows = zip(*(array.tolist() for array in read_turns_and_places(kept)), strict=True)
         taken = [TouchedMark(tuple(turned), tuple(place)) for turned, place in rows]
     done = {mark.place_mm[:2] for mark in taken}
     marks = [(x, y) for x, y in places_of_marks(geometry).tolist()]
@@ -391,7 +391,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
     """Compare by the light over white how high the sensor hangs at each place with the first; print the differences."""
     import numpy as np
 
-    from probewise.arm import LegoArm, require_reach
+    from probewise.arm import LegoArm, require_within_reach
     from probewise.arm.height_check import HeightReading, check_heights
     from probewise.arm.marks import places_of_marks
 
@@ -404,7 +404,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
     places = places or [(width / 2, height / 2), *((x, y) for x, y in places_of_marks(geometry).tolist())]
     if len(places) < 2:
         raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
-    require_reach(geometry, np.array(places), "place")
+    require_within_reach(geometry, np.array(places), "place")
     arguments.sensor = arguments.seed = arguments.scene = None
     instrument, bench = _open_instrument(arguments, geometry, scene=WHITE)
     assert isinstance(instrument, LegoArm)
@@ -464,7 +464,7 @@ def _read_sensor(arguments: argparse.Namespace, geometry: Geometry) -> None:
 def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
     import numpy as np
 
-    from probewise.arm import LegoArm, Pose, require_reach
+    from probewise.arm import LegoArm, Pose, require_within_reach
     from probewise.arm.carry_out import reach_of
 
     start, end = parse_place("X,Y", arguments.start), parse_place("X,Y", arguments.end)
@@ -472,12 +472,12 @@ def _scan_line(arguments: argparse.Namespace, geometry: Geometry) -> None:
         raise ParameterError("--readings", arguments.readings, f"up to {_MOST_READINGS}")
     places = np.linspace(start, end, arguments.readings)
     if arguments.arm is None or parse_arm(arguments.arm).is_lego:  # before connecting to the brick
-        require_reach(geometry, places, "reading of the scan")
+        require_within_reach(geometry, places, "reading of the scan")
     names: list[str] = ["battery_mv"]
     instrument, _ = _open_instrument(arguments, geometry)
     _warn_and_confirm_lowering(arguments, instrument, geometry)
     with instrument as arm:
-        require_reach(reach_of(arm), places, "reading of the scan")
+        require_within_reach(reach_of(arm), places, "reading of the scan")
         if isinstance(arm, LegoArm):
             print_result(",".join((_COLUMNS, *names)))
         for k, ((x_mm, y_mm), standing) in enumerate(zip(places, arm.orientation_rad(places), strict=True)):
@@ -524,7 +524,7 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     with reporting_what_is_kept(kept_message), instrument as arm:
         check = SheetCheck(plan, white_is_bright=not own)
         by_person = bench is None and not arguments.dry_run
-        ask: Callable[[Request], None] = (
+        ask: Callable[[RequestToPerson], None] = (
             _prompter(arguments, arm) if bench is None else partial(bench.carry_out_request, plan.patterns, origin)
         )
         if by_person:
@@ -568,7 +568,7 @@ def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list
     """
     import numpy as np
 
-    from probewise.arm import readings_of
+    from probewise.arm import readings_of_recording
     from probewise.recordings import read_recording
 
     if dry:
@@ -584,7 +584,7 @@ def _earlier_readings(out: Path, plan: Plan, *, resume: bool, dry: bool) -> list
     same = same_length and all((off <= _OFF_PLAN_MM).all() for off in off_mm)
     if not same or [rows.pattern_names[k] for k in rows.pattern] != [first.pattern_names[k] for k in first.pattern]:
         raise FileError(out, "readings of another plan", "the first rows of this plan, from an earlier session")
-    return readings_of(before)
+    return readings_of_recording(before)
 
 
 def _open_lego_arm(arguments: argparse.Namespace, geometry: Geometry, *, start_s: float = 0.0) -> LegoArm:

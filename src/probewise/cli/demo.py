@@ -54,7 +54,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
     import json
     import time
 
-    from probewise.arm import read_geometry, shipped_geometry
+    from probewise.arm import read_geometry, shipped_geometry_path
     from probewise.calibration import predict, write_sensor
     from probewise.cli import diagnose as diagnose_verb
     from probewise.cli._workers import worker_pool
@@ -95,7 +95,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         prediction=prediction,
         searches=searches,
         started_alike=started_alike,
-        geometry=read_geometry(shipped_geometry()),
+        geometry=read_geometry(shipped_geometry_path()),
     )
     drawn |= report.encoded_diagnosis_figures(diagnosis) | doubt_report.encoded_figures(doubted)
     concealed = ", ".join(effect.name for effect in world_behind("concealed").concealed)

@@ -71,10 +71,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise LinkError("emulate-nxt needs pseudo-terminals, which Linux, macOS and WSL have and this system lacks")
 
     from probewise.cli._bench import world_and_instrumentation
-    from probewise.emulator import Faults, parse_scene, read_geometry, set_up_bench, shipped_geometry
+    from probewise.emulator import Faults, parse_scene, read_geometry, set_up_bench, shipped_geometry_path
     from probewise.emulator.pty import Terminal, serve
 
-    geometry = read_geometry(shipped_geometry() if arguments.geometry is None else arguments.geometry)
+    geometry = read_geometry(shipped_geometry_path() if arguments.geometry is None else arguments.geometry)
     surface = parse_scene(arguments.scene)
     faults = Faults.parse(arguments.fault)
     world, _ = world_and_instrumentation(arguments.sensor)
@@ -130,7 +130,7 @@ class _TypedCommands:
             print_result(_position_in_words(self._bench.arm.sensor_pose()))
             return
         try:
-            self._bench.table.carry_out(line)
+            self._bench.table.carry_out_line(line)
             print_result(f"done: {line}")
         except ParameterError as error:
             print_result(str(error))

@@ -190,7 +190,7 @@ def _opened_plan_runner(
     arguments: argparse.Namespace, chosen: ArmName, folder: RoundsFolder, *, seed: int
 ) -> Iterator[Take]:
     """Open an arm; yield the function that takes a plan's readings with it. A person or the bench lays the sheets."""
-    from probewise.arm import Request, carry_out
+    from probewise.arm import RequestToPerson, carry_out
     from probewise.cli._bench import open_arm_and_bench
 
     geometry = geometry_of(arguments)
@@ -205,7 +205,7 @@ def _opened_plan_runner(
         by_hand, laid = prompter(arm), list[str]()
 
         def take_readings(number: int, plan: Plan, asked: str, taken: Sequence[Reading]) -> Iterator[Reading]:
-            def ask(request: Request) -> None:
+            def ask(request: RequestToPerson) -> None:
                 if bench is not None:
                     bench.carry_out_request(plan.patterns, origin, request)
                 elif not arguments.no_hands:

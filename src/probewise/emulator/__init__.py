@@ -9,7 +9,7 @@ from probewise.emulator.bench import Bench, set_up_bench
 from probewise.emulator.brick import Battery, Brick
 from probewise.emulator.clock import Clock, VirtualClock
 from probewise.emulator.faults import Faults
-from probewise.emulator.geometry import Geometry, JointNumbers, read_geometry, shipped_geometry
+from probewise.emulator.geometry import Geometry, JointNumbers, read_geometry, shipped_geometry_path
 from probewise.emulator.light_model import LightModel
 from probewise.emulator.line import VirtualLine
 from probewise.emulator.motor import Motor, MotorParameters
@@ -59,9 +59,12 @@ __all__ = [
     "parse_scene",
     "read_geometry",
     "set_up_bench",
-    "shipped_geometry",
+    "shipped_geometry_path",
     "ultrasonic_sensor",
 ]
+
+shipped_geometry = shipped_geometry_path
+"""The old name of `shipped_geometry_path`."""
 
 set_up = set_up_bench
 """The old name of `set_up_bench`."""

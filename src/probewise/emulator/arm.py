@@ -30,7 +30,7 @@ class Joint:
     motor: Motor
 
     @classmethod
-    def at_home(cls, numbers: JointNumbers) -> Self:
+    def create_at_home(cls, numbers: JointNumbers) -> Self:
         """Make a joint at its home position, with the motor at 0."""
         ends = sorted(
             (angle_deg - numbers.home_deg) * numbers.gear_ratio
@@ -47,7 +47,7 @@ class Joint:
         return math.radians(self.numbers.home_deg + self.motor.driven_deg / self.numbers.gear_ratio)
 
     def bring_to(self, angle_deg: float) -> None:
-        """Turn the joint by hand; the motor follows and rests in the middle of the backlash."""
+        """Set the joint to an angle, as by hand; the motor follows and rests in the middle of the backlash."""
         self.motor.angle_deg = self.motor.driven_deg = (angle_deg - self.numbers.home_deg) * self.numbers.gear_ratio
         self.motor.speed_deg_s = 0.0
 
@@ -70,7 +70,7 @@ class EmulatedArm:
 
     def __init__(self, geometry: Geometry) -> None:
         self._geometry = geometry
-        self.joints = tuple(Joint.at_home(numbers) for numbers in geometry.joints)
+        self.joints = tuple(Joint.create_at_home(numbers) for numbers in geometry.joints)
         self.lowest = self.sensor_pose()
 
     def motors(self) -> tuple[Motor, ...]:

@@ -12,7 +12,7 @@ from probewise.emulator.inputs import Inputs, Sensor
 from probewise.emulator.motor import Motor
 from probewise.emulator.outputs import Outputs
 from probewise.emulator.programs import Programs
-from probewise.emulator.protocol import RefusedError, Request, Status, parse, reply
+from probewise.emulator.protocol import RefusedError, Request, Status, build_reply, parse_request
 from probewise.emulator.sensors import EmptyPort
 from probewise.errors import ParameterError
 
@@ -138,17 +138,17 @@ class Brick:
         A command with the no-reply bit gets none, not even for an error.
         """
         self.advance()
-        request = None if self.is_off else parse(telegram)
+        request = None if self.is_off else parse_request(telegram)
         if request is None:
             return None
         status, payload = self._execute_request(request)
-        return reply(request.opcode, status, payload) if request.wants_reply else None
+        return build_reply(request.opcode, status, payload) if request.wants_reply else None
 
     def _execute_request(self, request: Request) -> tuple[Status, bytes]:
         if request.command is None:
             return Status.UNKNOWN_COMMAND, b""
         try:
-            return Status.OK, self._commands[request.opcode](*request.command.fields(request.body))
+            return Status.OK, self._commands[request.opcode](*request.command.parse_fields(request.body))
         except RefusedError as refused:
             zeros = bytes(request.command.error_bytes)
             return refused.status, zeros if refused.payload is None else refused.payload
@@ -171,7 +171,7 @@ class Brick:
         return b""
 
     def _device_info(self) -> bytes:
-        return struct.pack("<15s7s4xI", self._name, ADDRESS, self._files.free)
+        return struct.pack("<15s7s4xI", self._name, ADDRESS, self._files.free_bytes)
 
     def _refuse_module(self, wanted: bytes | int) -> bytes:
         raise RefusedError(Status.MODULE_NOT_FOUND)

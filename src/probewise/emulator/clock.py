@@ -1,4 +1,4 @@
-"""Clocks: real time, or a virtual clock that advances only by `sleep`."""
+"""The type of a clock, and a virtual clock that advances only by `sleep`."""
 
 from __future__ import annotations
 

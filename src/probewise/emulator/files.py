@@ -25,7 +25,7 @@ class _OpenFile:
 
 
 class Files:
-    """Files in flash.
+    """The flash file system: the files, the open handles, and the commands on them.
 
     Parameters
     ----------
@@ -55,33 +55,33 @@ class Files:
         }
 
     @property
-    def free(self) -> int:
+    def free_bytes(self) -> int:
         """Free bytes of flash; those reserved by open files count as used."""
         promised = sum(opened.size - opened.at for opened in self._open_files.values() if opened.size is not None)
         return self._capacity - promised - sum(len(content) for content in self._files.values())
 
     def exists(self, name: str) -> bool:
         """Return whether a file exists; names are not case-sensitive."""
-        return self._matching_name(name) is not None
+        return self._stored_name_or_none(name) is not None
 
     def _open_to_read(self, name: bytes) -> bytes:
-        found = self._stored_name(name)
+        found = self._checked_stored_name(name)
         return bytes((self._new_handle(_OpenFile(found)),)) + struct.pack("<I", len(self._files[found]))
 
     def _open_to_write(self, name: bytes, size: int) -> bytes:
         text = _checked_name(name)
         if self.exists(text):
             raise RefusedError(Status.FILE_EXISTS)
-        if size > self.free:
+        if size > self.free_bytes:
             raise RefusedError(Status.NO_SPACE)
         handle = self._new_handle(_OpenFile(text, size=size))
         self._files[text] = bytearray()
         return bytes((handle,))
 
     def _open_to_append(self, name: bytes) -> bytes:
-        found = self._stored_name(name)
+        found = self._checked_stored_name(name)
         length = len(self._files[found])
-        room = self.free
+        room = self.free_bytes
         handle = self._new_handle(_OpenFile(found, at=length, size=length + room))
         return bytes((handle,)) + struct.pack("<I", room)
 
@@ -113,7 +113,7 @@ class Files:
         return bytes((handle,))
 
     def _delete_file(self, name: bytes) -> bytes:
-        found = self._matching_name(_checked_name(name))
+        found = self._stored_name_or_none(_checked_name(name))
         if found is None:
             raise RefusedError(Status.FILE_NOT_FOUND, name)
         if any(opened.name == found for opened in self._open_files.values()):
@@ -131,12 +131,9 @@ class Files:
         matches = tuple(name for name in sorted(self._files) if fnmatchcase(name.lower(), wanted))
         if not matches:
             raise RefusedError(Status.FILE_NOT_FOUND)
-        return self._next_match(self._new_handle(_OpenFile("", matches=matches)))
+        return self._find_next_file(self._new_handle(_OpenFile("", matches=matches)))
 
     def _find_next_file(self, handle: int) -> bytes:
-        return self._next_match(handle)
-
-    def _next_match(self, handle: int) -> bytes:
         search = self._file_of_handle(handle)
         matches = tuple(name for name in search.matches if name in self._files)
         if not matches:
@@ -158,13 +155,13 @@ class Files:
             raise RefusedError(Status.HANDLE_CLOSED)
         return self._open_files[handle]
 
-    def _stored_name(self, name: bytes) -> str:
-        found = self._matching_name(_checked_name(name))
+    def _checked_stored_name(self, name: bytes) -> str:
+        found = self._stored_name_or_none(_checked_name(name))
         if found is None:
             raise RefusedError(Status.FILE_NOT_FOUND)
         return found
 
-    def _matching_name(self, name: str) -> str | None:
+    def _stored_name_or_none(self, name: str) -> str | None:
         return next((known for known in self._files if known.lower() == name.lower()), None)
 
 

@@ -45,7 +45,7 @@ class Geometry:
     joints: tuple[JointNumbers, JointNumbers, JointNumbers]  # base, shoulder, elbow
 
 
-def shipped_geometry() -> Path:
+def shipped_geometry_path() -> Path:
     """Return the path of the arm file shipped with the package."""
     return Path(str(resources.files("probewise"))) / "data" / "lego_arm.toml"
 

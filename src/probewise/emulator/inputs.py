@@ -74,7 +74,7 @@ class Inputs:
 
     def _configure_port(self, port: _InputPort, kind: int, mode: int) -> None:
         """Set type and mode; readings are invalid for a while, and the old values stay."""
-        self._convert_reading(port)
+        self._update_reading(port)
         now_s = self.clock()
         if kind != port.kind:
             port.valid_s = now_s + (0.301 if kind in _SOUND else 0.401 if kind in _COLOUR else 0.021)
@@ -84,7 +84,7 @@ class Inputs:
 
     def _get_values(self, number: int) -> bytes:
         port = self._port_numbered(number)
-        valid = self._convert_reading(port)
+        valid = self._update_reading(port)
         raw, normalized, scaled = port.shown
         return struct.pack(
             "<BBBBBHHhh", number, valid, False, port.kind, port.mode, raw, normalized, scaled, normalized
@@ -95,8 +95,8 @@ class Inputs:
         port.shown = (*port.shown[:2], 0)  # until the next conversion
         return b""
 
-    def _convert_reading(self, port: _InputPort) -> bool:
-        """Update the port's values; return whether they are valid."""
+    def _update_reading(self, port: _InputPort) -> bool:
+        """Read the port's sensor and update the port's values; return whether they are valid."""
         if self.clock() < port.valid_s:
             return False
         if port.kind not in (_NONE, *_DIGITAL):
@@ -109,12 +109,12 @@ class Inputs:
 
     def _bus_status(self, number: int) -> bytes:
         port = self._port_numbered(number)
-        status, ready = self._bus_state(port)
+        status, ready = self._bus_status_and_bytes(port)
         return _payload_if_ok(status, bytes((len(ready),)))
 
     def _bus_write(self, number: int, n_written: int, n_wanted: int, written: bytes) -> bytes:
         port = self._port_numbered(number)
-        status, _ = self._bus_state(port)
+        status, _ = self._bus_status_and_bytes(port)
         if status in (Status.CHANNEL_NOT_READY, Status.BUS_PENDING):
             raise RefusedError(Status.CHANNEL_NOT_READY)
         if n_written > 16 or n_wanted > 16 or len(written) < n_written:
@@ -127,13 +127,13 @@ class Inputs:
 
     def _bus_read(self, number: int) -> bytes:
         port = self._port_numbered(number)
-        status, ready = self._bus_state(port)
+        status, ready = self._bus_status_and_bytes(port)
         if status == Status.OK:
             port.answer = b""
         return _payload_if_ok(status, bytes((len(ready),)) + ready.ljust(16, b"\0"))
 
-    def _bus_state(self, port: _InputPort) -> tuple[Status, bytes]:
-        """Return the status of the bus and the bytes to read."""
+    def _bus_status_and_bytes(self, port: _InputPort) -> tuple[Status, bytes]:
+        """Return the status of the I2C bus and the bytes ready to be read."""
         if port.kind not in _DIGITAL or self.clock() < port.valid_s:
             return Status.CHANNEL_NOT_READY, b""
         if self.clock() < port.answered_s:

@@ -76,12 +76,17 @@ class LightModel:
         )
         return (
             (bright + _CUT_OFF)
-            * (1 + lit * _led_brightness(sensor_pose.height_mm) / _led_brightness(self._read_height_mm))
+            * (
+                1
+                + lit
+                * _led_brightness_at_height(sensor_pose.height_mm)
+                / _led_brightness_at_height(self._read_height_mm)
+            )
             / 2
         )
 
 
-def _led_brightness(height_mm: float) -> float:
+def _led_brightness_at_height(height_mm: float) -> float:
     """Return the relative brightness of the LED at a height, 1 at the brightest."""
     steps = max(height_mm, 0.0) / _BRIGHTEST_MM
     return steps * math.exp(1 - steps)

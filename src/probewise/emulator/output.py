@@ -74,7 +74,7 @@ class Output:
     _settled: bool = False
 
     def __post_init__(self) -> None:
-        self._seen_deg = self._shown_deg
+        self._seen_deg = self._encoder_deg
 
     def apply(self, setting: OutputSetting) -> None:
         """Apply a command in the firmware's sequence: speed, then regulation, then limit."""
@@ -92,14 +92,14 @@ class Output:
         forward = (self.set_power or self.target_power) > 0
         self._goal += setting.tacho_limit if forward else -setting.tacho_limit
 
-    def reset(self, *, block: bool) -> None:
+    def reset_counter(self, *, block: bool) -> None:
         """Set the block or the rotation counter to 0; neither touches the goal."""
         if block:
             self.block_count = 0
         else:
             self.rotation_count = 0
 
-    def report(self) -> tuple[FieldValue, ...]:
+    def reply_fields(self) -> tuple[FieldValue, ...]:
         """Return the fields of a GETOUTPUTSTATE reply after the port's number."""
         s = self.setting
         asked = (s.power, s.mode, s.regulation, s.turn_ratio, self.run_state, s.tacho_limit)
@@ -108,7 +108,7 @@ class Output:
     def simulate_millisecond(self, battery_mv: float) -> None:
         """Simulate a millisecond of motor and firmware."""
         self.motor.step(1e-3, self.power, brake=self._brake, battery_mv=battery_mv)
-        seen = self._shown_deg
+        seen = self._encoder_deg
         turned, self._seen_deg = seen - self._seen_deg, seen
         self.tacho_count += turned
         self.block_count += turned
@@ -120,11 +120,11 @@ class Output:
         if self.run_state == RunState.RAMP_DOWN:
             self._ramp_down()
         if self.run_state == RunState.RUNNING:
-            self._run_until_limit()
+            self._stop_at_limit()
         if self.run_state == RunState.IDLE:
             self._fade_power()
 
-    def regulate(self) -> bool:
+    def regulate_if_due(self) -> bool:
         """Regulate the speed if it is due; return whether it was."""
         if self._clock_ms <= _REGULATION_MS:
             return False
@@ -139,7 +139,7 @@ class Output:
     @property
     def is_at_rest(self) -> bool:
         """Whether nothing will change without a command or a hand that turns the motor."""
-        if self.motor.speed_deg_s or self.target_power or self.set_power or self._seen_deg != self._shown_deg:
+        if self.motor.speed_deg_s or self.target_power or self.set_power or self._seen_deg != self._encoder_deg:
             return False
         return self._settled and not self._moved if self._regulation else not self.power
 
@@ -154,8 +154,8 @@ class Output:
         return self._regulation & (_SYNC | _SPEED) == _SYNC
 
     @property
-    def _shown_deg(self) -> int:
-        """Reading of the motor's encoder: the nearest whole degree, so that home lies in the middle of count 0.
+    def _encoder_deg(self) -> int:
+        """Angle that the motor's encoder shows: the nearest whole degree, so that home lies in the middle of count 0.
 
         A real encoder's count may change at any angle. If it changed at home, a count would mean an angle half a degree
         larger on average, and every place would be off accordingly.
@@ -220,8 +220,8 @@ class Output:
             self.run_state, self._regulation = RunState.IDLE, 0
         self._drive_unregulated()
 
-    def _run_until_limit(self) -> None:
-        """Check for the limit; without one, carry the goal along."""
+    def _stop_at_limit(self) -> None:
+        """Become idle at the limit; without one, carry the goal along."""
         if self._endless:
             if self.target_power:
                 self._goal = self.tacho_count

@@ -23,7 +23,7 @@ class _Synchronisation:
     lead_sum: int = 0
     turn: int = 0  # difference in counts demanded by the turn ratio so far
 
-    def correct(self, one: Output, two: Output) -> None:
+    def correct_powers(self, one: Output, two: Output) -> None:
         """Slow the motor that leads and speed up the one that lags (PID gains 3, 1, 1, over 4)."""
         inner = two if (one.setting.turn_ratio > 0) == (one.target_power >= 0) else one
         self.turn += 2 * quotient_towards_zero(inner.setting.turn_ratio * abs(inner.target_power), 100)
@@ -85,9 +85,9 @@ class Outputs:
         if len(pair) == 2 and any(port.is_at_limit for port in pair):
             for port in pair:
                 port.run_state = RunState.IDLE
-        regulated = [port for port in moving if port.regulate()]
+        regulated = [port for port in moving if port.regulate_if_due()]
         if len(pair) == 2 and pair[0] in regulated:
-            self._synchronisation.correct(*pair)
+            self._synchronisation.correct_powers(*pair)
 
     def _set_state(
         self, port: int, power: int, mode: int, regulation: int, turn_ratio: int, run_state: int, tacho_limit: int
@@ -100,10 +100,10 @@ class Outputs:
         return b""
 
     def _get_state(self, port: int) -> bytes:
-        return struct.pack("<BbBBbBIiii", port, *self._port_numbered(port).report())
+        return struct.pack("<BbBBbBIiii", port, *self._port_numbered(port).reply_fields())
 
     def _reset_counter(self, port: int, relative: int) -> bytes:
-        self._port_numbered(port).reset(block=bool(relative))
+        self._port_numbered(port).reset_counter(block=bool(relative))
         return b""
 
     def _port_numbered(self, port: int) -> Output:

@@ -48,7 +48,7 @@ class Status(IntEnum):
 
 
 class RefusedError(Exception):
-    """A status other than OK; `payload` None means zeros at the command's full length."""
+    """Raised to refuse a command with a status other than OK; `payload` None: zeros at the full length of its reply."""
 
     def __init__(self, status: Status, payload: bytes | None = None) -> None:
         self.status, self.payload = status, payload
@@ -56,7 +56,7 @@ class RefusedError(Exception):
 
 
 @dataclass(frozen=True)
-class Command:
+class CommandLayout:
     """Layout of a command's telegram after the opcode, and length of its error reply after the status.
 
     `layout` is a `struct` format; with `more`, any further bytes are the last field. After the status of an
@@ -68,12 +68,12 @@ class Command:
     error_bytes: int = 0
     more: bool = False
 
-    def fields(self, body: bytes) -> tuple[FieldValue, ...]:
+    def parse_fields(self, body: bytes) -> tuple[FieldValue, ...]:
         """Parse the bytes after the opcode.
 
         Raises
         ------
-        Refused
+        RefusedError
             If there are too few of them.
         """
         size = struct.calcsize("<" + self.layout)
@@ -83,50 +83,50 @@ class Command:
         return (*found, body[size:]) if self.more else found
 
 
-COMMANDS: dict[int, Command] = {
-    0x00: Command("STARTPROGRAM", "20s"),
-    0x01: Command("STOPPROGRAM"),
-    0x02: Command("PLAYSOUNDFILE", "B20s"),
-    0x03: Command("PLAYTONE", "HH"),
-    0x04: Command("SETOUTPUTSTATE", "BbBBbBI"),
-    0x05: Command("SETINPUTMODE", "BBB"),
-    0x06: Command("GETOUTPUTSTATE", "B", 22),
-    0x07: Command("GETINPUTVALUES", "B", 13),
-    0x08: Command("RESETINPUTSCALEDVALUE", "B"),
-    0x09: Command("MESSAGEWRITE", "BB", more=True),
-    0x0A: Command("RESETMOTORPOSITION", "BB"),
-    0x0B: Command("GETBATTERYLEVEL"),
-    0x0C: Command("STOPSOUNDPLAYBACK"),
-    0x0D: Command("KEEPALIVE"),
-    0x0E: Command("LSGETSTATUS", "B"),
-    0x0F: Command("LSWRITE", "BBB", more=True),
-    0x10: Command("LSREAD", "B"),
-    0x11: Command("GETCURRENTPROGRAMNAME", "", 20),
-    0x13: Command("MESSAGEREAD", "BBB", 61),
-    0x80: Command("OPENREAD", "20s", 5),
-    0x81: Command("OPENWRITE", "20sI", 1),
-    0x82: Command("READ", "BH", 3),
-    0x83: Command("WRITE", "B", 3, more=True),
-    0x84: Command("CLOSE", "B", 1),
-    0x85: Command("DELETE", "20s", 20),
-    0x86: Command("FINDFIRST", "20s", 25),
-    0x87: Command("FINDNEXT", "B", 25),
-    0x88: Command("GETFIRMWAREVERSION"),
-    0x89: Command("OPENWRITELINEAR", "20sI", 1),
-    0x8B: Command("OPENWRITEDATA", "20sI", 1),
-    0x8C: Command("OPENAPPENDDATA", "20s", 5),
-    0x90: Command("FINDFIRSTMODULE", "20s", 31),
-    0x91: Command("FINDNEXTMODULE", "B", 31),
-    0x92: Command("CLOSEMODULE", "B", 1),
-    0x94: Command("READIOMAP", "IHH", 6),
-    0x95: Command("WRITEIOMAP", "IHH", 6, more=True),
-    0x97: Command("BOOT", "19s", 4),
-    0x98: Command("SETBRICKNAME", "", more=True),
-    0x9B: Command("GETDEVICEINFO"),
-    0xA0: Command("DELETEUSERFLASH"),
-    0xA1: Command("POLLLENGTH", "B"),
-    0xA2: Command("POLL", "BB", 2),
-    0xA4: Command("BLUETOOTHFACTORYRESET"),
+COMMANDS: dict[int, CommandLayout] = {
+    0x00: CommandLayout("STARTPROGRAM", "20s"),
+    0x01: CommandLayout("STOPPROGRAM"),
+    0x02: CommandLayout("PLAYSOUNDFILE", "B20s"),
+    0x03: CommandLayout("PLAYTONE", "HH"),
+    0x04: CommandLayout("SETOUTPUTSTATE", "BbBBbBI"),
+    0x05: CommandLayout("SETINPUTMODE", "BBB"),
+    0x06: CommandLayout("GETOUTPUTSTATE", "B", 22),
+    0x07: CommandLayout("GETINPUTVALUES", "B", 13),
+    0x08: CommandLayout("RESETINPUTSCALEDVALUE", "B"),
+    0x09: CommandLayout("MESSAGEWRITE", "BB", more=True),
+    0x0A: CommandLayout("RESETMOTORPOSITION", "BB"),
+    0x0B: CommandLayout("GETBATTERYLEVEL"),
+    0x0C: CommandLayout("STOPSOUNDPLAYBACK"),
+    0x0D: CommandLayout("KEEPALIVE"),
+    0x0E: CommandLayout("LSGETSTATUS", "B"),
+    0x0F: CommandLayout("LSWRITE", "BBB", more=True),
+    0x10: CommandLayout("LSREAD", "B"),
+    0x11: CommandLayout("GETCURRENTPROGRAMNAME", "", 20),
+    0x13: CommandLayout("MESSAGEREAD", "BBB", 61),
+    0x80: CommandLayout("OPENREAD", "20s", 5),
+    0x81: CommandLayout("OPENWRITE", "20sI", 1),
+    0x82: CommandLayout("READ", "BH", 3),
+    0x83: CommandLayout("WRITE", "B", 3, more=True),
+    0x84: CommandLayout("CLOSE", "B", 1),
+    0x85: CommandLayout("DELETE", "20s", 20),
+    0x86: CommandLayout("FINDFIRST", "20s", 25),
+    0x87: CommandLayout("FINDNEXT", "B", 25),
+    0x88: CommandLayout("GETFIRMWAREVERSION"),
+    0x89: CommandLayout("OPENWRITELINEAR", "20sI", 1),
+    0x8B: CommandLayout("OPENWRITEDATA", "20sI", 1),
+    0x8C: CommandLayout("OPENAPPENDDATA", "20s", 5),
+    0x90: CommandLayout("FINDFIRSTMODULE", "20s", 31),
+    0x91: CommandLayout("FINDNEXTMODULE", "B", 31),
+    0x92: CommandLayout("CLOSEMODULE", "B", 1),
+    0x94: CommandLayout("READIOMAP", "IHH", 6),
+    0x95: CommandLayout("WRITEIOMAP", "IHH", 6, more=True),
+    0x97: CommandLayout("BOOT", "19s", 4),
+    0x98: CommandLayout("SETBRICKNAME", "", more=True),
+    0x9B: CommandLayout("GETDEVICEINFO"),
+    0xA0: CommandLayout("DELETEUSERFLASH"),
+    0xA1: CommandLayout("POLLLENGTH", "B"),
+    0xA2: CommandLayout("POLL", "BB", 2),
+    0xA4: CommandLayout("BLUETOOTHFACTORYRESET"),
 }
 
 
@@ -136,11 +136,11 @@ class Request:
 
     opcode: int
     wants_reply: bool
-    command: Command | None
+    command: CommandLayout | None
     body: bytes
 
 
-def parse(telegram: bytes) -> Request | None:
+def parse_request(telegram: bytes) -> Request | None:
     """Parse a telegram; None for those the firmware ignores: replies, unknown types, incomplete ones."""
     if len(telegram) < 2:
         return None
@@ -152,7 +152,7 @@ def parse(telegram: bytes) -> Request | None:
     return Request(opcode, not telegram[0] & _NO_REPLY, command, telegram[2:])
 
 
-def reply(opcode: int, status: int, payload: bytes = b"") -> bytes:
+def build_reply(opcode: int, status: int, payload: bytes = b"") -> bytes:
     """Build a reply telegram."""
     return bytes((_REPLY, opcode, status)) + payload
 

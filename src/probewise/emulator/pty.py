@@ -50,7 +50,7 @@ class Terminal:
         """Path at which clients open it."""
         return self._slave_path if self._link is None else str(self._link)
 
-    def hang_up(self) -> None:
+    def hang_up_and_reopen(self) -> None:
         """End the connection, so that clients lose the device, and open a new one."""
         self._close_terminal()
         self._open_terminal()
@@ -113,7 +113,7 @@ def serve(
             terminal.write(received)
         if not radio.is_open and not radio.brick.is_off:
             before = terminal.path
-            terminal.hang_up()
+            terminal.hang_up_and_reopen()
             radio.reconnect()
             if terminal.path != before:
                 on_move(terminal.path)

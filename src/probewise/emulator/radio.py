@@ -16,7 +16,7 @@ import numpy as np
 from probewise.emulator.brick import Brick
 from probewise.emulator.clock import Clock
 from probewise.emulator.faults import Faults
-from probewise.emulator.protocol import COMMANDS, FrameAssembler, Status, framed, parse, reply
+from probewise.emulator.protocol import COMMANDS, FrameAssembler, Status, build_reply, framed, parse_request
 
 Event: TypeAlias = Literal[">", "<", "!"]
 Trace: TypeAlias = Callable[[float, Event, str], None]
@@ -95,7 +95,7 @@ class Radio:
 
     def send(self, data: bytes) -> None:
         """Take bytes from the host, in pieces of any size; a fault may cut off the end of a piece."""
-        if len(data) > 1 and self._occurs("half", self.faults.half / 2):
+        if len(data) > 1 and self._fault_occurs("half", self.faults.half / 2):
             data = data[: int(self._rng.integers(1, len(data)))]
         for telegram in self._frames.feed(data, self._clock()):
             if self.is_open:
@@ -110,50 +110,51 @@ class Radio:
 
     def _handle_request(self, telegram: bytes) -> None:
         self._trace_telegram(">", telegram)
-        if self._occurs("deaf", self.faults.deaf):
+        if self._fault_occurs("deaf", self.faults.deaf):
             return
-        answer = self._refusal(telegram) if self._occurs("error", self.faults.error) else self.brick.answer(telegram)
-        if self._occurs("disconnect", self.faults.disconnect):
+        refused = self._fault_occurs("error", self.faults.error)
+        answer = self._random_refusal(telegram) if refused else self.brick.answer(telegram)
+        if self._fault_occurs("disconnect", self.faults.disconnect):
             self._ended = True
             return
-        if answer is None or self._occurs("silence", self.faults.silence):
+        if answer is None or self._fault_occurs("silence", self.faults.silence):
             return
         self._trace_telegram("<", answer)
         at_s = self._clock() + self._turnaround_s
-        if self._occurs("unasked", self.faults.unasked):
+        if self._fault_occurs("unasked", self.faults.unasked):
             self._schedule_delivery(at_s, framed(_UNASKED))
-        if self._occurs("late", self.faults.late):
+        if self._fault_occurs("late", self.faults.late):
             at_s += self.faults.late_s
         frame = self._with_faults(framed(answer))
-        if self._occurs("merge", self.faults.merge):
+        if self._fault_occurs("merge", self.faults.merge):
             self._held += frame
             return
         frame, self._held = self._held + frame, b""
         for piece in self._cut_into_pieces(frame):
             self._schedule_delivery(at_s, piece)
             at_s += self._rng.uniform(0.0, _PIECE_S)
-        if self._occurs("double", self.faults.double):
+        if self._fault_occurs("double", self.faults.double):
             self._schedule_delivery(at_s + self._rng.uniform(0.0, _DOUBLED_S), frame)
 
-    def _refusal(self, telegram: bytes) -> bytes | None:
-        """Return an error reply to a request, without passing it to the brick."""
-        request = parse(telegram)
+    def _random_refusal(self, telegram: bytes) -> bytes | None:
+        """Return a reply with a random error status, in the brick's place; None if the request wants no reply."""
+        request = parse_request(telegram)
         if request is None or not request.wants_reply:
             return None
         zeros = 0 if request.command is None else request.command.error_bytes
-        return reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
+        return build_reply(request.opcode, int(self._rng.choice(_STATUSES)), bytes(zeros))
 
     def _with_faults(self, frame: bytes) -> bytes:
         """Apply faults to a frame on its way to the host."""
-        if self._occurs("corrupt", self.faults.corrupt):
+        if self._fault_occurs("corrupt", self.faults.corrupt):
             at, change = int(self._rng.integers(len(frame))), int(self._rng.integers(1, 256))
             frame = frame[:at] + bytes((frame[at] ^ change,)) + frame[at + 1 :]
-        if self._occurs("half", self.faults.half / 2):
+        if self._fault_occurs("half", self.faults.half / 2):
             frame = frame[: int(self._rng.integers(1, len(frame)))]
-        return bytes(byte for byte in frame if not self._occurs("drop", self.faults.drop))
+        return bytes(byte for byte in frame if not self._fault_occurs("drop", self.faults.drop))
 
     def _cut_into_pieces(self, frame: bytes) -> list[bytes]:
-        if len(frame) < 2 or not self._occurs("fragment", self.faults.fragment):
+        if len(frame) < 2 or not self._fault_occurs("fragment", self.faults.fragment):
             return [frame]
         n_cuts = int(self._rng.integers(1, min(len(frame), 4)))
         cuts = [0, *sorted(self._rng.choice(np.arange(1, len(frame)), n_cuts, replace=False).tolist()), len(frame)]
@@ -164,7 +165,8 @@ class Radio:
         self._last_s = max(at_s, self._last_s)
         self._coming.append((self._last_s, data))
 
-    def _occurs(self, name: str, rate: float) -> bool:
+    def _fault_occurs(self, name: str, rate: float) -> bool:
+        """Draw whether a fault occurs; count and record it if so."""
         happens = rate > 0 and self._rng.random() < rate
         if happens:
             self.mishaps[name] += 1

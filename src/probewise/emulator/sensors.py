@@ -48,11 +48,11 @@ class LightSensor:
         """Return the AD converter's current sample, 0 to 1023; it takes one every 3 ms."""
         number = int(self.clock() / 0.003)
         if self._sample[:2] != (number, lit):
-            self._sample = (number, lit, _counts_of(self.seen(lit)))
+            self._sample = (number, lit, _counts_of_percent(self.seen(lit)))
         return self._sample[2]
 
 
-def _counts_of(percent: float) -> int:
+def _counts_of_percent(percent: float) -> int:
     """Invert the firmware's conversion: 0 % is 896 counts, 100 % is 200, extrapolated on both sides."""
     return min(max(round(200 + 68 / 100 * (AD_MAX - percent * AD_MAX / 100)), 0), AD_MAX)
 

@@ -17,7 +17,7 @@ class Tabletop:
     surface: Surface
     turned_rad: float = 0.0
 
-    def carry_out(self, line: str) -> None:
+    def carry_out_line(self, line: str) -> None:
         """Carry out a typed line: a scene becomes the surface, `turn DEGREES` sets the rotation of the sensor.
 
         Raises
@@ -37,4 +37,4 @@ class Tabletop:
         except ValueError as error:
             raise ParameterError("line", line, f"turn DEGREES; {'; '.join(FORMS)}; in mm and degrees") from error
 
-    obey = carry_out  # its old name
+    carry_out = obey = carry_out_line  # its old names

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from probewise.arm import Reading, readings_of, recorded
+from probewise.arm import Reading, readings_of_recording, recorded
 from probewise.errors import FileError
 from probewise.progress import Progress, silent
 from probewise.recordings import (
@@ -79,7 +79,7 @@ class RoundsFolder:
                 )
             write_plan(plan, planned)
         plan = read_plan(planned)
-        readings = readings_of(read_recording(readings_file)) if readings_file.exists() else []
+        readings = readings_of_recording(read_recording(readings_file)) if readings_file.exists() else []
         kept_s = time.monotonic()
         progress(f"round {number}, readings", len(readings), len(plan))
         for reading in take(number, plan, asked, tuple(readings)):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._kinds import did_you_mean
-from probewise.arm import Reading, readings_of
+from probewise.arm import Reading, readings_of_recording
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.world import World, concealed
@@ -30,7 +30,7 @@ class SimulatedRecorder:
         """Yield the readings of a round's plan after those already taken."""
         rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
         recording = self.world.simulate(plan, rng=rng)
-        yield from readings_of(recording)[len(taken) :]
+        yield from readings_of_recording(recording)[len(taken) :]
 
 
 def parse_concealed(text: str) -> tuple[Concealed, ...]:

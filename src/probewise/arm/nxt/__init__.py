@@ -5,7 +5,7 @@ interface. Each layer can be used and tested without those above it.
 """
 
 from probewise.arm.nxt.brick import Brick
-from probewise.arm.nxt.light import LightReading, LightSensor, SensorError, normalized_of
+from probewise.arm.nxt.light import LightReading, LightSensor, SensorError, normalized_from_counts
 from probewise.arm.nxt.link import ByteStream, Link, NoAnswerError, Timing
 from probewise.arm.nxt.machine import BrickMachine
 from probewise.arm.nxt.motor import Drive, Guard, Motor, MotorError
@@ -36,8 +36,11 @@ __all__ = [
     "decode",
     "encode",
     "framed",
-    "normalized_of",
+    "normalized_from_counts",
 ]
+
+normalized_of = normalized_from_counts
+"""The old name of `normalized_from_counts`."""
 
 Light = LightSensor
 """The old name of `LightSensor`."""

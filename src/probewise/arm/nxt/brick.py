@@ -78,7 +78,7 @@ class Brick:
         """
         with defer_signals():
             try:
-                self._come_to_rest()
+                self._switch_off_motors_and_leds()
             except LinkError:
                 if error is None:
                     raise
@@ -90,7 +90,7 @@ class Brick:
         return Motor(self.link, port, guard=guard, drive=drive, clock=self._clock)
 
     def light(self, port: int) -> LightSensor:
-        """Make the light sensor at input 0 to 3; see `LightSensor`."""
+        """Return the light sensor at input 0 to 3, the same object at every call; see `LightSensor`."""
         return self._lights.setdefault(port, LightSensor(self.link, port, clock=self._clock))
 
     def battery_mv(self) -> int:
@@ -143,7 +143,7 @@ class Brick:
                 return None
             raise
 
-    def _come_to_rest(self) -> None:
+    def _switch_off_motors_and_leds(self) -> None:
         """Release the motors and switch the LEDs off, each even if another fails.
 
         First send all commands without waiting for answers, which may be missing or late; then confirm.

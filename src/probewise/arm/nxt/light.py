@@ -22,7 +22,7 @@ class SensorError(LinkError):
     """Raised for a sensor that gives no usable reading."""
 
 
-def normalized_of(raw_counts: int) -> int:
+def normalized_from_counts(raw_counts: int) -> int:
     """Convert A/D counts, which fall with brightness, to 0 (dark) to 1023 (bright).
 
     The firmware's integer arithmetic for types 05 and 06: only 697 of the 1024 values occur.
@@ -47,7 +47,7 @@ class LightReading:
     @property
     def normalized(self) -> int:
         """Brightness from 0 (dark) to 1023 (bright)."""
-        return normalized_of(self.raw_counts)
+        return normalized_from_counts(self.raw_counts)
 
     @property
     def percent(self) -> int:
@@ -79,10 +79,12 @@ class LightSensor:
         self._link, self.port, self._clock, self._valid_s = link, port, clock, valid_s
         self._type: SensorType | None = None
 
-    def light_up(self, lit: bool = True) -> None:
-        """Switch the LED on or off."""
+    def set_led(self, lit: bool = True) -> None:
+        """Switch the LED on (`lit`) or off, and set the input to raw readings."""
         self._type = SensorType.LIGHT_ACTIVE if lit else SensorType.LIGHT_INACTIVE
         self._link.ask(SetInputMode(self.port, self._type, Mode.RAW))
+
+    light_up = set_led  # its old name
 
     def read(self) -> LightReading:
         """Read once, with the LED as last set (by default on).
@@ -95,7 +97,7 @@ class LightSensor:
             If the brick's answers remain inconsistent after repeated questions.
         """
         if self._type is None:
-            self.light_up()
+            self.set_led()
         deadline = self._clock.monotonic() + self._valid_s
         for number in itertools.count(1):
             values = self._link.ask(GetInputValues(self.port), check=_require_consistent)
@@ -109,7 +111,7 @@ class LightSensor:
                     "is the light sensor plugged in?"
                 )
             if not as_set:  # a program that starts or stops resets all settings
-                self.light_up(self._type == SensorType.LIGHT_ACTIVE)
+                self.set_led(self._type == SensorType.LIGHT_ACTIVE)
         raise AssertionError("a count has no end")  # pragma: no cover
 
     @property
@@ -121,7 +123,7 @@ class LightSensor:
 
 
 def _require_consistent(values: InputValues) -> None:
-    """Refuse values that the firmware never sends: each reading comes in four consistent conversions.
+    """Raise TelegramError for values that the firmware never sends: it converts each reading in four consistent ways.
 
     The protocol has no checksum. A corrupted byte makes the four values inconsistent, or changes none that is used.
     """
@@ -134,9 +136,9 @@ def _require_consistent(values: InputValues) -> None:
     if (
         values.valid
         and is_light
-        and {values.normalized, values.scaled, values.calibrated_value} != {normalized_of(values.raw)}
+        and {values.normalized, values.scaled, values.calibrated_value} != {normalized_from_counts(values.raw)}
     ):
         raise TelegramError(
             f"input {values.port + 1} says {values.raw} counts, and converted {values.normalized}, {values.scaled} and "
-            f"{values.calibrated_value}; allowed: {normalized_of(values.raw)} three times"
+            f"{values.calibrated_value}; allowed: {normalized_from_counts(values.raw)} three times"
         )

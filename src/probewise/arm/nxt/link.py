@@ -1,4 +1,4 @@
-"""Exchange telegrams with the brick over a byte stream whose data may come in pieces, late, or not at all.
+"""Exchange of telegrams with the brick over a byte stream whose data may come in pieces, late, or not at all.
 
 The stream keeps the order of bytes, so one rule assigns answers reliably. A command whose answer did not come stays
 *owed*; before the next question, the stream is drained and a fence is sent: a harmless question with another opcode.
@@ -174,7 +174,7 @@ class Link:
                 self._await_turn()
                 if self._owed or self._stream.read(LONGEST, 0.0):
                     self._discard_late_answers()
-                answer = request.answer(self._exchange(request))
+                answer = request.decode_answer(self._exchange(request))
                 if check is not None:
                     check(answer)
             except (NoAnswerError, TelegramError):
@@ -218,7 +218,7 @@ class Link:
         self.n_asked += 1
         sent_at = self._clock.monotonic()
         self._free_at = sent_at + 2 * self._timing.turn_s
-        reply = self._reply_to(request, sent_at + self._timing.answer_s)
+        reply = self._await_reply(request, sent_at + self._timing.answer_s)
         self._owed.discard(request.OPCODE)
         self._free_at = max(self._free_at, self._clock.monotonic() + self._timing.turn_s)
         return reply
@@ -253,9 +253,9 @@ class Link:
         if wait_s > 0:
             self._clock.sleep(wait_s)
 
-    def _reply_to(self, request: Request[A], deadline: float) -> Reply:
+    def _await_reply(self, request: Request[A], deadline: float) -> Reply:
         while True:
-            telegram = self._frame(request, deadline)
+            telegram = self._read_frame(request, deadline)
             try:
                 reply = decode(telegram)
             except TelegramError:
@@ -265,7 +265,7 @@ class Link:
             if reply.opcode not in self._owed:
                 raise TelegramError(f"a reply to opcode {reply.opcode:02X} came, which was not asked for")
 
-    def _frame(self, request: Request[A], deadline: float) -> bytes:
+    def _read_frame(self, request: Request[A], deadline: float) -> bytes:
         length = int.from_bytes(self._read_exactly(2, request, deadline), "little")
         if not 2 <= length <= LONGEST:
             raise TelegramError(f"a telegram of {length} bytes was announced; allowed: 2 to {LONGEST}")

@@ -32,7 +32,8 @@ class BrickMachine:
         self._joints = geometry.joints
         self._zeros = [0] * 3  # counts at home; not 0 between finding a stop and the next reset
         self._motors = [
-            brick.motor(joint.port, guard=partial(self._check_move, k)) for k, joint in enumerate(self._joints)
+            brick.motor(joint.port, guard=partial(self._require_allowed_move, k))
+            for k, joint in enumerate(self._joints)
         ]
         self._light = brick.light(geometry.sensor_port)
 
@@ -41,8 +42,8 @@ class BrickMachine:
         try:
             for joint, motor in enumerate(self._motors):
                 # An earlier session that lost its connection may have left a motor turning.
-                self.limits.record(joint, motor.stop_and_settle())
-            self._light.light_up()
+                self.limits.record_counts(joint, motor.stop_and_settle())
+            self._light.set_led()
         except BaseException as error:
             self.brick.__exit__(type(error), error, error.__traceback__)
             raise
@@ -78,14 +79,14 @@ class BrickMachine:
         found = motor.find_stop(with_gears, round(range_counts) + 2 * ROOM_COUNTS)
         at_stop = mechanics.stop_counts
         self._zeros[joint] = found - at_stop
-        self.limits.record(joint, at_stop)
+        self.limits.record_counts(joint, at_stop)
 
     def reset(self, joints: Sequence[int]) -> None:
         """Set the counters of these joints' motors to 0."""
         for joint in joints:
             self._motors[joint].reset()
             self._zeros[joint] = 0
-            self.limits.record(joint, 0)
+            self.limits.record_counts(joint, 0)
 
     def read_percent(self) -> float:
         """Read the light sensor, LED on."""
@@ -106,8 +107,8 @@ class BrickMachine:
         try:
             yield motor
         finally:
-            self.limits.record(joint, motor.last_counts - self._zeros[joint])
+            self.limits.record_counts(joint, motor.last_counts - self._zeros[joint])
 
-    def _check_move(self, joint: int, here: int, to: int) -> None:
+    def _require_allowed_move(self, joint: int, here: int, to: int) -> None:
         """Check a move against the limits, whose counts are from home."""
-        self.limits.check(joint, here - self._zeros[joint], to - self._zeros[joint])
+        self.limits.require_allowed_move(joint, here - self._zeros[joint], to - self._zeros[joint])

@@ -1,4 +1,4 @@
-"""Turn a motor to a count and hold it there, given how the brick's firmware treats a limit.
+"""A motor that turns to a count and holds it, given how the brick's firmware treats a limit.
 
 The firmware counts a limited move from its own running *target*, not from the motor's position; at the target it cuts
 the power, and the motor *coasts* by some counts. So the target is tracked here, the coast is learned by direction and
@@ -141,11 +141,11 @@ class Motor:
 
     def counts(self) -> int:
         """Read the rotation counter."""
-        return self._state().rotation_counts
+        return self._read_confirmed_state().rotation_counts
 
     def reset(self) -> None:
         """Set its counter to 0."""
-        state = self._state()
+        state = self._read_confirmed_state()
         self._link.ask(ResetMotorPosition(self.port, 0))
         if self._target is not None:
             self._target -= state.rotation_counts
@@ -153,7 +153,7 @@ class Motor:
 
     def hold(self) -> None:
         """Hold its position against a load."""
-        self._link.ask(self._command(0, 0))
+        self._link.ask(self._drive_command(0, 0))
 
     def stop_and_settle(self) -> int:
         """Stop and hold it; return its count once it has settled."""
@@ -183,7 +183,7 @@ class Motor:
         here = self.counts()
         for _ in range(self.drive.n_moves):
             if self._target is None:
-                here = self._synchronise()
+                here = self._synchronise_target()
             ahead = side * (goal - here)
             if abs(ahead) <= self.drive.tolerance_counts and self._arrived == side:
                 return here
@@ -198,14 +198,14 @@ class Motor:
         )
 
     def move_near(self, goal: int) -> int:
-        """Turn approximately to a count, by one fast move if needed, and hold; see `move_to`."""
+        """Turn approximately to a count, by one fast move if needed, and hold; return the count at rest."""
         here = self.counts()
         side: Side = 1 if goal >= here else -1
         if self._target is None:
-            here = self._synchronise()
+            here = self._synchronise_target()
         target = goal - side * self._coast_counts(self.drive.fast_power, side)
-        if min(side * (target - here), side * (target - self._require_target)) > 0:
-            here = self._limited_move(target, side, self.drive.fast_power, here)
+        if min(side * (target - here), side * (target - self._checked_target)) > 0:
+            here = self._make_limited_move(target, side, self.drive.fast_power, here)
         return here
 
     def find_stop(self, side: Side, farthest: int) -> int:
@@ -227,12 +227,14 @@ class Motor:
         MotorError
             If nothing stops it.
         """
-        start = self._synchronise()
+        start = self._synchronise_target()
         power = side * self.drive.seek_power
         gently = SetOutputState(self.port, power, BRAKED, run_state=RunState.RUNNING, limit_counts=farthest)
-        while not self._start(start + side * farthest, side, gently):
-            start = self._synchronise()
-        trouble = self._await_idle(start, side * (farthest + self.drive.runaway_counts), start + side * farthest)
+        while not self._try_start(start + side * farthest, side, gently):
+            start = self._synchronise_target()
+        trouble = self._await_idle_or_trouble(
+            start, side * (farthest + self.drive.runaway_counts), start + side * farthest
+        )
         here = self.stop_and_settle()
         self._target = None  # it lies behind the stop
         if trouble != STUCK:
@@ -242,7 +244,8 @@ class Motor:
         return here
 
     @property
-    def _require_target(self) -> int:
+    def _checked_target(self) -> int:
+        """The firmware's target; MotorError if it is unknown."""
         if self._target is None:
             raise MotorError(f"motor {self.letter}: its counters jumped; did a program start on the brick?")
         return self._target
@@ -251,38 +254,40 @@ class Motor:
         """Move towards the goal: fast to well short of it, or slowly all the way."""
         fast, slow = self.drive.fast_power, self.drive.slow_power
         target = goal - side * self._coast_counts(slow, side)
-        if side * self._require_target >= side * target:
-            here = self._synchronise()  # a target left by a move in the other direction would lead beyond the goal
-        least = max(side * here, side * self._require_target) + 1  # a target behind this position causes no motion
+        if side * self._checked_target >= side * target:
+            here = (
+                self._synchronise_target()
+            )  # a target left by a move in the other direction would lead beyond the goal
+        least = max(side * here, side * self._checked_target) + 1  # a target behind this position causes no motion
         short = goal - side * (2 * self.drive.lead_counts + self._coast_counts(fast, side))
         if side * short > least + self.drive.lead_counts:
-            return self._limited_move(short, side, fast, here)
-        return self._limited_move(side * max(side * target, least), side, slow, here)
+            return self._make_limited_move(short, side, fast, here)
+        return self._make_limited_move(side * max(side * target, least), side, slow, here)
 
     def _back_off(self, goal: int, side: Side, here: int) -> int:
         """Back off behind the goal, far enough for a slow move to start and take up the play."""
         back: Side = 1 if side == -1 else -1
         fast, slow = self.drive.fast_power, self.drive.slow_power
         behind = goal - side * (self._coast_counts(slow, side) + 2 * self.drive.lead_counts)
-        least = max(back * here, back * self._require_target) + 1
+        least = max(back * here, back * self._checked_target) + 1
         short = behind + side * self._coast_counts(fast, back)
         if back * short > least + self.drive.lead_counts:
-            return self._limited_move(short, back, fast, here)
-        return self._limited_move(back * max(back * behind, least), back, slow, here)
+            return self._make_limited_move(short, back, fast, here)
+        return self._make_limited_move(back * max(back * behind, least), back, slow, here)
 
     def _coast_counts(self, power: int, side: Side) -> int:
         share = power / self.drive.fast_power
         return round(self._coast.get((power, side), share * self.drive.coast_counts))
 
-    def _limited_move(self, target: int, side: Side, power: int, here: int) -> int:
+    def _make_limited_move(self, target: int, side: Side, power: int, here: int) -> int:
         """Make one limited move to a firmware target, and read the resulting count."""
         stop = target + side * self._coast_counts(power, side)
         if self._guard is not None:
             self._guard(here, stop)
-        if not self._start(target, side, self._command(side * power, side * (target - self._require_target))):
+        if not self._try_start(target, side, self._drive_command(side * power, side * (target - self._checked_target))):
             return self.stop_and_settle()
         self._clock.sleep(max(side * (target - here), 0) / (COUNTS_S * power))
-        trouble = self._await_idle(here, stop + side * self.drive.runaway_counts - here, target)
+        trouble = self._await_idle_or_trouble(here, stop + side * self.drive.runaway_counts - here, target)
         here = self.stop_and_settle()
         if trouble:
             self._target = None
@@ -297,8 +302,8 @@ class Motor:
         self._coast[power, side] = (learned + ran_on) / 2
         return here
 
-    def _start(self, target: int, side: Side, command: SetOutputState) -> bool:
-        """Command a limited move exactly once; return whether the brick accepted it.
+    def _try_start(self, target: int, side: Side, command: SetOutputState) -> bool:
+        """Command a limited move, exactly once; return whether the brick accepted it.
 
         Raises
         ------
@@ -309,7 +314,7 @@ class Motor:
             self._link.ask(command)
         except (NoAnswerError, TelegramError, BrickError) as error:
             # Holding sets the limit to 0 after every move, so this limit confirms that the brick accepted the command.
-            took = self._state(lambda state: False).limit_counts == command.limit_counts
+            took = self._read_confirmed_state(lambda state: False).limit_counts == command.limit_counts
             if not took or self._target is None:
                 self._n_untaken += 1
                 if self._n_untaken >= N_UNTAKEN:
@@ -320,36 +325,36 @@ class Motor:
         self._arrived = side
         return True
 
-    def _synchronise(self) -> int:
-        """Stop the motor and find the firmware's target, which follows a motor that is driven without a limit.
+    def _synchronise_target(self) -> int:
+        """Find the firmware's target, which follows a motor that is driven without a limit; stop and return the count.
 
-        It is driven with too little power to turn, so that a lost connection or a repeated command does no harm.
+        The motor is driven with too little power to turn, so that a lost connection or a repeated command does no harm.
         """
 
-        def is_faint(state: OutputState) -> bool:
+        def has_faint_power(state: OutputState) -> bool:
             return (state.power, state.run_state, state.limit_counts) == (FAINT_POWER, RunState.RUNNING, 0)
 
         faint = SetOutputState(self.port, FAINT_POWER, BRAKED, run_state=RunState.RUNNING)
         self._link.ask(faint)
         self._clock.sleep(self.drive.settle_s)
-        state = self._state(is_faint)
-        if not is_faint(state):
+        state = self._read_confirmed_state(has_faint_power)
+        if not has_faint_power(state):
             raise MotorError(
                 f"motor {self.letter} does not keep the power it was set to; does a program run on the brick?"
             )
         self._target = state.rotation_counts
         return self.stop_and_settle()
 
-    def _await_idle(self, start: int, farthest: int, target: int) -> str:
-        """Wait for a limited move to end; return a description of the trouble if it sticks or overruns."""
+    def _await_idle_or_trouble(self, start: int, farthest: int, target: int) -> str:
+        """Wait for a limited move to end; return a text on the trouble if it sticks or overruns, otherwise ""."""
         side = 1 if farthest > 0 else -1
 
-        def is_likely(state: OutputState) -> bool:
+        def is_plausible(state: OutputState) -> bool:
             # The firmware releases a motor at its target, not before.
             return state.run_state == RunState.RUNNING or side * (state.rotation_counts - target) >= 0
 
         here, changed_at = start, self._clock.monotonic()
-        while (state := self._state(is_likely)).run_state != RunState.IDLE:
+        while (state := self._read_confirmed_state(is_plausible)).run_state != RunState.IDLE:
             now = self._clock.monotonic()
             if state.rotation_counts != here:
                 here, changed_at = state.rotation_counts, now
@@ -359,19 +364,21 @@ class Motor:
                 return STUCK
         return ""
 
-    def _state(self, is_likely: Callable[[OutputState], bool] = lambda state: True) -> OutputState:
+    def _read_confirmed_state(self, is_plausible: Callable[[OutputState], bool] = lambda state: True) -> OutputState:
         """Read the motor's state; if it is implausible or a counter jumped, read until two successive states agree.
 
         A corrupted byte shifts one of the three counters against the others.
         """
-        state, before = self._output_state(), None
+        state, before = self._read_state(), None
         n_asked = 1
-        while (_counter_offsets(state) != self._offsets or not is_likely(state)) and _constant_fields(state) != before:
+        while (_counter_offsets(state) != self._offsets or not is_plausible(state)) and _constant_fields(
+            state
+        ) != before:
             if n_asked == N_ASKED:
                 raise MotorError(
                     f"motor {self.letter} reports another state each of {N_ASKED} times; is the brick near?"
                 )
-            before, state = _constant_fields(state), self._output_state()
+            before, state = _constant_fields(state), self._read_state()
             n_asked += 1
         self.last_counts = state.rotation_counts
         if _counter_offsets(state) != self._offsets:
@@ -379,10 +386,10 @@ class Motor:
             self._target, self._offsets = None, _counter_offsets(state)
         return state
 
-    def _output_state(self) -> OutputState:
+    def _read_state(self) -> OutputState:
         return self._link.ask(GetOutputState(self.port))
 
-    def _command(self, power: int, limit: int) -> SetOutputState:
+    def _drive_command(self, power: int, limit: int) -> SetOutputState:
         return SetOutputState(
             self.port, power, DRIVEN, Regulation.SPEED, run_state=RunState.RUNNING, limit_counts=limit
         )
@@ -394,5 +401,5 @@ def _counter_offsets(state: OutputState) -> tuple[int, int]:
 
 
 def _constant_fields(state: OutputState) -> tuple[object, ...]:
-    """Return the fields that do not change while a motor turns."""
+    """Return the fields, and differences of counters, that do not change while a motor turns."""
     return _counter_offsets(state), state.power, state.mode, state.regulation, state.run_state, state.limit_counts

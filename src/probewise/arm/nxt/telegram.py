@@ -1,4 +1,4 @@
-"""Encode and decode the brick's telegrams: pure functions without input or output.
+"""Encoding and decoding of the brick's telegrams: pure functions without input or output.
 
 A telegram is a type byte, an opcode and a body; on Bluetooth its length goes before it
 (`framed`). One class per command holds the body's fields in the order of the bytes; its
@@ -14,7 +14,7 @@ from enum import IntEnum, IntFlag
 from typing import ClassVar, Generic, TypeVar, cast
 
 from probewise.arm.nxt.status import OK, BrickError
-from probewise.arm.nxt.wire import Answer, Fields, IntegerField, TelegramError, field_of, in_hex
+from probewise.arm.nxt.wire import Answer, Fields, IntegerField, TelegramError, in_hex, packed_field
 
 A_co = TypeVar("A_co", bound=Answer, covariant=True)
 
@@ -87,7 +87,7 @@ class Request(Fields, Generic[A_co]):
         """Name of the command in LEGO's documentation."""
         return type(self).__name__.upper()
 
-    def answer(self, reply: Reply) -> A_co:
+    def decode_answer(self, reply: Reply) -> A_co:
         """Decode a reply to this command into its answer.
 
         Raises
@@ -107,19 +107,21 @@ class Request(Fields, Generic[A_co]):
             raise TelegramError(f"an answer about port {said.port} came for {self}")
         return cast(A_co, said)
 
+    answer = decode_answer  # its old name
+
 
 @dataclass(frozen=True)
 class SetOutputState(Request[Done]):
     """Drive a motor, or all with port 255; a limit of 0 counts means no limit. By default they idle, free to turn."""
 
     OPCODE = 0x04
-    port: int = field_of(IntegerField("B", 0, 2, (ALL_OUTPUTS,)))
-    power: int = field_of(_PERCENT, 0)
-    mode: int = field_of(IntegerField("B", 0, 7), OutputMode.IDLE)
-    regulation: int = field_of(IntegerField("B", 0, 2), Regulation.IDLE)
-    turn_ratio: int = field_of(_PERCENT, 0)
-    run_state: int = field_of(IntegerField("B", 0, 0, (0x10, 0x20, 0x40)), RunState.IDLE)
-    limit_counts: int = field_of(IntegerField("I", 0, 0xFFFFFFFF), 0)
+    port: int = packed_field(IntegerField("B", 0, 2, (ALL_OUTPUTS,)))
+    power: int = packed_field(_PERCENT, 0)
+    mode: int = packed_field(IntegerField("B", 0, 7), OutputMode.IDLE)
+    regulation: int = packed_field(IntegerField("B", 0, 2), Regulation.IDLE)
+    turn_ratio: int = packed_field(_PERCENT, 0)
+    run_state: int = packed_field(IntegerField("B", 0, 0, (0x10, 0x20, 0x40)), RunState.IDLE)
+    limit_counts: int = packed_field(IntegerField("I", 0, 0xFFFFFFFF), 0)
 
     @property
     def is_repeatable(self) -> bool:
@@ -132,9 +134,9 @@ class SetInputMode(Request[Done]):
     """Set the sensor type and the reading mode of an input."""
 
     OPCODE = 0x05
-    port: int = field_of(_INPUT)
-    type: int = field_of(IntegerField("B", 0, 0x12))
-    mode: int = field_of(IntegerField("B", 0, 0xFF))
+    port: int = packed_field(_INPUT)
+    type: int = packed_field(IntegerField("B", 0, 0x12))
+    mode: int = packed_field(IntegerField("B", 0, 0xFF))
 
 
 @dataclass(frozen=True)
@@ -160,7 +162,7 @@ class GetOutputState(Request[OutputState]):
 
     OPCODE = 0x06
     REPLY = OutputState
-    port: int = field_of(_OUTPUT)
+    port: int = packed_field(_OUTPUT)
 
 
 @dataclass(frozen=True)
@@ -185,7 +187,7 @@ class GetInputValues(Request[InputValues]):
 
     OPCODE = 0x07
     REPLY = InputValues
-    port: int = field_of(_INPUT)
+    port: int = packed_field(_INPUT)
 
 
 @dataclass(frozen=True)
@@ -193,8 +195,8 @@ class ResetMotorPosition(Request[Done]):
     """Set the block counter (`relative` 1) or the rotation counter (0) of a motor to 0."""
 
     OPCODE = 0x0A
-    port: int = field_of(_OUTPUT)
-    relative: int = field_of(IntegerField("B", 0, 1))
+    port: int = packed_field(_OUTPUT)
+    relative: int = packed_field(IntegerField("B", 0, 1))
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ class IntegerField:
             raise ParameterError(name, value, f"a whole number from {self.low} to {self.high}{more}")
 
 
-def field_of(kind: IntegerField, default: Any = dataclasses.MISSING) -> Any:
+def packed_field(kind: IntegerField, default: Any = dataclasses.MISSING) -> Any:
     """Make a dataclass field with this byte layout."""
     return dataclasses.field(default=default, metadata={"kind": kind})
 
@@ -42,14 +42,14 @@ class Fields:
     """Body of a command: successive integers, each within its bounds."""
 
     def __post_init__(self) -> None:
-        for name, kind in self._kinds():
+        for name, kind in self._named_fields():
             kind.check(name, getattr(self, name))
 
     def pack(self) -> bytes:
         """Encode the fields."""
-        return b"".join(struct.pack("<" + kind.code, getattr(self, name)) for name, kind in self._kinds())
+        return b"".join(struct.pack("<" + kind.code, getattr(self, name)) for name, kind in self._named_fields())
 
-    def _kinds(self) -> Iterator[tuple[str, IntegerField]]:
+    def _named_fields(self) -> Iterator[tuple[str, IntegerField]]:
         return ((field.name, field.metadata["kind"]) for field in dataclasses.fields(self))
 
 
@@ -73,7 +73,7 @@ class Answer:
         except struct.error as error:
             size = struct.calcsize("<" + cls.LAYOUT)
             raise TelegramError(f"{cls.__name__} has {size} bytes; there are {len(raw)}: {in_hex(raw)}") from error
-        return cls(*(_text(value) if isinstance(value, bytes) else value for value in values))
+        return cls(*(_text_before_nul(value) if isinstance(value, bytes) else value for value in values))
 
 
 def in_hex(raw: bytes) -> str:
@@ -81,5 +81,5 @@ def in_hex(raw: bytes) -> str:
     return raw.hex(" ").upper() or "no bytes"
 
 
-def _text(raw: bytes) -> str:
+def _text_before_nul(raw: bytes) -> str:
     return raw.partition(b"\0")[0].decode("latin-1")

@@ -203,12 +203,12 @@ def test_a_rehearsal_of_homing_goes_to_the_stops_first():
 def test_a_joint_can_be_turned_alone_as_far_as_the_guard_allows(bench):
     with bench.arm as arm:
         start = arm.angles_rad
-        arm.turn(0, math.radians(20))
+        arm.turn_joint(0, math.radians(20))
         np.testing.assert_allclose(arm.angles_rad - start, [math.radians(20), 0, 0], atol=2e-3)
         with pytest.raises(ReachError, match=r"base is '.* degrees'; allowed: -190 to 10 degrees"):
-            arm.turn(0, math.radians(200))
+            arm.turn_joint(0, math.radians(200))
         with pytest.raises(ReachError, match="the sensor's height while the shoulder moves"):
-            arm.turn(1, math.radians(-100))
+            arm.turn_joint(1, math.radians(-100))
 
 
 def test_the_battery_and_the_sensor_can_be_read_without_moving(bench):
@@ -299,7 +299,7 @@ def test_no_command_passes_the_guard(make_paper_brick, data):
                 if what == "place":
                     arm.go_down(first, second)
                 else:
-                    arm.turn(first, second)
+                    arm.turn_joint(first, second)
             except ReachError:
                 pass
 

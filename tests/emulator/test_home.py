@@ -94,7 +94,7 @@ def test_an_arm_with_stops_comes_home_from_wherever_it_was(clock: VirtualClock, 
 def test_joints_without_a_stop_keep_their_counters(clock: VirtualClock) -> None:
     bench = lost(clock, base=30.0)
     with connected(bench, clock, with_stops("base")) as lego:
-        lego.turn(2, math.radians(10))
+        lego.turn_joint(2, math.radians(10))
         lego.home()
     assert [round(math.degrees(joint.angle_rad)) for joint in bench.arm.joints] == [-90, 90, -20]
 

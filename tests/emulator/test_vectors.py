@@ -104,7 +104,7 @@ def test_input_values_are_laid_out_as_in_the_vectors(
 
 def test_output_state_is_laid_out_as_in_the_vectors(brick: Brick) -> None:
     port = brick.outputs.ports[2]
-    port.apply(OutputSetting(-40, 5, 1, 0, 0x20, 1000))
+    port.apply_setting(OutputSetting(-40, 5, 1, 0, 0x20, 1000))
     port.tacho_count = port.block_count = -123
     port.rotation_count = 4567
     assert exchanged(brick, "03 00 00 06 02") == (

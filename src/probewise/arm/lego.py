@@ -266,18 +266,20 @@ class LegoArm:
         return self._machine.read_percent()
 
     def battery_mv(self) -> float:
-        """Read the battery's voltage."""
+        """Read the battery's voltage, in mV."""
         return self._machine.battery_mv()
 
     def keep_awake(self) -> None:
         """Keep the brick from falling asleep; call it now and then during minutes of inactivity."""
         self._machine.keep_awake()
 
-    def turn(self, joint: int, by_rad: float) -> None:
+    def turn_joint(self, joint: int, by_rad: float) -> None:
         """Turn one joint (0 to 2: base, shoulder, elbow) by an angle; ReachError if it would leave the limits."""
         angles = self.angles_rad
         angles[joint] += by_rad
         self._turn_joint_to(joint, self._goals_at_angles(angles)[joint])
+
+    turn = turn_joint  # its old name
 
     def _pose(self) -> Pose:
         """Return the sensor's pose by the motors' counters."""

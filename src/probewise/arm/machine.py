@@ -48,7 +48,7 @@ class Machine(Protocol):
         ...
 
     def battery_mv(self) -> float:
-        """Read the battery's voltage."""
+        """Read the battery's voltage, in mV."""
         ...
 
     def keep_awake(self) -> None:

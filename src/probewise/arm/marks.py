@@ -20,7 +20,7 @@ def places_of_marks(geometry: Geometry) -> FloatArray:
 
     Returns
     -------
-    Shape (n_marks, 2), at most nine, in the order of use.
+    Shape (n_marks, 2), at most eight, in mm, in the order of use.
 
     Raises
     ------

@@ -237,7 +237,8 @@ def instrument_of(
         `y_mm`, `orientation_rad`, the time `time_s`, and any other numbers, which become covariates. It may also have
         `reachable(places_mm)`, True or False for each place (n_places, 2); `travel_s(start, places_mm)`, seconds from a
         pose to each place; `orientation_rad(places_mm)`, the sensor's orientation at each place; a single value applies
-        to all places. `close()`, or `__exit__`, is always called at the end.
+        to all places. Attributes `turns = True` and `lifts = True` declare that it turns its sensor to the pose's
+        orientation and reads at the pose's height. `close()`, or `__exit__`, is always called at the end.
     start_s
         Time at the start, for resuming an earlier run.
     name

@@ -294,7 +294,7 @@ def _jog_joint_or_sensor(arguments: argparse.Namespace, geometry: Geometry) -> N
             except ValueError as error:
                 raise ParameterError("WHERE", text, "a number of degrees") from error
             with _open_lego_arm(arguments, geometry) as arm:
-                arm.turn(JOINTS.index(joint), by_rad)
+                arm.turn_joint(JOINTS.index(joint), by_rad)
                 _print_position(arm, quiet=arguments.quiet)
         case _:
             raise ParameterError("WHERE", " ".join(arguments.where), f"X,Y in mm; or {', '.join(JOINTS)}, and degrees")

@@ -117,7 +117,7 @@ class Brick:
 
     @property
     def battery_mv(self) -> float:
-        """The battery's voltage now."""
+        """The battery's voltage now, in mV."""
         return self._battery.millivolts_after(self._clock() - self._began_s)
 
     @property

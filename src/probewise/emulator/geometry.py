@@ -56,7 +56,7 @@ def read_geometry(path: Path) -> Geometry:
     Raises
     ------
     FileError
-        If it is not a TOML file or lacks a number.
+        If the file is missing or not TOML, or a number is missing or not allowed.
     """
     text = read_text(path, "an arm's file of format arm/1")
     try:

@@ -69,7 +69,7 @@ class Inputs:
             self._configure_port(port, _NONE, _RAW)
 
     def _set_mode(self, number: int, kind: int, mode: int) -> bytes:
-        self._configure_port(self._port_numbered(number), kind, mode)
+        self._configure_port(self._checked_port(number), kind, mode)
         return b""
 
     def _configure_port(self, port: _InputPort, kind: int, mode: int) -> None:
@@ -83,7 +83,7 @@ class Inputs:
         port.kind, port.mode = kind, mode
 
     def _get_values(self, number: int) -> bytes:
-        port = self._port_numbered(number)
+        port = self._checked_port(number)
         valid = self._update_reading(port)
         raw, normalized, scaled = port.shown
         return struct.pack(
@@ -91,7 +91,7 @@ class Inputs:
         )
 
     def _reset_scaled(self, number: int) -> bytes:
-        port = self._port_numbered(number)
+        port = self._checked_port(number)
         port.shown = (*port.shown[:2], 0)  # until the next conversion
         return b""
 
@@ -108,12 +108,12 @@ class Inputs:
         return True
 
     def _bus_status(self, number: int) -> bytes:
-        port = self._port_numbered(number)
+        port = self._checked_port(number)
         status, ready = self._bus_status_and_bytes(port)
         return _payload_if_ok(status, bytes((len(ready),)))
 
     def _bus_write(self, number: int, n_written: int, n_wanted: int, written: bytes) -> bytes:
-        port = self._port_numbered(number)
+        port = self._checked_port(number)
         status, _ = self._bus_status_and_bytes(port)
         if status in (Status.CHANNEL_NOT_READY, Status.BUS_PENDING):
             raise RefusedError(Status.CHANNEL_NOT_READY)
@@ -126,7 +126,7 @@ class Inputs:
         return b""
 
     def _bus_read(self, number: int) -> bytes:
-        port = self._port_numbered(number)
+        port = self._checked_port(number)
         status, ready = self._bus_status_and_bytes(port)
         if status == Status.OK:
             port.answer = b""
@@ -140,7 +140,7 @@ class Inputs:
             return Status.BUS_PENDING, b""
         return (Status.BUS_ERROR, b"") if port.failed else (Status.OK, port.answer)
 
-    def _port_numbered(self, number: int) -> _InputPort:
+    def _checked_port(self, number: int) -> _InputPort:
         if number >= len(self._ports):
             raise RefusedError(Status.OUT_OF_RANGE)
         return self._ports[number]

@@ -76,7 +76,7 @@ class Output:
     def __post_init__(self) -> None:
         self._seen_deg = self._encoder_deg
 
-    def apply(self, setting: OutputSetting) -> None:
+    def apply_setting(self, setting: OutputSetting) -> None:
         """Apply a command in the firmware's sequence: speed, then regulation, then limit."""
         self.setting, self._settled = setting, False
         self._brake = bool(setting.mode & _BRAKE)

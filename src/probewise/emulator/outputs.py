@@ -75,7 +75,7 @@ class Outputs:
     def release(self) -> None:
         """Let all motors coast, as the firmware does when a program starts or ends."""
         for port in self.ports:
-            port.apply(OutputSetting())
+            port.apply_setting(OutputSetting())
 
     def _simulate_millisecond(self, moving: Sequence[Output], battery_mv: float) -> None:
         """Simulate a millisecond of the moving ports; a synchronised pair stops when one of them reaches its limit."""
@@ -93,20 +93,20 @@ class Outputs:
         self, port: int, power: int, mode: int, regulation: int, turn_ratio: int, run_state: int, tacho_limit: int
     ) -> bytes:
         setting = OutputSetting(power, mode, regulation, turn_ratio, run_state, tacho_limit)
-        for output in self.ports if port == _ALL else (self._port_numbered(port),):
-            output.apply(setting)
+        for output in self.ports if port == _ALL else (self._checked_port(port),):
+            output.apply_setting(setting)
             if output.is_synchronised:
                 self._synchronisation = _Synchronisation()
         return b""
 
     def _get_state(self, port: int) -> bytes:
-        return struct.pack("<BbBBbBIiii", port, *self._port_numbered(port).reply_fields())
+        return struct.pack("<BbBBbBIiii", port, *self._checked_port(port).reply_fields())
 
     def _reset_counter(self, port: int, relative: int) -> bytes:
-        self._port_numbered(port).reset_counter(block=bool(relative))
+        self._checked_port(port).reset_counter(block=bool(relative))
         return b""
 
-    def _port_numbered(self, port: int) -> Output:
+    def _checked_port(self, port: int) -> Output:
         if port >= len(self.ports):
             raise RefusedError(Status.OUT_OF_RANGE)
         return self.ports[port]

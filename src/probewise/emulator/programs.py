@@ -32,7 +32,7 @@ class Programs:
             0x00: self._start_program,
             0x01: self._stop_program,
             0x09: self._write_message,
-            0x11: self._running_name,
+            0x11: self._checked_running_name,
             0x13: self._read_message,
         }
 
@@ -43,7 +43,7 @@ class Programs:
         return b""
 
     def _stop_program(self) -> bytes:
-        self._running_name()
+        self._checked_running_name()
         self._switch_program(None)
         return b""
 
@@ -58,7 +58,7 @@ class Programs:
             raise RefusedError(Status.OUT_OF_RANGE)
         if box >= _N_BOXES:
             raise RefusedError(Status.ILLEGAL_MAILBOX)
-        self._running_name()
+        self._checked_running_name()
         self._boxes[box + _ANSWERS if box < _ANSWERS else box].append(message)
         return b""
 
@@ -74,7 +74,7 @@ class Programs:
             raise RefusedError(Status.MAILBOX_EMPTY, padded(b""))
         return padded(self._boxes[box].popleft() if remove else self._boxes[box][0])
 
-    def _running_name(self) -> bytes:
+    def _checked_running_name(self) -> bytes:
         """Return the running program's name; refuse if none runs."""
         if self.running is None:
             raise RefusedError(Status.NO_PROGRAM)

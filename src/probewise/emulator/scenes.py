@@ -38,7 +38,7 @@ def parse_scene(text: str) -> Surface:
 def scene_text(surface: Surface) -> str:
     """Write a scene as `parse_scene` reads it.
 
-    Raises ParameterError if it has none of the forms, such as stripes or black on white.
+    Raises ParameterError for an ellipse, and for what has none of the forms, such as stripes or black on white.
     """
     if (getattr(surface, "inside", 1.0), getattr(surface, "outside", 0.0)) == (1.0, 0.0):
         match surface:

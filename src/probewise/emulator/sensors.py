@@ -78,7 +78,7 @@ class DigitalSensor:
 
 
 def ultrasonic_sensor(distance_cm: int) -> DigitalSensor:
-    """Make an ultrasonic sensor at a distance from a wall."""
+    """Make an ultrasonic sensor that stands `distance_cm` from a wall."""
     version, maker, kind = b"V1.0".ljust(8, b"\0"), b"LEGO".ljust(8, b"\0"), b"Sonar".ljust(8, b"\0")
     heads = {0x00: version, 0x08: maker, 0x10: kind, 0x14: b"10E-2m\0", 0x41: b"\x02", 0x42: bytes((distance_cm,))}
     return DigitalSensor(0x02, heads)

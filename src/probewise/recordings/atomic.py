@@ -26,7 +26,7 @@ def write_bytes_atomically(path: str | os.PathLike[str], content: bytes) -> None
     Raises
     ------
     FileError
-        If the folder does not exist or cannot be written to.
+        If the folder does not exist or cannot be written to, or the disk is full.
     """
     path = Path(path)
     prefix = f".{path.name}."
@@ -62,7 +62,7 @@ def write_text_atomically(path: str | os.PathLike[str], text: str) -> None:
     Raises
     ------
     FileError
-        If the folder does not exist or cannot be written to.
+        If the folder does not exist or cannot be written to, or the disk is full.
     """
     write_bytes_atomically(path, text.encode("utf-8"))
 

@@ -75,7 +75,7 @@ class CSVTable:
         name
             The column.
         missing
-            Whether an empty cell or `nan` is allowed; it becomes NaN.
+            Whether an empty cell, `nan`, `na` or `n/a` is allowed; it becomes NaN.
         largest
             Largest magnitude allowed; None: any finite number.
 

@@ -31,7 +31,7 @@ _PLACES, _WIDTHS = _places_and_widths_on_rings(
 
 
 def _moment_preserving_basis() -> FloatArray:
-    """Find an orthonormal basis of the shares that change neither mean nor covariance, (n_rings, n_bends)."""
+    """Find an orthonormal basis of the shares that change neither mean nor covariance, (N_FREE_FORM - 1, N_BENDS)."""
     x, y = _PLACES.T
     moments = np.stack([x, y, x * x + _WIDTHS**2 - 1, y * y + _WIDTHS**2 - 1, x * y])
     return np.ascontiguousarray(np.linalg.svd(moments)[2][len(moments) :].T)

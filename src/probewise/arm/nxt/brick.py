@@ -36,7 +36,7 @@ NO_PROGRAM = 0xEC
 
 
 class Brick:
-    """A LEGO NXT; use it in a `with` block, which stops and releases all motors at its end.
+    """A LEGO NXT; use it in a `with` block, which at its end releases the motors, puts LEDs out and disconnects.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Brick:
         return self._lights.setdefault(port, LightSensor(self.link, port, clock=self._clock))
 
     def battery_mv(self) -> int:
-        """Read the battery's voltage; warn once if it is low.
+        """Read the battery's voltage, in mV; warn once if it is low.
 
         A voltage far from the last one must be confirmed by a second reading, since the protocol has no checksum.
 

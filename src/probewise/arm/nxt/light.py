@@ -51,7 +51,7 @@ class LightReading:
 
     @property
     def percent(self) -> int:
-        """Whole percent from 0 to 100, as the brick shows it: the paper's LEGO units."""
+        """Whole percent from 0 to 100, as the brick shows it; LEGO units are the same, but at least 1."""
         return self.normalized * 100 // AD_MAX
 
     @property

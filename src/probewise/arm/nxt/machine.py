@@ -89,11 +89,11 @@ class BrickMachine:
             self.limits.record_counts(joint, 0)
 
     def read_percent(self) -> float:
-        """Read the light sensor, LED on."""
+        """Read the light sensor with the LED on: 0 to 100, with fractions."""
         return self._light.read().fine_percent
 
     def battery_mv(self) -> float:
-        """Read the battery's voltage."""
+        """Read the battery's voltage, in mV."""
         return self.brick.battery_mv()
 
     def keep_awake(self) -> None:
@@ -110,5 +110,5 @@ class BrickMachine:
             self.limits.record_counts(joint, motor.last_counts - self._zeros[joint])
 
     def _require_allowed_move(self, joint: int, here: int, to: int) -> None:
-        """Check a move against the limits, whose counts are from home."""
+        """Raise ReachError if a move, in counts of the motor, leaves the limits, whose counts are from home."""
         self.limits.require_allowed_move(joint, here - self._zeros[joint], to - self._zeros[joint])

@@ -33,7 +33,7 @@ class IntegerField:
 
 
 def packed_field(kind: IntegerField, default: Any = dataclasses.MISSING) -> Any:
-    """Make a dataclass field with this byte layout."""
+    """Return a dataclass field of a command, packed with this byte layout."""
     return dataclasses.field(default=default, metadata={"kind": kind})
 
 

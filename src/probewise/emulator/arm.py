@@ -41,6 +41,8 @@ class Joint:
         stops_deg = (ends[0] - play_deg / 2, ends[1] + play_deg / 2)
         return cls(numbers, Motor(MotorParameters(stops_deg=stops_deg, play_deg=play_deg)))
 
+    at_home = create_at_home  # its old name
+
     @property
     def angle_rad(self) -> float:
         """Angle of the joint."""

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.fitting.fit import Model, fit, start_with_more_gaussians, starts_of_one_gaussian
-from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.fit import Model, fit, starts_of_one_gaussian, starts_with_more_gaussians
+from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent
 from probewise.inference import sd_floor
@@ -67,11 +67,11 @@ def _fitted(recording: Recording, names: tuple[str, ...], free_form: bool):
     one = default_sensor(extent, 1)
     found = _best(Model(one, (), recording.plan), recording, starts_of_one_gaussian(one), law)
     if free_form:
-        wanted = FreeForm.from_one_gaussian(one)
-        starts = wanted.start_from(found.z)
+        wanted = FreeFormSensor.from_one_gaussian(one)
+        starts = wanted.start_from_one_gaussian(found.z)
     else:
         wanted = default_sensor(extent, 2)
-        starts = start_with_more_gaussians(found.model.sensor, found.z, wanted)
+        starts = starts_with_more_gaussians(found.model.sensor, found.z, wanted)
     found = _best(Model(wanted, (), recording.plan), recording, starts, law)
     for name in names:
         model = found.model.with_effect(VOCABULARY[name].for_extent(extent))

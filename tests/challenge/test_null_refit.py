@@ -56,7 +56,7 @@ def test_what_is_left_of_a_small_effect_is_its_projection(refit, clean):
     """Two routes: the refit, and least squares on slopes by differences."""
     null = refit.null(clean)
     wave = 0.2 * np.sin(np.arange(len(clean)) / 7.0)
-    _, slopes = null.model.jacobian(null.z)
+    _, slopes = null.model.predict_and_differentiate(null.z)
     left = wave - slopes @ np.linalg.lstsq(slopes, wave)[0]
     assert refit(clean, changed(clean, wave)) == pytest.approx(np.linalg.norm(left), rel=0.01)
 

@@ -160,7 +160,7 @@ def test_a_repair_that_fails_on_what_was_kept_back_is_no_repair(monkeypatch):
     found_out = Improvement(30.0, -4.0, 0.5, (("edge_0", -4.0),), 0.9, 0.6, 0.4)
     plain = Improvement(0.0, 0.0, 0.0, (), 0.9, 0.9, 1e-9)
     answers = [found_out, plain]
-    monkeypatch.setattr("probewise.diagnosis.repair.best.improvement_of", lambda *_, **__: answers.pop(0))
+    monkeypatch.setattr("probewise.diagnosis.repair.best_repair.improvement_of", lambda *_, **__: answers.pop(0))
     found = diagnose(recording("forth_and_back", hidden.Backlash(0.7), seed=2), rng=np.random.default_rng(0))
     assert found.verdict == "cannot_tell"
     assert found.combination == ()
@@ -415,10 +415,12 @@ def asked_about(monkeypatch, of: Recording) -> tuple[list, float, Diagnosis]:
     """Diagnose, and tell which rivals the next readings were to part, and in what noise."""
     seen: list = []
 
-    def next_scans(rivals, sd, plan, apparatus):
+    def measurement_separating_rivals(rivals, sd, plan, apparatus):
         seen.append((list(rivals), sd))
 
-    monkeypatch.setattr("probewise.diagnosis.advice.rivals.next_scans", next_scans)
+    monkeypatch.setattr(
+        "probewise.diagnosis.advice.rivals.measurement_separating_rivals", measurement_separating_rivals
+    )
     found = diagnose(of, rng=np.random.default_rng(0))
     return *seen[0], found
 

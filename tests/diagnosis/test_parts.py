@@ -11,12 +11,12 @@ from scipy.integrate import quad
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.advice.aliases import Alias, projected_cosine
-from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import (
     LEAST_VISIBLE,
     SCALES,
-    Blocks,
     Linearised,
+    OrthonormalBlocks,
     block_log_bayes_factors,
     mix_scales,
 )
@@ -27,13 +27,13 @@ from probewise.diagnosis.fitting.coordinates import (
     effect_values,
     theta_to_natural,
 )
-from probewise.diagnosis.fitting.earlier import sensor_from_posterior
 from probewise.diagnosis.fitting.fit import Fit, Model
-from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.free_form import FreeFormSensor
+from probewise.diagnosis.fitting.sensor_prior import sensor_from_posterior
 from probewise.diagnosis.joining import join
-from probewise.diagnosis.judgement.judged import Hypothesis, credible_set, decide
+from probewise.diagnosis.judgement.judged import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.diagnosis.light_sensor.covariates import covariate_of
-from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, steps_within_scans, white_noise
+from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, rows_to_previous_usable, white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
@@ -108,14 +108,14 @@ def test_an_earlier_posterior_becomes_the_prior_of_the_same_spread():
 
 
 def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
-    free = FreeForm.from_one_gaussian(default_sensor(EXTENT, 1))
+    free = FreeFormSensor.from_one_gaussian(default_sensor(EXTENT, 1))
     rng = np.random.default_rng(0)
     z = 0.02 * rng.normal(size=(4000, free.n_params))
     theta = free.theta(z)
     np.testing.assert_allclose(free.z(theta), z, atol=1e-8)
     names = (*mixture_names(free.n_gaussians), "I_min", "I_max")
     prior = sensor_from_posterior(names, theta.mean(axis=0), np.cov(theta.T))
-    assert isinstance(prior, FreeForm)
+    assert isinstance(prior, FreeFormSensor)
     drawn = prior.theta(rng.normal(size=(4000, free.n_params)))
     spread = theta.std(axis=0)
     np.testing.assert_allclose(drawn.std(axis=0)[spread > 1e-9], spread[spread > 1e-9], rtol=0.08)
@@ -124,7 +124,7 @@ def test_an_earlier_free_form_becomes_the_prior_of_the_same_spread():
 def test_the_weight_of_a_variant_is_the_sum_over_its_settings():
     one = (np.zeros((5, 1)),) * 5
     templates = EffectTemplates(one, one, (Backlash(),) * 3, np.array([0, 0, 1, 2, 2]))
-    np.testing.assert_allclose(templates.weights(np.log([1.0, 3.0, 10.0, 5.0, 1.0])), [0.2, 0.5, 0.3])
+    np.testing.assert_allclose(templates.variant_probabilities(np.log([1.0, 3.0, 10.0, 5.0, 1.0])), [0.2, 0.5, 0.3])
 
 
 @pytest.mark.parametrize("name", ["flicker", "albedo_patch", "scan_angle_error"])
@@ -143,7 +143,7 @@ def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, 
     for k, own in enumerate(at):
         np.testing.assert_array_equal(few.settings[k], whole.settings[own])
         np.testing.assert_allclose(few.columns[k], whole.columns[own], atol=1e-8)  # the error of a response
-        assert few.variant(k) == whole.variant(own)
+        assert few.variant_of_entry(k) == whole.variant_of_entry(own)
 
 
 def test_what_changes_nothing_but_the_last_digit_is_no_template():
@@ -174,7 +174,7 @@ def test_templates_of_a_variant_are_what_its_scans_change():
         templates = effect_templates(found, effect, usable)
         assert len(templates.columns) == len(templates.settings) == len(templates.choice)
         for at in range(0, len(templates.choice), 9):
-            richer = model.with_effect(templates.variant(at))
+            richer = model.with_effect(templates.variant_of_entry(at))
             theta = np.concatenate([sensor.theta(z[None, :]), templates.settings[at]], axis=1)
             change = richer.chain.predict(theta, plan)[0] - predicted
             np.testing.assert_allclose(templates.columns[at][:, 0], change[usable], atol=1e-7)
@@ -193,16 +193,16 @@ def test_whitening_is_the_inverse_root_of_the_covariance():
     readings = recording.readings.copy()
     readings[2] = np.nan
     recording = Recording(recording.plan, readings)
-    steps = steps_within_scans(recording)
+    steps = rows_to_previous_usable(recording)
     np.testing.assert_array_equal(steps, [0, 1, 2, 1, 1, 0, 1, 1, 1, 1, 1])
     rows = np.flatnonzero(recording.usable)
-    nodes = NoiseModel((CorrelatedNoise(),), recording).laws(np.zeros(len(rows)))
+    nodes = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(np.zeros(len(rows)))
     node = 20
     rho, whitener = nodes.settings[node, 0], nodes.laws[node]
     scan = recording.plan.scan[rows]
     cov = np.where(scan[:, None] == scan[None, :], rho ** np.abs(rows[:, None] - rows[None, :]), 0.0)
     r = np.random.default_rng(0).normal(size=len(rows))
-    by_whitening = -0.5 * np.sum(whitener(r) ** 2) - whitener.log_det() - 0.5 * len(r) * math.log(2 * math.pi)
+    by_whitening = -0.5 * np.sum(whitener(r) ** 2) - whitener.half_log_det() - 0.5 * len(r) * math.log(2 * math.pi)
     assert by_whitening == pytest.approx(multivariate_normal(cov=cov).logpdf(r))
     np.testing.assert_allclose(whitener(np.eye(len(r))) @ cov @ whitener(np.eye(len(r))).T, np.eye(len(r)), atol=1e-12)
 
@@ -218,7 +218,7 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     augmented = np.concatenate([r, np.zeros(p)])
     residual = augmented - basis @ (basis.T @ augmented)
     problem = Linearised(basis, residual, white_noise(n), 1.0, n)
-    blocks = Blocks.of(problem, [template], ["t"])
+    blocks = OrthonormalBlocks.of(problem, [template], ["t"])
     found = block_log_bayes_factors(blocks, residual[:, None], n)[0, 0]
 
     unit = problem.project(template / np.sqrt(np.mean(template**2)))[:, 0]
@@ -260,9 +260,9 @@ def test_a_bank_weighs_as_blocks_do():
     residuals = rng.normal(size=(n + p, 3))
     residuals -= basis @ (basis.T @ residuals)
     problem = Linearised(basis, residuals[:, 0], law, 1.3, n)
-    blocks = Blocks.of(problem, templates, [""] * 4)
+    blocks = OrthonormalBlocks.of(problem, templates, [""] * 4)
     wanted = block_log_bayes_factors(blocks, residuals, n)
-    np.testing.assert_allclose(Bank.of(templates, ["a"] * 4, n).log_bayes_factors(problem, residuals), wanted)
+    np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4, n).log_bayes_factors(problem, residuals), wanted)
 
 
 def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
@@ -278,14 +278,16 @@ def test_what_survives_of_a_template_is_what_no_parameter_takes_up():
         unit = columns / np.linalg.norm(columns, axis=0)
         left = unit - slopes @ np.linalg.lstsq(slopes, unit)[0]
         wanted.append(np.linalg.norm(left) / np.linalg.norm(unit))
-    np.testing.assert_allclose(Bank.of(templates, ["a", "b", "c"], n).unabsorbed_shares(problem), wanted, atol=1e-7)
+    np.testing.assert_allclose(
+        TemplateBank.of(templates, ["a", "b", "c"], n).unabsorbed_shares(problem), wanted, atol=1e-7
+    )
 
 
 def test_null_draws_have_nothing_in_the_span_of_the_fit():
     rng = np.random.default_rng(1)
     basis, _ = np.linalg.qr(rng.normal(size=(40, 3)))
     problem = Linearised(basis, np.zeros(40), white_noise(37), 1.0, 37)
-    draws = problem.draws(200, rng=rng)
+    draws = problem.draw_null_residuals(200, rng=rng)
     np.testing.assert_allclose(basis.T @ draws, 0.0, atol=1e-12)
     assert np.mean(np.sum(draws**2, axis=0)) == pytest.approx(37, rel=0.05)
 
@@ -317,7 +319,7 @@ def test_a_bump_is_found_where_it_is():
     augmented = np.concatenate([r, [0.0]])
     problem = Linearised(basis, augmented - basis @ (basis.T @ augmented), white_noise(n), 1.0, n)
     covariates = [Covariate("time", time, np.arange(n)), Covariate("level", rng.normal(size=n), np.arange(n))]
-    found = significant_places(problem, covariates, ("s",), r, problem.draws(400, rng=rng))
+    found = significant_places(problem, covariates, ("s",), r, problem.draw_null_residuals(400, rng=rng))
     assert found[0].covariate == "time"
     assert found[0].start == pytest.approx(60, abs=8)
     assert found[0].end == pytest.approx(75, abs=8)
@@ -396,7 +398,7 @@ def test_white_noise_is_left_as_it_is():
     r = np.arange(5.0)
     np.testing.assert_array_equal(white_noise(5)(r), r)
     twice = NoiseLaw(np.full(5, 2.0), np.zeros(5), np.zeros(5, dtype=np.bool_))
-    assert twice.log_det() == pytest.approx(5 * math.log(2))
+    assert twice.half_log_det() == pytest.approx(5 * math.log(2))
 
 
 def test_joined_recordings_keep_scans_and_patterns_apart():
@@ -471,7 +473,10 @@ def hypotheses(**probability: float) -> tuple[Hypothesis, ...]:
 )
 def test_verdicts_follow_the_probabilities(probability, verdict, combination):
     aliases = (Alias(("backlash", "tilt"), 1.0, "turn the sensor", 8), Alias(("backlash", "lag"), 0.99, "go back", 8))
-    assert decide(hypotheses(**probability), NOISE, aliases, lambda _: frozenset()) == (verdict, combination)
+    assert verdict_from_probabilities(hypotheses(**probability), NOISE, aliases, lambda _: frozenset()) == (
+        verdict,
+        combination,
+    )
 
 
 @pytest.mark.parametrize(
@@ -481,9 +486,12 @@ def test_what_readings_cannot_tell_apart_is_not_named(lag, verdict):
     """Half of the probability is not enough where priors alone may have parted two that predict the same."""
     found = hypotheses(clean=0.3 - lag, backlash=0.6, lag=lag, glint=0.1)
     same = {("backlash",): frozenset({("lag",)})}
-    assert decide(found, NOISE, (), lambda names: same.get(names, frozenset())) == (verdict, ("backlash",))
+    assert verdict_from_probabilities(found, NOISE, (), lambda names: same.get(names, frozenset())) == (
+        verdict,
+        ("backlash",),
+    )
 
 
 def test_a_credible_set_is_the_fewest_that_hold_the_mass():
     found = hypotheses(clean=0.02, backlash=0.7, backlash__lag=0.26, glint=0.02)
-    assert credible_set(found) == ("backlash", "backlash+lag")
+    assert credible_labels(found) == ("backlash", "backlash+lag")

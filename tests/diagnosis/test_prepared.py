@@ -26,21 +26,21 @@ def test_effects_are_those_that_could_show_here():
     assert "backlash" in prepared.effects
     assert "arm_knock" in prepared.effects  # out of vocabulary, by its formula
     assert "orientation_error" not in prepared.effects  # the SSF takes it up
-    assert prepared.on_noise >= {"outliers", "drifting_noise"}
-    assert not prepared.thinned
+    assert prepared.noise_effect_names >= {"outliers", "drifting_noise"}
+    assert not prepared.is_thinned
 
 
 def test_too_little_is_few_readings_or_equal_ones():
     whole = recording()
-    assert not prepare(whole, apparatus=SENSOR).too_little
-    assert prepare(recording(20), apparatus=SENSOR).too_little
-    assert prepare(replace(whole, readings=np.full(408, 5.0)), apparatus=SENSOR).too_little
+    assert not prepare(whole, apparatus=SENSOR).has_too_little_data
+    assert prepare(recording(20), apparatus=SENSOR).has_too_little_data
+    assert prepare(replace(whole, readings=np.full(408, 5.0)), apparatus=SENSOR).has_too_little_data
 
 
 def test_values_of_usable_readings_are_spread_over_all_rows():
     whole = recording(30)
     holes = replace(whole, readings=np.where(np.arange(30) % 2, np.nan, whole.readings))
-    spread = prepare(holes, apparatus=SENSOR).spread(np.arange(15.0))
+    spread = prepare(holes, apparatus=SENSOR).expand_to_all_rows(np.arange(15.0))
     np.testing.assert_array_equal(spread[::2], np.arange(15.0))
     assert np.isnan(spread[1::2]).all()
 

@@ -21,18 +21,20 @@ EFFECTS = {**VOCABULARY, **UNNAMED}
 
 def test_everything_about_the_mean_sums_to_one_but_for_what_is_unknown_beside():
     effects = {name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()}
-    odds = PriorOdds.over({name: effect for name, effect in effects.items() if effect is not None})
+    odds = PriorOdds.for_effects({name: effect for name, effect in effects.items() if effect is not None})
     named = [n for n, kind in VOCABULARY.items() if kind.stage is not Stage.NOISE and effects[n] is not None]
-    total = math.exp(odds.log_unknown(()))
-    total += sum(math.exp(odds.log_mean(names)) for k in range(4) for names in combinations(named, k))
-    total += sum(math.exp(odds.log_mean((name,))) for name in UNNAMED)
+    total = math.exp(odds.log_prior_with_unknown(()))
+    total += sum(math.exp(odds.log_prior_on_mean(names)) for k in range(4) for names in combinations(named, k))
+    total += sum(math.exp(odds.log_prior_on_mean((name,))) for name in UNNAMED)
     assert total == pytest.approx(1.0, abs=1e-9)
 
 
 def test_half_of_the_unknown_has_a_name_of_our_own():
-    odds = PriorOdds.over({name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()})
-    assert sum(math.exp(odds.log_mean((name,))) for name in UNNAMED) == pytest.approx(math.exp(odds.log_unknown(())))
-    beside = odds.log_mean(("arm_knock", "backlash")) - odds.log_mean(("backlash",))
+    odds = PriorOdds.for_effects({name: kind.for_extent(EXTENT) for name, kind in EFFECTS.items()})
+    assert sum(math.exp(odds.log_prior_on_mean((name,))) for name in UNNAMED) == pytest.approx(
+        math.exp(odds.log_prior_with_unknown(()))
+    )
+    beside = odds.log_prior_on_mean(("arm_knock", "backlash")) - odds.log_prior_on_mean(("backlash",))
     assert math.exp(beside) * len(UNNAMED) == pytest.approx(odds.unknown_beside * odds.out_of_vocabulary)
 
 
@@ -50,11 +52,11 @@ def test_of_one_wave_two_are_likelier_than_it_beside_another_effect_and_all_sums
     names = ["drift", "wave", "lag"]
     sets = [of for k in range(1, 4) for of in combinations(names, k)]
     twice = [(*of, "wave~again") for of in sets if "wave" in of]
-    assert sum(math.exp(odds.log_mean(of)) for of in [*sets, *twice]) == pytest.approx(0.34)
-    assert math.exp(odds.log_mean(("wave", "wave~again"))) == pytest.approx(0.1 * 0.1)
-    assert odds.log_mean(("wave", "wave~again")) > odds.log_mean(("drift", "wave"))
+    assert sum(math.exp(odds.log_prior_on_mean(of)) for of in [*sets, *twice]) == pytest.approx(0.34)
+    assert math.exp(odds.log_prior_on_mean(("wave", "wave~again"))) == pytest.approx(0.1 * 0.1)
+    assert odds.log_prior_on_mean(("wave", "wave~again")) > odds.log_prior_on_mean(("drift", "wave"))
     as_any = PriorOdds(n_named=3, n_unnamed=0, by_size=(0.3, 0.03, 0.01), twofold=frozenset({"wave"}))
-    assert as_any.log_mean(("wave", "wave~again")) == as_any.log_mean(("drift", "wave"))
+    assert as_any.log_prior_on_mean(("wave", "wave~again")) == as_any.log_prior_on_mean(("drift", "wave"))
 
 
 def test_every_noise_sums_to_one_beside_an_effect_and_alone():
@@ -62,7 +64,7 @@ def test_every_noise_sums_to_one_beside_an_effect_and_alone():
     odds = replace(SimulatorApparatus.prior_odds(cast(Any, None), {}), n_noises=5)
     for alone in (False, True):
         sets = (names for k in range(4) for names in combinations("abcde", k))
-        assert sum(math.exp(odds.log_noise(names, alone=alone)) for names in sets) == pytest.approx(1.0)
-    assert math.exp(odds.log_noise((), alone=True)) == pytest.approx(0.8)
-    assert odds.log_noise(("a",), alone=True) > odds.log_noise(("a",))
-    assert PriorOdds().log_noise(("a",), alone=True) == PriorOdds().log_noise(("a",))
+        assert sum(math.exp(odds.log_prior_on_noise(names, alone=alone)) for names in sets) == pytest.approx(1.0)
+    assert math.exp(odds.log_prior_on_noise((), alone=True)) == pytest.approx(0.8)
+    assert odds.log_prior_on_noise(("a",), alone=True) > odds.log_prior_on_noise(("a",))
+    assert PriorOdds().log_prior_on_noise(("a",), alone=True) == PriorOdds().log_prior_on_noise(("a",))

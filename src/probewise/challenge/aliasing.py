@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.challenge.null_refit import NullRefit
-from probewise.diagnosis.evidence.laplace import Blocks, Linearised
+from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
 from probewise.diagnosis.fitting.fit import Fit, fit
 from probewise.diagnosis.noise.law import white_noise
@@ -109,7 +109,7 @@ def _templates_and_explained_squares(
 ) -> tuple[EffectTemplates, FloatArray]:
     """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
     templates = effect_templates(found, effect, usable)
-    blocks = Blocks.of(problem, templates.columns, [effect.name] * len(templates.columns))
+    blocks = OrthonormalBlocks.of(problem, templates.columns, [effect.name] * len(templates.columns))
     return templates, np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
 
 
@@ -120,9 +120,9 @@ def _refit_with_effect(
     columns, setting = templates.columns[at], templates.settings[at]
     amount = np.linalg.lstsq(problem.project(columns), problem.residual)[0]
     start = effect.start(setting, np.asarray(amount, dtype=np.float64))
-    z = found.z + problem.absorbed(found, columns @ amount)
-    model = found.model.with_effect(templates.variant(at))
-    start_z = np.concatenate([z, model.coordinates_of_last_effect(start[None, :])[0]])
+    z = found.z + problem.absorbing_shift(found, columns @ amount)
+    model = found.model.with_effect(templates.variant_of_entry(at))
+    start_z = np.concatenate([z, model.z_of_last_effect(start[None, :])[0]])
     rss = float(found.residuals @ found.residuals)
     # The floor of the sd is a tenth of the residual: small enough for accuracy, large enough not to force an exact fit.
     floor = 0.1 * np.sqrt(rss / len(found.residuals))

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.laplace import weigh
+from probewise.diagnosis.evidence.laplace import laplace_evidence
 from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.fitting.fit import Fit, Model, fit, start_with_more_gaussians, starts_of_one_gaussian
+from probewise.diagnosis.fitting.fit import Fit, Model, fit, starts_of_one_gaussian, starts_with_more_gaussians
 from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.effects import Extent
@@ -64,10 +64,10 @@ def _fit_of_best_order(clean: Recording) -> Fit:
         (_white_noise_fit(Model(sensor, (), clean.plan), clean, z) for z in starts_of_one_gaussian(sensor)),
         key=lambda f: f.objective,
     )
-    best, best_log_z = found, weigh(found, noise).log_z
+    best, best_log_z = found, laplace_evidence(found, noise).log_z
     for _ in range(_MOST_GAUSSIANS - 1):
         found = min(_fits_with_one_more_gaussian(found, clean, extent), key=lambda f: f.objective)
-        log_z = weigh(found, noise).log_z
+        log_z = laplace_evidence(found, noise).log_z
         if log_z > best_log_z:
             best, best_log_z = found, log_z
         elif log_z < best_log_z - _BEHIND:
@@ -78,7 +78,7 @@ def _fit_of_best_order(clean: Recording) -> Fit:
 def _fits_with_one_more_gaussian(found: Fit, recording: Recording, extent: Extent) -> Iterator[Fit]:
     """Fit with one more Gaussian, starting from every way to split the heaviest."""
     wanted = default_sensor(extent, found.model.sensor.n_gaussians + 1)
-    for z in start_with_more_gaussians(found.model.sensor, found.z, wanted):
+    for z in starts_with_more_gaussians(found.model.sensor, found.z, wanted):
         yield _white_noise_fit(Model(wanted, (), recording.plan), recording, z)
 
 

@@ -17,9 +17,9 @@ from probewise.diagnosis.audit.plan_audit import (
     audit_recorded,
 )
 from probewise.diagnosis.engine import Thorough, diagnose
-from probewise.diagnosis.fitting.earlier import SensorPrior
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.own_model import OwnModel, Parameters
+from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.judgement.judged import Hypothesis, Judged, Verdict
 from probewise.diagnosis.model_with import model_with

@@ -41,7 +41,7 @@ class Words:
     covariates: Mapping[str, str] | None = None
 
     def covariate(self, name: str) -> str:
-        """Write the name of a covariate."""
+        """Return the name of a covariate in words."""
         if self.covariates is None:
             return name.replace("_", " ")
         return self.covariates.get(name, name.replace("state:", "state "))
@@ -59,19 +59,19 @@ class Apparatus(Protocol):
         """Return the vocabulary scaled to a recording, by name, without effects that could not be detectable there."""
         ...
 
-    def proposals(self) -> Mapping[str, NamedEffect[Any]]:
+    def proposed_effects(self) -> Mapping[str, NamedEffect[Any]]:
         """Return proposed formulas for effects out of vocabulary; names begin with `effects.PROPOSAL`."""
         ...
 
-    def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+    def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Return the names of the user's own effects, which are always tried."""
         ...
 
-    def spent_refit_budget(self) -> float:
+    def refit_budget_share_spent(self) -> float:
         """Return the share of the budget of costly predictions that is spent: 1 or more if it is used up."""
         ...
 
-    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
+    def is_refit_budget_spent(self, share: float = 1.0) -> bool:
         """Return whether this share of the budget of costly predictions is spent.
 
         With all of it spent, no further combination is refitted.
@@ -86,7 +86,7 @@ class Apparatus(Protocol):
         """Return the forms of the null to calibrate from the recording, if no null is given."""
         ...
 
-    def covariates(self, found: Fit, recording: Recording) -> tuple[Sequence[Covariate], FloatArray]:
+    def covariates_and_slope(self, found: Fit, recording: Recording) -> tuple[Sequence[Covariate], FloatArray]:
         """Return the covariates of a residual, and the slope of the prediction along the motion, (n_usable,)."""
         ...
 
@@ -101,7 +101,7 @@ class Apparatus(Protocol):
         """Choose the covariate in which an effect is located, from its change of the readings `without` it."""
         ...
 
-    def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
+    def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
         """Return slopes by structure that no form of the null fits and that is not physics: (n_usable, n_columns)."""
         ...
 
@@ -109,16 +109,19 @@ class Apparatus(Protocol):
         """Partition usable readings into parts to hold out in turn."""
         ...
 
-    def commands(
+    def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> Sequence[Command]:
-        """Return the possible next measurements; `level` (n_points,) are the expected readings of the plan."""
+        """Return the possible next measurements.
+
+        With stride k, only every k-th reading is taken; `level` (n_points,) are the expected readings of the plan.
+        """
         ...
 
-    def as_alternatives(self, commands: Sequence[Any], after: Plan) -> Plan:
+    def plan_of_alternatives(self, commands: Sequence[Any], after: Plan) -> Plan:
         """Concatenate alternative commands, each timed as if directly after a plan, to predict all of them at once."""
         ...
 
-    def in_sequence(self, commands: Sequence[Any], after: Plan) -> Plan:
+    def plan_in_sequence(self, commands: Sequence[Any], after: Plan) -> Plan:
         """Concatenate commands into one plan, timed to be carried out in sequence after a plan."""
         ...

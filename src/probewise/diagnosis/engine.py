@@ -14,15 +14,15 @@ import numpy as np
 
 from probewise._kinds import require_like, require_progress, require_rng
 from probewise.diagnosis.advice.next_scans import NextMeasurement
-from probewise.diagnosis.advice.rivals import next_readings
-from probewise.diagnosis.fitting.earlier import SensorPrior
+from probewise.diagnosis.advice.rivals import choose_next_measurement
 from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.fitting.sensor_prior import SensorPrior
 from probewise.diagnosis.judgement.global_test import GlobalTest, run_global_test
 from probewise.diagnosis.judgement.judged import judge
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import Prepared, prepare
-from probewise.diagnosis.repair.best import Best, best_repair
-from probewise.diagnosis.repair.correction import corrected
+from probewise.diagnosis.repair.best_repair import BestRepair, judged_and_best_repair
+from probewise.diagnosis.repair.correction import improvement_and_correction
 from probewise.diagnosis.repair.ensemble import DrawnModels, draw_models
 from probewise.diagnosis.repair.places import locate_effects_and_residuals
 from probewise.diagnosis.repair.repair import repair_of
@@ -112,30 +112,30 @@ def diagnose_prepared(
     searched, weighings = search(prepared, progress=progress), tuple[Weighing, ...]()
     searched = search_with_formulas(searched, progress=progress)
     prepared = searched.prepared
-    if prepared.too_little:
+    if prepared.has_too_little_data:
         searched = searched.with_prior_probabilities()
     elif thorough is not None:
         searched, weighings = thorough(searched)
     progress("testing the residuals")
     test = run_global_test(searched, rng=rng)
     progress("testing the repair on held-out readings")
-    judged, best = best_repair(searched, test, judge(searched, test), rng=rng)
+    judged, best = judged_and_best_repair(searched, test, judge(searched, test), rng=rng)
     drawn = draw_models(searched, test, judged, best, rng=rng, progress=progress)
     found = effects_found(searched, judged.hypotheses, best, drawn.best, rng=rng)
     progress("locating the residuals")
     where = locate_effects_and_residuals(searched, test, judged, best, {e.name: e.size_lambda for e in found}, rng=rng)
-    change = np.zeros(len(prepared.usable))
+    change = np.zeros(len(prepared.usable_rows))
     if judged.verdict == "unknown" and not best.out_of_vocabulary:
-        improvement, change = corrected(searched, test, best, rng=rng)
+        improvement, change = improvement_and_correction(searched, test, best, rng=rng)
         best = replace(best, improvement=improvement)
     progress("choosing the next readings")
-    asked = next_readings(searched, test.null)
+    asked = choose_next_measurement(searched, test.null)
     noise = noise_found(searched, best, drawn.best, rng=rng)
     remainder = remainder_of(searched, judged, best, rng=rng)
     formula = formula_of(searched, judged, best, drawn.best)
     grounds = _facts_for_reason(searched, test, best, drawn=drawn, found=found, where=where, asked=asked)
     reason = sentence_with_agreement(reason_of(judged, grounds), weighings)
-    if prepared.thinned:
+    if prepared.is_thinned:
         reason += f" (From {len(prepared.recording)} of {len(prepared.everything)} readings, evenly spread.)"
     return Diagnosis(
         recording=prepared.everything,
@@ -151,7 +151,7 @@ def diagnose_prepared(
 def _facts_for_reason(
     searched: Searched,
     test: GlobalTest,
-    best: Best,
+    best: BestRepair,
     *,
     drawn: DrawnModels,
     found: Sequence[EffectFound],
@@ -166,7 +166,7 @@ def _facts_for_reason(
     columns = [drawn.best.effect_samples(effect.name) for effect in formulas]
     return Grounds(
         words=prepared.apparatus.words,
-        n_readings=len(prepared.usable),
+        n_readings=len(prepared.usable_rows),
         least_readings=prepared.least_readings,
         form=searched.nulls[max(orders, key=lambda n: orders[n])].form,
         sentences={effect.name: effect.sentence for effect in found},

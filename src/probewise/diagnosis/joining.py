@@ -42,15 +42,15 @@ def join(recordings: Sequence[Recording]) -> Recording:
                 "reading unit", other.plan.instrumentation.unit, f"{first.plan.instrumentation.unit!r}, as the first"
             )
     for (i, one), (j, other) in itertools.combinations(enumerate(recordings), 2):
-        if _same_readings(one, other):
-            found = f"{_name(one, i)} (number {i + 1}) and {_name(other, j)} (number {j + 1})"
+        if _is_same_recording(one, other):
+            found = f"{_recording_label(one, i)} (number {i + 1}) and {_recording_label(other, j)} (number {j + 1})"
             raise ParameterError("recordings", found, "recordings that differ; these are the same")
     notes = [note for recording in recordings for note in recording.notes]
     return Recording(
         join_plans([recording.plan for recording in recordings]),
         np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
         " + ".join(r.source for r in recordings if r.source),
-        (*notes, *_notes_on_covariates(recordings)),
+        (*notes, *_notes_on_missing_covariates(recordings)),
     )
 
 
@@ -90,18 +90,18 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
         pattern=np.concatenate(codes),
         pattern_names=tuple(names),
         patterns=patterns,
-        covariates={name: _column(plans, name) for name in sorted({*first.covariates, *commanded})},
+        covariates={name: _joined_covariate(plans, name) for name in sorted({*first.covariates, *commanded})},
         instrumentation=first.instrumentation,
     )
 
 
-def last_known(values: FloatArray, otherwise: float = math.nan) -> float:
-    """Return the last known value of a covariate."""
+def last_known_value(values: FloatArray, otherwise: float = math.nan) -> float:
+    """Return the last finite value of a covariate; `otherwise` if there is none."""
     known = values[np.isfinite(values)]
     return float(known[-1]) if known.size else otherwise
 
 
-def _column(plans: Sequence[Plan], name: str) -> FloatArray:
+def _joined_covariate(plans: Sequence[Plan], name: str) -> FloatArray:
     """Return a covariate of every row; where a plan lacks it, NaN if commanded, else its last known value."""
     columns: list[FloatArray] = []
     last = math.nan
@@ -109,23 +109,23 @@ def _column(plans: Sequence[Plan], name: str) -> FloatArray:
         column = plan.covariates.get(name)
         if column is None:
             column = np.full(len(plan), math.nan if name in COMMANDED else last)
-        last = last_known(column, last)
+        last = last_known_value(column, last)
         columns.append(column)
     return np.concatenate(columns)
 
 
-def _notes_on_covariates(recordings: Sequence[Recording]) -> list[str]:
+def _notes_on_missing_covariates(recordings: Sequence[Recording]) -> list[str]:
     """Describe the treatment of covariates that some recordings lack."""
     first, out = recordings[0], []
     for k, other in enumerate(recordings[1:], 1):
         for name in sorted({*first.plan.covariates} - {*other.plan.covariates, *COMMANDED}):
-            out.append(f"{_name(other, k)} has no column {name}: taken to be there as it was last known")
+            out.append(f"{_recording_label(other, k)} has no column {name}: taken to be there as it was last known")
         for name in sorted({*other.plan.covariates} - {*first.plan.covariates, *COMMANDED}):
-            out.append(f"column {name} of {_name(other, k)} left out: {_name(first, 0)} has none")
+            out.append(f"column {name} of {_recording_label(other, k)} left out: {_recording_label(first, 0)} has none")
     return out
 
 
-def _same_readings(one: Recording, other: Recording) -> bool:
+def _is_same_recording(one: Recording, other: Recording) -> bool:
     """Return whether two recordings hold the same readings at the same places and times."""
     return (
         len(one) == len(other)
@@ -134,5 +134,5 @@ def _same_readings(one: Recording, other: Recording) -> bool:
     )
 
 
-def _name(recording: Recording, index: int) -> str:
+def _recording_label(recording: Recording, index: int) -> str:
     return recording.source or f"recording {index + 1}"

@@ -12,8 +12,13 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.apparatus import Apparatus
 from probewise.diagnosis.fitting.coordinates import LEAST_READINGS
-from probewise.diagnosis.fitting.earlier import SensorPrior, require_same_unit, require_sensor_prior, sensor_of
 from probewise.diagnosis.fitting.null import Null
+from probewise.diagnosis.fitting.sensor_prior import (
+    SensorPrior,
+    require_same_unit,
+    require_sensor_prior,
+    sensor_from_samples,
+)
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.thinning import rows_to_diagnose
 from probewise.effects import NamedEffect, NoiseEffect
@@ -47,24 +52,24 @@ class Prepared:
     everything: Recording
 
     @property
-    def thinned(self) -> bool:
+    def is_thinned(self) -> bool:
         """Whether only some readings are used."""
         return self.everything is not self.recording
 
     @cached_property
-    def usable(self) -> IntArray:
+    def usable_rows(self) -> IntArray:
         """Rows with a usable reading, (n_usable,)."""
         return np.flatnonzero(self.recording.usable)
 
     @cached_property
-    def on_noise(self) -> frozenset[str]:
+    def noise_effect_names(self) -> frozenset[str]:
         """Names of the effects on the noise."""
         return frozenset(name for name, effect in self.effects.items() if effect.stage is Stage.NOISE)
 
     @cached_property
-    def faults_of_the_noise(self) -> frozenset[str]:
+    def pure_noise_effect_names(self) -> frozenset[str]:
         """Names of the effects that change the noise alone."""
-        return frozenset(n for n in self.on_noise if not cast(NoiseEffect, self.effects[n]).changes_the_mean)
+        return frozenset(n for n in self.noise_effect_names if not cast(NoiseEffect, self.effects[n]).changes_the_mean)
 
     @property
     def least_readings(self) -> int:
@@ -72,19 +77,19 @@ class Prepared:
         return LEAST_READINGS if self.null is None else self.null.least_readings
 
     @property
-    def has_equal_readings(self) -> bool:
+    def has_only_equal_readings(self) -> bool:
         """Whether all usable readings are equal."""
-        return float(np.ptp(self.recording.readings[self.usable])) == 0.0
+        return float(np.ptp(self.recording.readings[self.usable_rows])) == 0.0
 
     @property
-    def too_little(self) -> bool:
+    def has_too_little_data(self) -> bool:
         """Whether the readings are too few for a verdict, or all equal."""
-        return len(self.usable) < self.least_readings or self.has_equal_readings
+        return len(self.usable_rows) < self.least_readings or self.has_only_equal_readings
 
-    def spread(self, values: FloatArray) -> FloatArray:
+    def expand_to_all_rows(self, values: FloatArray) -> FloatArray:
         """Expand values of usable readings to all rows, NaN elsewhere: (n_usable,) -> (n_points,)."""
         out = np.full(len(self.recording), np.nan)
-        out[self.usable] = values
+        out[self.usable_rows] = values
         return out
 
 
@@ -107,6 +112,6 @@ def prepare(
     recording = everything if len(rows) == len(everything) else everything.take(rows)
     if sensor is not None:
         require_same_unit(sensor, everything.plan)
-        null = sensor_of(sensor)
+        null = sensor_from_samples(sensor)
     effects = apparatus.effects(recording, null)
     return Prepared(recording, effects, null, apparatus, everything)

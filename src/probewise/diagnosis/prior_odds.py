@@ -45,7 +45,7 @@ class PriorOdds:
     twofold: frozenset[str] = frozenset()
 
     @classmethod
-    def over(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
+    def for_effects(cls, effects: Mapping[str, NamedEffect[Any]]) -> Self:
         """Divide the odds among these effects."""
         on_noise = {name for name, effect in effects.items() if effect.stage is Stage.NOISE}
         unnamed = sum(is_out_of_vocabulary(name) for name in effects)
@@ -53,31 +53,33 @@ class PriorOdds:
         n_named = len(effects) - len(on_noise) - unnamed - len(twofold)
         return cls(n_named, unnamed, len(on_noise), twofold=twofold)
 
-    def log_mean(self, names: Names) -> float:
-        """Return the log prior of a combination of effects on the mean."""
+    over = for_effects  # its old name
+
+    def log_prior_on_mean(self, names: Names) -> float:
+        """Return the log prior probability of a combination of effects on the mean."""
         named = [name for name in names if not is_out_of_vocabulary(name)]
         if self.twice is None:
-            log_p = self._log_of_named(len(named))
+            log_p = self._log_prior_of_count(len(named))
         else:
             once = self.twofold.intersection(named)
             n_again = sum(name_of_first_copy(name) is not None for name in named)
-            log_p = self._log_of_named(len(named) - n_again)
+            log_p = self._log_prior_of_count(len(named) - n_again)
             log_p += n_again * math.log(self.twice) + (len(once) - n_again) * math.log1p(-self.twice)
         for k in range(len(names) - len(named)):
             share = self.unknown / self.clean_mean if not named and k == 0 else self.unknown_beside
             log_p += math.log(share * self.out_of_vocabulary / (self.n_unnamed - k))
         return log_p
 
-    def _log_of_named(self, n: int) -> float:
+    def _log_prior_of_count(self, n: int) -> float:
         return math.log(self.by_size[n - 1] / math.comb(self.n_named, n) if n else self.clean_mean)
 
-    def log_unknown(self, names: Names) -> float:
+    def log_prior_with_unknown(self, names: Names) -> float:
         """Return the log prior of an unknown effect in addition to a combination of effects on the mean."""
         if names:
-            return self.log_mean(names) + math.log(self.unknown_beside)
+            return self.log_prior_on_mean(names) + math.log(self.unknown_beside)
         return math.log(self.unknown * (1 - self.out_of_vocabulary if self.n_unnamed else 1.0))
 
-    def alone(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
+    def single_effect_priors(self, names: Iterable[str], noise: Names) -> dict[tuple[Names, Names], float]:
         """Return the prior probabilities of clean, unknown and single effects, for readings without information.
 
         Parameters
@@ -93,7 +95,7 @@ class PriorOdds:
         total = sum(believed.values())
         return {(mean, noise): p / total for mean, p in believed.items()}
 
-    def log_noise(self, names: Names, *, alone: bool = False) -> float:
+    def log_prior_on_noise(self, names: Names, *, alone: bool = False) -> float:
         """Return the log prior of a noise model; `names` are those of its effects that are not certain.
 
         `alone`: beside a complete mean.
@@ -105,3 +107,9 @@ class PriorOdds:
             return math.log1p(-not_white)
         share = self.noise_by_size[len(names) - 1] / (1 - self.white)
         return math.log(not_white * share / math.comb(self.n_noises, len(names)))
+
+    # Their old names.
+    log_mean = log_prior_on_mean
+    log_unknown = log_prior_with_unknown
+    alone = single_effect_priors
+    log_noise = log_prior_on_noise

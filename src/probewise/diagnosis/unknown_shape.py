@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, frozen
-from probewise.diagnosis.fitting.coordinates import FARTHEST, CalibratedSensor, known_scene
-from probewise.diagnosis.fitting.earlier import SensorPrior, sensor_of
+from probewise.diagnosis.fitting.coordinates import FARTHEST, CalibratedSensor, cached_known_scene
+from probewise.diagnosis.fitting.sensor_prior import SensorPrior, sensor_from_samples
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
@@ -55,7 +55,7 @@ class SensorAndShape:
         rng
             Source of randomness, for the search.
         """
-        known = sensor_of(sensor)
+        known = sensor_from_samples(sensor)
         members = tuple(shape.shapes.values()) if isinstance(shape, AnyOf) else (shape,)
         found = [_search_for_shapes(cls(known, member, np.empty((0, 0))), recording, rng) for member in members]
         best = min(range(len(members)), key=lambda k: found[k][0])
@@ -72,9 +72,9 @@ class SensorAndShape:
         return self.sensor.n_gaussians
 
     @property
-    def degrees_of_freedom(self) -> int:
+    def effective_n_gaussians(self) -> int:
         """Effective degrees of freedom of the sensor's SSF, counted in Gaussians."""
-        return self.sensor.degrees_of_freedom
+        return self.sensor.effective_n_gaussians
 
     @property
     def form(self) -> str:
@@ -82,12 +82,12 @@ class SensorAndShape:
         return self.sensor.form
 
     @property
-    def in_bulk(self) -> bool:
+    def predicts_in_bulk(self) -> bool:
         """Whether many samples cost little more than one: False."""
         return False
 
     @property
-    def known_nearby(self) -> bool:
+    def predicts_cheaply_nearby(self) -> bool:
         """Whether a prediction near another one costs less: False."""
         return False
 
@@ -97,7 +97,7 @@ class SensorAndShape:
         return self.sensor.exchangeable
 
     @property
-    def nuisance(self) -> tuple[str, ...]:
+    def nuisance_names(self) -> tuple[str, ...]:
         """Names of the shape's parameters, which apply to this recording only."""
         return self.shape.prior.names
 
@@ -128,7 +128,7 @@ class SensorAndShape:
         asked, names = diagnosis.next_measurement, list(diagnosis.repaired.chain.names)
         if asked is None:
             return diagnosis
-        own = [names.index(name) for name in self.nuisance]
+        own = [names.index(name) for name in self.nuisance_names]
         believed = diagnosis.repaired.theta[:, own].mean(axis=0)
         outline = outlines(self.shape.region(believed[None, :]))[0]
         shape = Polygon(tuple((float(x), float(y)) for x, y in outline[:-1]))
@@ -159,7 +159,7 @@ class _ShapeAmongPatterns:
 
     def regions(self, theta: FloatArray) -> Mapping[str, Region]:
         """Return the region of each pattern by name, for theta (n_samples, n_params of the shape)."""
-        known = known_scene(self.plan).regions(theta)
+        known = cached_known_scene(self.plan).regions(theta)
         unknown = self.shape.region(theta)
         return {name: known.get(name, unknown) for name in self.plan.pattern_names}
 

@@ -177,8 +177,8 @@ class System:
         return 0
 
     @property
-    def degrees_of_freedom(self) -> int:
-        """0: no degrees of freedom besides its parameters."""
+    def effective_n_gaussians(self) -> int:
+        """0: it has no SSF."""
         return 0
 
     @property
@@ -192,7 +192,7 @@ class System:
         return False
 
     @property
-    def nuisance(self) -> tuple[str, ...]:
+    def nuisance_names(self) -> tuple[str, ...]:
         """Parameters per run, which apply to this table only."""
         return tuple(name for name in self.marginals if name not in self.simulator.parameters)
 
@@ -215,12 +215,12 @@ class System:
         return max(12, 3 * (self.n_params - n_own) + n_own)
 
     @property
-    def in_bulk(self) -> bool:
+    def predicts_in_bulk(self) -> bool:
         """Whether many samples cost little more than one: for a law, or a `simulate` that broadcasts."""
         return self.caller is None or self.caller.broadcasts
 
     @property
-    def known_nearby(self) -> bool:
+    def predicts_cheaply_nearby(self) -> bool:
         """Whether predictions near a point cost little once it was predicted itself: for a law."""
         return self.caller is None
 

@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from probewise.diagnosis.advice.next_scans import PredictiveNormal, Rival, mutual_information, next_scans
+from probewise.diagnosis.advice.next_scans import (
+    PredictiveNormal,
+    Rival,
+    measurement_separating_rivals,
+    mutual_information_lower_bound,
+)
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model
-from probewise.diagnosis.light_sensor.commands import commands, excerpts
-from probewise.diagnosis.light_sensor.scheduling import as_alternatives, in_sequence, postponed
+from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, excerpts
+from probewise.diagnosis.light_sensor.scheduling import plan_in_sequence, plan_of_alternatives, postponed
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
@@ -47,7 +52,7 @@ def by_sampling(of: list[PredictiveNormal], weights: np.ndarray, n: int = 40_000
 @pytest.mark.parametrize("seed", [0, 1])
 def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
     weights = np.array([0.5, 0.3, 0.2])
-    bound, true = (f(predictives(seed, apart), weights) for f in (mutual_information, by_sampling))
+    bound, true = (f(predictives(seed, apart), weights) for f in (mutual_information_lower_bound, by_sampling))
     entropy = float(-np.sum(weights * np.log(weights)))
     assert 0.4 * true - 0.02 < bound < true + 0.02
     assert bound <= entropy + 1e-12
@@ -57,7 +62,7 @@ def test_the_bound_lies_below_the_information_and_near_it(seed, apart):
 
 def test_the_same_predictions_tell_nothing():
     one = predictives(0, 1.0)[0]
-    assert mutual_information([one, one, one], np.full(3, 1 / 3)) == pytest.approx(0.0, abs=1e-12)
+    assert mutual_information_lower_bound([one, one, one], np.full(3, 1 / 3)) == pytest.approx(0.0, abs=1e-12)
 
 
 def rival(name: str, probability: float, settings: list[float], plan: Plan) -> Rival:
@@ -65,7 +70,7 @@ def rival(name: str, probability: float, settings: list[float], plan: Plan) -> R
     sensor = default_sensor(extent, 1)
     effect = VOCABULARY[name].for_extent(extent)
     model = Model(sensor, (effect,), plan)
-    z = np.concatenate([np.zeros(sensor.n_params), model.coordinates_of_last_effect(np.array([settings]))[0]])
+    z = np.concatenate([np.zeros(sensor.n_params), model.z_of_last_effect(np.array([settings]))[0]])
     return Rival(name.replace("_", " "), model, z, 0.01 * np.eye(len(z)), probability)
 
 
@@ -79,7 +84,7 @@ def rival(name: str, probability: float, settings: list[float], plan: Plan) -> R
 )
 def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
     plan = paper_plan()
-    asked = next_scans(
+    asked = measurement_separating_rivals(
         [rival(name, 1 / len(rivals), own, plan) for name, own in rivals.items()], 0.4, plan, LightSensor()
     )
     assert asked is not None
@@ -100,7 +105,7 @@ def test_what_the_same_sheet_cannot_tell_another_does(rivals, tmp_path):
 def test_lag_against_backlash_wants_the_other_way():
     plan = paper_plan()
     lag, play = rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)
-    asked = next_scans([lag, play], 0.4, plan, LightSensor())
+    asked = measurement_separating_rivals([lag, play], 0.4, plan, LightSensor())
     assert asked is not None
     assert "backwards" in asked.description or "forth and back" in asked.description
 
@@ -108,7 +113,12 @@ def test_lag_against_backlash_wants_the_other_way():
 def test_a_plan_that_moves_nowhere_has_no_next_scan():
     plan = paper_plan().take(np.arange(404, 408))
     rivals = [rival("hysteresis", 0.5, [0.5], paper_plan()), rival("lag", 0.5, [0.5], paper_plan())]
-    assert next_scans([replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan, LightSensor()) is None
+    assert (
+        measurement_separating_rivals(
+            [replace(r, model=replace(r.model, plan=plan)) for r in rivals], 0.4, plan, LightSensor()
+        )
+        is None
+    )
 
 
 def read_by(plan: Plan) -> np.ndarray:
@@ -164,8 +174,13 @@ def test_along_an_edge_there_is_nothing_to_lay_otherwise():
 
 def test_short_scans_are_taken_whole():
     plan = paper_plan().take(np.arange(45, 57))
-    assert {command.kind for command in commands(plan, strides=(2, 4))} == {"repeat", "reverse", "respeed", "rotate"}
-    assert all(len(command.plan) == 12 for command in commands(plan, strides=(2, 4)))
+    assert {command.kind for command in candidate_scans(plan, strides=(2, 4))} == {
+        "repeat",
+        "reverse",
+        "respeed",
+        "rotate",
+    }
+    assert all(len(command.plan) == 12 for command in candidate_scans(plan, strides=(2, 4)))
     tiny = replace(plan, x_mm=plan.x_mm / 10)
     assert not any(re.search("by -?0 mm", command.description) for command in target_swaps(tiny))
 
@@ -191,28 +206,30 @@ def test_excerpts_hold_the_step_and_every_so_many_readings():
 
 def test_a_scan_over_a_new_sheet_takes_longer():
     plan = paper_plan()
-    again = next(c for c in commands(plan, strides=(4,)) if c.kind == "repeat")
+    again = next(c for c in candidate_scans(plan, strides=(4,)) if c.kind == "repeat")
     new = next(c for c in target_swaps(plan) if c.plan.scan_names == ("boundary_half_round_4",))
     assert new.minutes == pytest.approx(again.minutes + 1.0)
     # In turn, or behind a plan: what the minutes say passes before the first reading.
     end_s, lasts_s = float(plan.time_s.max()), float(np.ptp(new.plan.time_s))
     later = postponed(new, plan).plan
     assert later.time_s[-1] - end_s == pytest.approx(60.0 * new.minutes)
-    both = in_sequence([again, new], plan)
+    both = plan_in_sequence([again, new], plan)
     assert both.time_s[-1] - end_s == pytest.approx(60.0 * (again.minutes + new.minutes))
     assert both.time_s[-1] - both.time_s[len(again.plan)] == pytest.approx(lasts_s)
 
 
 def test_a_battery_is_expected_to_stay_as_it_was():
     plan = paper_plan()
-    everywhere, rows = as_alternatives(commands(plan)[:3], plan), rows_by_command(commands(plan)[:3])
+    everywhere, rows = plan_of_alternatives(candidate_scans(plan)[:3], plan), rows_by_command(candidate_scans(plan)[:3])
     assert [len(own) for own in rows] == [101, 101, 102]
     assert (everywhere.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
-    asked = next_scans([rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor())
+    asked = measurement_separating_rivals(
+        [rival("lag", 0.5, [0.5], plan), rival("backlash", 0.5, [0.84], plan)], 0.4, plan, LightSensor()
+    )
     assert asked is not None
     assert (asked.plan.covariates["battery_mv"] == plan.covariates["battery_mv"][-1]).all()
     gone = np.append(plan.covariates["battery_mv"][:-1], np.nan)
     after = replace(plan, covariates={"battery_mv": gone, "never_mv": np.full(len(plan), np.nan)})
-    everywhere = as_alternatives(commands(plan)[:3], after)
+    everywhere = plan_of_alternatives(candidate_scans(plan)[:3], after)
     assert set(everywhere.covariates) == {"battery_mv"}
     assert (everywhere.covariates["battery_mv"] == gone[-2]).all()

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import audit_plan, join
-from probewise.diagnosis.audit.detectability import Expected, PlanTemplates, ProjectedTemplates
-from probewise.diagnosis.audit.plan_audit import _steps_that_cure
+from probewise.diagnosis.audit.detectability import ExpectedSensor, PlanTemplates, ProjectedTemplates
+from probewise.diagnosis.audit.plan_audit import _curing_step_by_effect
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.joining import join_plans
-from probewise.diagnosis.light_sensor.commands import commands
+from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans
 from probewise.effects import Backlash, EdgeMisplacement, Extent
 from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan
@@ -30,13 +30,13 @@ def thinned(plan: Plan, step: int = 4) -> Plan:
 def sights_of(plan: Plan):
     """The surviving share of backlash and its cosine to an edge that lies elsewhere, by `ProjectedTemplates`."""
     sensor = default_sensor(Extent(10.0, 60.0, plan), 1)
-    expected = Expected(sensor, np.full(sensor.n_params, 0.1), (10.0, 60.0), 0.5)
+    expected = ExpectedSensor(sensor, np.full(sensor.n_params, 0.1), (10.0, 60.0), 0.5)
     seen = ProjectedTemplates.of(PlanTemplates.of(expected, plan, TWO), np.arange(len(plan)))
-    share, like = seen.detectability()["backlash"]
+    share, like = seen.shares_and_cosines()["backlash"]
     return expected, share, like["edge_misplacement"], seen
 
 
-def by_least_squares(plan: Plan, expected: Expected) -> tuple[float, float]:
+def by_least_squares(plan: Plan, expected: ExpectedSensor) -> tuple[float, float]:
     """The same two numbers from predictions of plain chains and ordinary least squares."""
     z, sensor = expected.z, expected.null
 
@@ -71,7 +71,7 @@ def test_the_smallest_size_leaves_lambda_eight():
     """A trace of that size, from the chain, has length 8 once the fit has taken its part."""
     plan = thinned(two_way_plan(), 8)
     expected, share, _, seen = sights_of(plan)
-    (width_mm,) = seen.smallest(seen.laid.built["backlash"])
+    (width_mm,) = seen.smallest_detectable_amplitudes(seen.laid.built["backlash"])
     theta = expected.null.theta(expected.z[None, :])
     plain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
     with_play = plain.with_effects(Backlash())
@@ -105,8 +105,8 @@ def test_what_a_step_behind_the_last_cure_spoils_is_cured_all_the_same():
     detectability = {"lag": "aaff", "tilt": "aafa", "halo": "afaa", "glint": "ffff", "edge": "aaaa"}
     words = {"a": "aliased", "f": "fine"}
     steps = [[SimpleNamespace(name=n, detectability=words[of[k]]) for n, of in detectability.items()] for k in range(4)]
-    assert _steps_that_cure(steps) == {"lag": 2, "tilt": 2}
-    assert _steps_that_cure(steps[:1]) == {}
+    assert _curing_step_by_effect(steps) == {"lag": 2, "tilt": 2}
+    assert _curing_step_by_effect(steps[:1]) == {}
 
 
 @pytest.mark.slow
@@ -133,10 +133,10 @@ def test_a_flat_surface_shows_no_edge():
 
 def test_only_what_the_apparatus_can_command_is_asked_for():
     plan = paper_plan()
-    kinds = {command.kind for command in commands(plan)}
+    kinds = {command.kind for command in candidate_scans(plan)}
     assert kinds == {"repeat", "reverse", "respeed", "rotate"}
     able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led", "height_mm")))
-    assert {command.kind for command in commands(able)} == {"repeat", "reverse", "respeed", "relight", "raise"}
+    assert {command.kind for command in candidate_scans(able)} == {"repeat", "reverse", "respeed", "relight", "raise"}
 
 
 def test_a_commanded_height_widens_the_footprint_and_dims_the_signal():
@@ -162,7 +162,7 @@ def test_without_the_led_only_what_is_no_signal_is_read():
 def test_readings_that_are_set_behind_a_plan_keep_its_battery_and_say_what_was_commanded():
     plan = paper_plan()
     able = replace(plan, instrumentation=replace(plan.instrumentation, controls=("led",)))
-    dark = next(command.plan for command in commands(able) if command.kind == "relight")
+    dark = next(command.plan for command in candidate_scans(able) if command.kind == "relight")
     both = join_plans([able, dark])
     assert both.covariates["battery_mv"][-1] == plan.covariates["battery_mv"][-1]
     assert np.isnan(both.covariates["led"][: len(plan)]).all()

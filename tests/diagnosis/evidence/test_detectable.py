@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import log_ndtr
 
-from probewise.diagnosis.evidence.detectable import log_detectable
+from probewise.diagnosis.evidence.detectable import log_probability_detectable
 from probewise.diagnosis.evidence.laplace import LEAST_VISIBLE
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
@@ -25,18 +25,22 @@ def test_a_size_is_what_a_refit_without_the_effect_leaves(amount):
     sensor = default_sensor(EXTENT, 1)
     effect = VOCABULARY["ambient_gradient"].for_extent(EXTENT)
     model = Model(sensor, (effect,), PLAN)
-    z = np.concatenate([np.full(sensor.n_params, 0.2), model.coordinates_of_last_effect(np.array([[amount, 0.0]]))[0]])
-    predicted, slopes = model.jacobian(z)
+    z = np.concatenate([np.full(sensor.n_params, 0.2), model.z_of_last_effect(np.array([[amount, 0.0]]))[0]])
+    predicted, slopes = model.predict_and_differentiate(z)
     found = Fit(model, z, predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
     law = white_noise(len(PLAN))
     null = Model(sensor, (), PLAN)
-    left = fit(null, Recording(PLAN, predicted), z[: sensor.n_params], law.at_least(SD), tolerance=1e-6).residuals
+    left = fit(
+        null, Recording(PLAN, predicted), z[: sensor.n_params], law.with_least_sigma(SD), tolerance=1e-6
+    ).residuals
     expected = float(log_ndtr(np.linalg.norm(left) / SD - LEAST_VISIBLE))
-    assert log_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(expected, abs=0.1 + 0.02 * abs(expected))
+    assert log_probability_detectable(found, law, np.arange(len(PLAN))) == pytest.approx(
+        expected, abs=0.1 + 0.02 * abs(expected)
+    )
 
 
 def test_a_fit_without_effects_is_as_it_is():
     model = Model(default_sensor(EXTENT, 1), (), PLAN)
-    predicted, slopes = model.jacobian(np.zeros(7))
+    predicted, slopes = model.predict_and_differentiate(np.zeros(7))
     found = Fit(model, np.zeros(7), predicted, np.zeros(len(PLAN)), slopes, SD, 0.0)
-    assert log_detectable(found, white_noise(len(PLAN)), np.arange(len(PLAN))) == 0.0
+    assert log_probability_detectable(found, white_noise(len(PLAN)), np.arange(len(PLAN))) == 0.0

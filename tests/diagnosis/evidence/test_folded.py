@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from probewise import nested
-from probewise.diagnosis.evidence.folded import FoldedNormal, folded
-from probewise.diagnosis.evidence.joint import JointProblem, StandardNormal
-from probewise.diagnosis.evidence.laplace import weigh
+from probewise.diagnosis.evidence.folded import FoldedNormal, fold_problem
+from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem, StandardNormal
+from probewise.diagnosis.evidence.laplace import laplace_evidence
 from probewise.diagnosis.fitting.coordinates import default_sensor
 from probewise.diagnosis.fitting.fit import Model, fit
 from probewise.diagnosis.noise.law import white_noise
@@ -100,9 +100,9 @@ def test_where_no_names_can_be_traded_nothing_is_folded():
     for n_gaussians, same in ((1, True), (2, False)):
         sensor = default_sensor(EXTENT, n_gaussians)
         found = fit(Model(sensor, (), PLAN), recording, np.zeros(sensor.n_params), white_noise(len(PLAN), least=0.1))
-        evidence = weigh(found, NoiseModel((), recording, least_sd=0.1))
-        problem = JointProblem(found.model, recording, evidence)
-        once = folded(problem, found.z)
+        evidence = laplace_evidence(found, NoiseModel((), recording, least_sd=0.1))
+        problem = HypothesisProblem(found.model, recording, evidence)
+        once = fold_problem(problem, found.z)
         assert (once is problem) == same
         z = found.z[None, :]
         np.testing.assert_array_equal(once.log_likelihood(z), problem.log_likelihood(z))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from probewise.diagnosis.evidence.held_out import gain_by_part
+from probewise.diagnosis.evidence.held_out import hold_out_each_part
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
 from probewise.recordings import Recording, paper_plan
 
@@ -34,5 +34,5 @@ def test_many_scans_side_by_side_are_kept_back_by_pattern_and_orientation():
     assert len(names) == 2
     assert names[0].endswith("0 degrees")
     np.testing.assert_array_equal(parts, np.round(many.orientation_rad / (np.pi / 2)).astype(int) - int(parts[0] != 0))
-    held = gain_by_part(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
+    held = hold_out_each_part(parts, lambda out: np.where(parts[out] == 0, 1.0, -1.0), names)
     assert dict(held.by_scan) == {names[0]: 1.0, names[1]: -1.0}

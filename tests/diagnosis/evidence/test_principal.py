@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.bank import _eigenvectors_of_grams
+from probewise.diagnosis.evidence.bank import _gram_eigensystems
 
 
 @pytest.mark.parametrize("width", [1, 2, 3])
@@ -13,6 +13,6 @@ def test_closed_forms_are_those_of_the_general_solver(width):
         columns[0, :, 1] = columns[0, :, 0] * 2  # one axis only
         columns[1] = 0.0
     squares = columns.transpose(0, 2, 1) @ columns
-    values, axes = _eigenvectors_of_grams(squares)
+    values, axes = _gram_eigensystems(squares)
     assert np.sort(values, axis=1) == pytest.approx(np.linalg.eigvalsh(squares), abs=1e-12)
     assert (axes * values[:, None, :]) @ axes.transpose(0, 2, 1) == pytest.approx(squares, abs=1e-12)

@@ -3,18 +3,20 @@
 import pytest
 
 from probewise.diagnosis.advice.aliases import Alias
-from probewise.diagnosis.judgement.judged import Hypothesis, Judged, hypotheses_of, verdict_on
+from probewise.diagnosis.judgement.judged import Hypothesis, Judged, ranked_hypotheses, verdict_and_combination
 
 NOISE = frozenset({"outliers"})
 
 
 def verdict(probabilities, *, p_value=1e-6, aliases=(), same=()):
-    found = hypotheses_of(probabilities)
-    return verdict_on(found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same))
+    found = ranked_hypotheses(probabilities)
+    return verdict_and_combination(
+        found, p_value, noise_names=NOISE, aliases=aliases, aliased_with=lambda _: frozenset(same)
+    )
 
 
 def test_mean_and_noise_join_into_one_name_and_the_unknown_is_one_whatever_the_noise():
-    found = hypotheses_of(
+    found = ranked_hypotheses(
         {
             (("lag",), ()): 0.3,
             (("lag",), ("outliers",)): 0.1,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.fitting.coordinates import default_sensor, known_scene
+from probewise.diagnosis.fitting.coordinates import cached_known_scene, default_sensor
 from probewise.diagnosis.fitting.fit import Fit, Model, fit
-from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.fitting.own_model import OwnModel
-from probewise.diagnosis.light_sensor.fine_structure import fine_structure
+from probewise.diagnosis.light_sensor.fine_structure import fine_structure_slopes
 from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent
 from probewise.priors import LogUniform, Product
@@ -25,12 +25,12 @@ NOISE_SD = 0.4
 def fitted(recording: Recording, *, free: bool = True) -> Fit:
     sensor = default_sensor(Extent.of(recording), 1)
     law = white_noise(len(recording))
-    one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law.at_least(NOISE_SD))
+    one = fit(Model(sensor, (), recording.plan), recording, np.zeros(7), law.with_least_sigma(NOISE_SD))
     if not free:
         return one
-    form = FreeForm.from_one_gaussian(sensor)
-    start = form.start_from(one.z)[0]
-    return fit(Model(form, (), recording.plan), recording, start, law.at_least(NOISE_SD))
+    form = FreeFormSensor.from_one_gaussian(sensor)
+    start = form.start_from_one_gaussian(one.z)[0]
+    return fit(Model(form, (), recording.plan), recording, start, law.with_least_sigma(NOISE_SD))
 
 
 def usable(recording: Recording) -> np.ndarray:
@@ -45,7 +45,7 @@ def test_the_slopes_are_those_of_a_mixture_with_a_little_of_each():
     """Second route: a true mixture of the fitted Gaussian and one narrow one, by a difference in its share."""
     recording = noise_free(gaussian_spot([Blob(1.0, (0.4, -0.3), (5.0, 3.5), 0.3)], pixel_mm=0.5), paper_plan())
     found = fitted(recording, free=False)
-    more = fine_structure(found.model, found.z, usable(recording))
+    more = fine_structure_slopes(found.model, found.z, usable(recording))
     assert more.shape[1] > 30
     theta = found.model.sensor.theta(found.z[None, :])[0]
     blob, levels = theta[:6], theta[6:]
@@ -55,7 +55,7 @@ def test_the_slopes_are_those_of_a_mixture_with_a_little_of_each():
     share = 1e-4
     mass = np.sqrt((aa * bb - cc**2) / (blob[3] * blob[4] - blob[5] ** 2))
     two = np.concatenate([blob, [blob[0] * share / (1 - share) * mass, blob[1], blob[2], aa, bb, cc]])
-    chain = Chain(FreeMixture(2), FixedLevels(*levels), known_scene(recording.plan), ())
+    chain = Chain(FreeMixture(2), FixedLevels(*levels), cached_known_scene(recording.plan), ())
     slope = (chain.predict(two[None, :], recording.plan)[0] - found.predicted) / share
     closest = np.linalg.norm(more / 0.03 - slope[:, None], axis=0).min()
     assert closest < 1e-3 * np.linalg.norm(slope)
@@ -65,7 +65,7 @@ def test_the_slopes_are_those_of_a_mixture_with_a_little_of_each():
 def test_it_takes_up_what_a_free_form_leaves_of_a_ring(plan):
     recording = noise_free(ring_spot(4.0, 1.2, pixel_mm=0.5), plan)
     found = fitted(recording)
-    slopes = np.concatenate([found.slopes, fine_structure(found.model, found.z, usable(recording))], axis=1)
+    slopes = np.concatenate([found.slopes, fine_structure_slopes(found.model, found.z, usable(recording))], axis=1)
     z = np.pad(found.z, (0, slopes.shape[1] - len(found.z)))
     design = np.concatenate([slopes / NOISE_SD, np.eye(len(z))])
     target = np.concatenate([found.residuals / NOISE_SD, -z])
@@ -83,12 +83,12 @@ def test_effects_outlast_it():
     found = fitted(recording)
     law = white_noise(len(recording))
     extent = Extent.of(recording)
-    more = fine_structure(found.model, found.z, usable(recording))
+    more = fine_structure_slopes(found.model, found.z, usable(recording))
     without, beside = Linearised.of(found, law), Linearised.of(found, law, more)
     for name in ("backlash", "lag", "sensor_tilt", "ambient_gradient", "glint", "battery_sag", "flicker"):
         effect = VOCABULARY[name].for_extent(extent)
         model = found.model.with_effect(effect)
-        z = np.concatenate([found.z, model.coordinates_of_last_effect(effect.bank()[0][:1])[0]])
+        z = np.concatenate([found.z, model.z_of_last_effect(effect.bank()[0][:1])[0]])
         change = (model.predict(z[None, :])[0] - found.model.predict(found.z[None, :])[0])[:, None]
         kept = np.linalg.norm(beside.project(change)) / np.linalg.norm(without.project(change))
         assert kept > 0.9, name
@@ -99,4 +99,4 @@ def test_a_model_without_an_ssf_has_none():
     prior = Product({"level": LogUniform(1.0, 10.0)})
     null = OwnModel(lambda parameters, plan: parameters["level"] * np.ones(len(plan)), prior)
     model = Model(null, (), plan)
-    assert fine_structure(model, np.zeros(1), np.arange(len(plan))).shape == (len(plan), 0)
+    assert fine_structure_slopes(model, np.zeros(1), np.arange(len(plan))).shape == (len(plan), 0)

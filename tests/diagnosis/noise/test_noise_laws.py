@@ -13,10 +13,10 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.evidence.laplace import weigh
+from probewise.diagnosis.evidence.laplace import laplace_evidence
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.noise.law import NoiseLaw, Tail, white_noise
-from probewise.diagnosis.noise.models import NoiseModel, log_lost_value, rough_sd
+from probewise.diagnosis.noise.models import NoiseModel, log_prior_of_lost_value, rough_sd
 from probewise.effects import CorrelatedNoise, DriftingNoise, Dropouts, Extent, Outliers, SignalDependentNoise
 from probewise.recordings import Recording, paper_plan, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
@@ -56,7 +56,7 @@ def test_the_scale_is_where_the_misfit_is_least():
     z = np.random.default_rng(1).normal(size=(50, 1))
     z[:3] *= 9
     law = heavy(0.05, 8.0)
-    sigma = law.scale(z)
+    sigma = law.likeliest_sigma(z)
     trial = sigma * np.linspace(0.8, 1.25, 451)
     misfits = np.array([float(law.minus_log_likelihood(z, np.array([s]))[0]) for s in trial])
     assert trial[misfits.argmin()] == pytest.approx(float(sigma[0]), rel=1e-2)
@@ -67,8 +67,8 @@ def test_a_tail_that_is_not_there_is_none():
     z = np.random.default_rng(2).normal(size=(50, 2))
     thin, none = heavy(1e-12, 3.0), white_noise(50)
     for floor in (0.0, 3.0):
-        bounded, sigma = thin.at_least(floor), none.at_least(floor).scale(z)
-        np.testing.assert_allclose(bounded.scale(z), sigma, rtol=1e-6)
+        bounded, sigma = thin.with_least_sigma(floor), none.with_least_sigma(floor).likeliest_sigma(z)
+        np.testing.assert_allclose(bounded.likeliest_sigma(z), sigma, rtol=1e-6)
         np.testing.assert_allclose(
             bounded.minus_log_likelihood(z, sigma), none.minus_log_likelihood(z, sigma), rtol=1e-6
         )
@@ -82,7 +82,7 @@ def test_pseudo_observations_say_as_much_as_the_density_does(share, times):
     z = rng.normal(size=n) * np.where(rng.random(n) < share, times, 1.0)
     tail = Tail(share, times)
     one = np.ones(1)
-    plain, moved = (tail.as_normal((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    plain, moved = (tail.normal_pseudo_observations((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
     assert np.var(plain) == pytest.approx(1 / float(tail.information), rel=0.02)
     assert np.abs(plain).max() < 10
@@ -92,7 +92,7 @@ def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
     lost = np.zeros(50, dtype=np.bool_)
     lost[7] = True
     law = NoiseLaw(np.ones(50), np.zeros(50), lost, 0.05, 8.0)
-    drawn = law.draws(4000, rng=np.random.default_rng(0))
+    drawn = law.draw_pseudo_observations(4000, rng=np.random.default_rng(0))
     assert drawn[~lost].std() == pytest.approx(1.0, rel=0.02)
     np.testing.assert_array_equal(drawn[7], 0.0)
 
@@ -109,7 +109,7 @@ def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
     slope = rng.normal(size=N)
     noise = SD * rng.normal(size=N) * np.where(rng.random(N) < 0.03, 6.0, 1.0)
     found, recording = found_with(noise, slope)
-    evidence = weigh(found, NoiseModel(() if effect is None else (effect,), recording, least_sd=0.6 * SD))
+    evidence = laplace_evidence(found, NoiseModel(() if effect is None else (effect,), recording, least_sd=0.6 * SD))
     step = np.linspace(-0.2, 0.2, 161)
     log_sigma = math.log(SD) + np.linspace(-1.0, 1.2, 221)
     for node in (0, len(evidence.nodes.laws) // 2):
@@ -121,7 +121,7 @@ def test_the_evidence_is_the_integral_over_the_parameter_and_the_scale(effect):
             density = log_mixture(z, law.share, law.times) if law.share else norm.logpdf(z)
             total.append(logsumexp(density.sum(axis=0) - N * s + norm.logpdf(step)))
         cell = (step[1] - step[0]) * (log_sigma[1] - log_sigma[0])
-        by_grid = float(logsumexp(total)) + math.log(cell) - law.log_det()
+        by_grid = float(logsumexp(total)) + math.log(cell) - law.half_log_det()
         own = evidence.log_z_nodes[node] - evidence.nodes.log_weights[node]
         assert own == pytest.approx(by_grid, abs=0.05)
 
@@ -133,12 +133,12 @@ def test_readings_lost_to_one_value_are_no_wide_ones():
     noise[lost] = -MEAN[lost]
     found, recording = found_with(noise)
     log_z = {
-        type(e).__name__: weigh(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
+        type(e).__name__: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
         for e in (Dropouts(), Outliers())
     }
-    plain = weigh(found, NoiseModel((), recording, least_sd=1e-6)).log_z
+    plain = laplace_evidence(found, NoiseModel((), recording, least_sd=1e-6)).log_z
     assert log_z["Dropouts"] > log_z["Outliers"] + 3 > plain + 50
-    law = weigh(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6)).law
+    law = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6)).likeliest_law
     np.testing.assert_array_equal(np.flatnonzero(law.lost), lost)
 
 
@@ -152,7 +152,8 @@ def test_one_reading_at_an_end_of_the_declared_range_is_lost(value, lost):
     found, recording = found_with(noise)
     dropouts = Dropouts.for_extent(Extent.of(recording))
     log_z = {
-        type(e).__name__: weigh(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z for e in (dropouts, Outliers())
+        type(e).__name__: laplace_evidence(found, NoiseModel((e,), recording, least_sd=1e-6)).log_z
+        for e in (dropouts, Outliers())
     }
     if lost:
         assert log_z["Dropouts"] > log_z["Outliers"] + 3
@@ -166,15 +167,17 @@ def test_two_readings_that_agree_say_more_than_one_at_an_end():
     dark, bright = np.argsort(MEAN)[:1], np.argsort(MEAN)[-2:]
     noise[dark], noise[bright] = 100.0 - MEAN[dark], 37.0 - MEAN[bright]
     found, recording = found_with(noise)
-    law = weigh(found, NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)).law
+    law = laplace_evidence(
+        found, NoiseModel((Dropouts.for_extent(Extent.of(recording)),), recording, least_sd=1e-6)
+    ).likeliest_law
     np.testing.assert_array_equal(np.flatnonzero(law.lost), np.sort(bright))
 
 
 def test_the_prior_of_what_is_lost_to_sums_to_one():
     """Of a hundred cells of the range two are its ends, each of them likely."""
-    others = 98 * math.exp(log_lost_value(37.0, 100.0, (0.0, 100.0)))
-    assert others + 2 * math.exp(log_lost_value(100.0, 100.0, (0.0, 100.0))) == pytest.approx(1.0)
-    assert log_lost_value(100.0, 100.0, ()) == -math.log(100.0)
+    others = 98 * math.exp(log_prior_of_lost_value(37.0, 100.0, (0.0, 100.0)))
+    assert others + 2 * math.exp(log_prior_of_lost_value(100.0, 100.0, (0.0, 100.0))) == pytest.approx(1.0)
+    assert log_prior_of_lost_value(100.0, 100.0, ()) == -math.log(100.0)
 
 
 def test_an_own_effect_may_lose_readings_too():
@@ -187,20 +190,20 @@ def test_an_own_effect_may_lose_readings_too():
     noise = SD * np.random.default_rng(5).normal(size=N)
     noise[[30, 90, 200]] = -MEAN[[30, 90, 200]]
     found, recording = found_with(noise)
-    law = weigh(found, NoiseModel((Blind(), Dropouts()), recording, least_sd=1e-6)).law
+    law = laplace_evidence(found, NoiseModel((Blind(), Dropouts()), recording, least_sd=1e-6)).likeliest_law
     np.testing.assert_array_equal(np.flatnonzero(law.lost), [30, 90, 200])
 
 
 def test_where_nothing_is_lost_there_is_no_such_law():
     found, recording = found_with(SD * np.random.default_rng(6).normal(size=N))
-    evidence = weigh(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))
+    evidence = laplace_evidence(found, NoiseModel((Dropouts(),), recording, least_sd=1e-6))
     assert evidence.log_z == -math.inf
     assert evidence.nodes.laws == ()
 
 
 def test_a_law_of_some_scans_is_that_of_the_whole():
     found, recording = found_with(np.zeros(N))
-    law = NoiseModel((CorrelatedNoise(),), recording).laws(found.predicted).laws[20]
+    law = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(found.predicted).laws[20]
     rows = PLAN.scan == 1
     r = np.random.default_rng(7).normal(size=N)
     np.testing.assert_allclose(law.take(rows)(r[rows]), law(r)[rows])

@@ -24,7 +24,7 @@ def test_a_walk_is_whitened_as_the_root_of_its_covariance_does():
     columns = rng.standard_normal((n, 3))
     exact = np.linalg.solve(np.linalg.cholesky(covariance), columns[~lost])
     np.testing.assert_allclose((law(columns) ** 2).sum(axis=0), (exact**2).sum(axis=0))
-    assert law.log_det() == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])
+    assert law.half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])
 
 
 def test_what_is_kept_of_a_walk_has_walked_over_what_is_left_out():
@@ -34,7 +34,7 @@ def test_what_is_kept_of_a_walk_has_walked_over_what_is_left_out():
     kept = rng.random(20) < 0.6
     gone = np.cumsum(walk)[kept]
     covariance = np.minimum(gone[:, None], gone) + np.eye(kept.sum())
-    assert law.take(kept).log_det() == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])
+    assert law.take(kept).half_log_det() == pytest.approx(0.5 * np.linalg.slogdet(covariance)[1])
 
 
 def test_draws_of_a_walk_scatter_as_it_says():
@@ -63,7 +63,9 @@ def test_the_evidence_of_noise_per_run_is_that_of_brute_force():
         law = replace(white_noise(90), sd=values[run])
         whitened = law(residuals)[:, None]
         return (
-            -law.minus_log_likelihood(whitened, law.scale(whitened))[0] - law.log_det() + 0.5 * math.log(math.pi / 90)
+            -law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0]
+            - law.half_log_det()
+            + 0.5 * math.log(math.pi / 90)
         )
 
     laplace = logsumexp([log_z(values) + weight for values, weight in zip(nodes, log_weights, strict=True)])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis.fitting.coordinates import default_sensor
-from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
+from probewise.diagnosis.repair.averaging import can_share_one_model, mix_over_hypotheses, mix_over_orders
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import UNNAMED, VOCABULARY, Extent
 from probewise.recordings import two_way_plan
@@ -29,7 +29,7 @@ def samples_of(n_gaussians: int, n: int = 500) -> ModelSamples:
 
 def test_a_gaussian_in_halves_predicts_the_same():
     one, three = samples_of(1), samples_of(3)
-    mixed = over_orders([one, three], np.array([1.0, 0.0]), rng=np.random.default_rng(0))
+    mixed = mix_over_orders([one, three], np.array([1.0, 0.0]), rng=np.random.default_rng(0))
     assert mixed.n_gaussians == 3
     assert mixed.theta.shape == three.theta.shape
     expected = np.sort(one.chain.predict(one.theta, PLAN)[:, 150])
@@ -37,7 +37,7 @@ def test_a_gaussian_in_halves_predicts_the_same():
 
 
 def test_orders_are_mixed_by_their_probability():
-    mixed = over_orders([samples_of(1), samples_of(2)], np.array([0.3, 0.7]), rng=np.random.default_rng(3))
+    mixed = mix_over_orders([samples_of(1), samples_of(2)], np.array([0.3, 0.7]), rng=np.random.default_rng(3))
     of_one = int(np.sum(mixed.noise_sd == 1.0))
     # Four sd of a binomial of 500: fails by chance once in 16,000 seeds.
     assert of_one == pytest.approx(150, abs=4 * np.sqrt(500 * 0.3 * 0.7))
@@ -46,7 +46,7 @@ def test_orders_are_mixed_by_their_probability():
 
 def test_one_order_alone_stays_as_it_is():
     one = samples_of(2)
-    alone = over_orders([one], np.ones(1), rng=np.random.default_rng(0))
+    alone = mix_over_orders([one], np.ones(1), rng=np.random.default_rng(0))
     np.testing.assert_array_equal(np.sort(alone.theta, axis=0), np.sort(one.theta, axis=0))
 
 
@@ -93,7 +93,7 @@ def test_hypotheses_are_mixed_by_their_probability_and_predict_what_each_does():
     parts[2] = dataclasses.replace(parts[2], noise_sd=np.full(500, 3.0))
     shares = np.array([0.5, 0.3, 0.2])
     null = default_sensor(EXTENT, 2)
-    mixed = over_hypotheses(parts, shares, null, PLAN, rng=np.random.default_rng(4))
+    mixed = mix_over_hypotheses(parts, shares, null, PLAN, rng=np.random.default_rng(4))
     assert mixed.effects == ("backlash", "lag")
     assert mixed.n_gaussians == 2
     predicted = mixed.chain.predict(mixed.theta, PLAN)
@@ -112,7 +112,7 @@ def test_hypotheses_are_mixed_by_their_probability_and_predict_what_each_does():
 
 def test_what_does_not_fit_into_one_model():
     first, second = BUILT["scan_misplacement"].variants()[:2]
-    assert not side_by_side([first], [second])
-    assert side_by_side([first], [BUILT["lag"]])
-    assert side_by_side([BUILT["lag"]], [dataclasses.replace(BUILT["lag"])])
-    assert not side_by_side([SimpleNamespace(name="own", nothing=None)], [BUILT["lag"]])
+    assert not can_share_one_model([first], [second])
+    assert can_share_one_model([first], [BUILT["lag"]])
+    assert can_share_one_model([BUILT["lag"]], [dataclasses.replace(BUILT["lag"])])
+    assert not can_share_one_model([SimpleNamespace(name="own", nothing=None)], [BUILT["lag"]])

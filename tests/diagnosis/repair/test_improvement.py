@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose
-from probewise.diagnosis.evidence.held_out import held_out_blocks
+from probewise.diagnosis.evidence.held_out import partition_into_blocks
 from probewise.recordings import Recording, two_way_plan
 from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
@@ -36,7 +36,7 @@ def test_two_bumps_in_time_are_both_repaired():
 def test_blocks_are_kept_back_whole_and_every_reading_once():
     readings = np.ones(len(PLAN))
     readings[:3] = np.nan
-    part, names = held_out_blocks(Recording(PLAN, readings))
+    part, names = partition_into_blocks(Recording(PLAN, readings))
     assert len(part) == len(PLAN) - 3
     assert sorted(np.unique(part)) == list(range(len(names)))
     ends = np.flatnonzero(np.diff(part)) + 1

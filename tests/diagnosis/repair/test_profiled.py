@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.samples import sample_model
 from probewise.diagnosis.search.noises import NoiseModels
@@ -29,8 +29,8 @@ def _settled(seed):
     )  # fmt: skip
     prepared = prepare_system(simulator, RunTable({"t": time, "run": run, "y": y}, time="t", run="run"))
     prior = prepared.apparatus.prior_odds(prepared.effects)
-    refits = Refits(prepared.null, NoiseModels(prepared.recording, {}, prior), TemplateMemory(prepared.usable))
-    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.on_noise}
+    refits = Refits(prepared.null, NoiseModels(prepared.recording, {}, prior), TemplateCache(prepared.usable_rows))
+    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.noise_effect_names}
     state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
     fit_nulls(state, prepared, max_order=1)
     candidate = state.refits.refit_with_effect(state.null, state.effects["settling"])[0]
@@ -70,7 +70,7 @@ def test_intervals_of_a_time_constant_hold_what_they_say_of_the_exact_posterior(
     for seed in (1, 2, 3):
         recording, candidate, evidence = _settled(seed)
         found = candidate.found
-        assert ProfiledDensity.of(found, evidence.law, recording) is not None
+        assert ProfiledDensity.of(found, evidence.likeliest_law, recording) is not None
         samples = sample_model(
             found, evidence, recording, weights=candidate.weights, rng=np.random.default_rng(seed), annealed=True
         )

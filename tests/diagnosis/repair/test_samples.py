@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from probewise.calibration import FittedSensor
-from probewise.diagnosis.evidence.laplace import weigh
-from probewise.diagnosis.fitting.coordinates import FARTHEST, SensorCoordinates, default_sensor
+from probewise.diagnosis.evidence.laplace import laplace_evidence
+from probewise.diagnosis.fitting.coordinates import FARTHEST, GaussianMixtureSensor, default_sensor
 from probewise.diagnosis.fitting.fit import Model, fit
-from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.noise.law import white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
@@ -22,7 +22,7 @@ PLAN = two_way_plan()
 
 @pytest.mark.slow
 def test_a_sensor_of_free_form_is_written_read_and_driven_by():
-    free = FreeForm.from_one_gaussian(default_sensor(Extent(10.0, 60.0, PLAN), 1))
+    free = FreeFormSensor.from_one_gaussian(default_sensor(Extent(10.0, 60.0, PLAN), 1))
     rng = np.random.default_rng(5)
     z = 0.3 * rng.standard_normal(free.n_params) + 0.02 * rng.standard_normal((500, free.n_params))
     chain = free.chain(PLAN, (), n_nodes=16)
@@ -45,13 +45,13 @@ def test_a_posterior_against_the_bound_of_its_prior_is_drawn_from():
     """An earlier sensor whose white level is twenty of its sds off: the fit rests at six of them."""
     rng = np.random.default_rng(0)
     center = default_sensor(Extent(10.0, 60.0, PLAN), 1).center
-    tight = SensorCoordinates(1, center, np.diag([0.05, 0.05, 0.01, 0.01, 0.02, 0.05, 0.05]), exchangeable=False)
+    tight = GaussianMixtureSensor(1, center, np.diag([0.05, 0.05, 0.01, 0.01, 0.02, 0.05, 0.05]), exchangeable=False)
     truth = tight.theta(np.zeros((1, 7)))
     truth[:, -1] += 20 * 0.05
     readings = tight.chain(PLAN, (), n_nodes=16).predict(truth, PLAN)[0] + 0.3 * rng.standard_normal(len(PLAN))
     recording = Recording(PLAN, readings)
     found = fit(Model(tight, (), PLAN), recording, np.zeros(7), white_noise(len(PLAN), least=1e-3))
-    noise = weigh(found, NoiseModel((), recording, least_sd=1e-3))
+    noise = laplace_evidence(found, NoiseModel((), recording, least_sd=1e-3))
     samples = sample_model(found, noise, recording, weights={}, rng=rng)
     z = tight.z(samples.theta)
     assert z[:, -1].max() < FARTHEST

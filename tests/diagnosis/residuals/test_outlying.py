@@ -55,7 +55,7 @@ def test_what_is_in_the_tail_follows_bayes_rule():
     law = tailed()
     residuals = np.random.default_rng(2).standard_normal(N)
     residuals[10] = 9.0
-    sigma = float(law.scale(law(residuals)[:, None])[0])
+    sigma = float(law.likeliest_sigma(law(residuals)[:, None])[0])
     odds = (0.05 / 6) * np.exp(-0.5 * (residuals / sigma / 6) ** 2) / (0.95 * np.exp(-0.5 * (residuals / sigma) ** 2))
     np.testing.assert_allclose(outlier_probabilities(residuals, law), odds / (1 + odds))
     assert outlier_probabilities(residuals, law)[10] > 0.999

@@ -12,7 +12,7 @@ from probewise.diagnosis.search.searched import Evidences, Searched
 def test_a_name_stands_beside_what_is_unknown_in_its_share_of_the_evidence():
     """Two hypotheses, nothing named and `lag`, whose evidence and prior odds make them as one to three."""
     prior = PriorOdds()
-    more = math.log(3.0) + prior.log_unknown(()) - prior.log_unknown(("lag",))
+    more = math.log(3.0) + prior.log_prior_with_unknown(()) - prior.log_prior_with_unknown(("lag",))
     unknown = {(0, (), ()): 10.0, (0, ("lag",), ()): 10.0 + more}
     searched = SimpleNamespace(evidences=Evidences({}, unknown=unknown), prior=prior, certain=())
     assert Searched.probabilities_given_unknown(searched) == pytest.approx({"lag": 0.75})

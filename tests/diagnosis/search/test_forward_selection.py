@@ -8,7 +8,7 @@ import pytest
 from probewise.calibration import read_sensor, write_sensor
 from probewise.challenge import NullRefit
 from probewise.diagnosis import Diagnosis, diagnose
-from probewise.diagnosis.fitting.earlier import sensor_of
+from probewise.diagnosis.fitting.sensor_prior import sensor_from_samples
 from probewise.experiment import experiment_for
 from probewise.scene import Circle, Field
 from probewise.world.challenge import Case, draw_case
@@ -61,6 +61,6 @@ def test_a_prediction_leaves_open_what_a_clean_verdict_does(tmp_path):
     assert leading.mean()["I_max"] == pytest.approx(plain.mean()["I_max"], abs=0.5 * plain.sd()["I_max"])
     posed = experiment_for(read, Circle(), Field())
     assert not posed.model.effects
-    known, of_plain = sensor_of(read), sensor_of(plain)
+    known, of_plain = sensor_from_samples(read), sensor_from_samples(plain)
     sds = [np.sqrt(np.diag(s.factor @ s.factor.T)) for s in (known, of_plain)]
     assert np.all(sds[0] < 1.5 * sds[1])

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.search import search as searching
 from probewise.diagnosis.search.noises import NoiseModels
 from probewise.diagnosis.search.nulls import fit_nulls
@@ -48,8 +48,10 @@ def _state(prepared):
     prior = prepared.apparatus.prior_odds(prepared.effects)
     extent = Extent.of(prepared.recording)
     on_noise = {kind.name: kind.for_extent(extent) for kind in (CorrelatedNoise, RandomWalk)}
-    refits = Refits(prepared.null, NoiseModels(prepared.recording, on_noise, prior), TemplateMemory(prepared.usable))
-    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.on_noise}
+    refits = Refits(
+        prepared.null, NoiseModels(prepared.recording, on_noise, prior), TemplateCache(prepared.usable_rows)
+    )
+    on_mean = {name: effect for name, effect in prepared.effects.items() if name not in prepared.noise_effect_names}
     state = SearchState(on_mean, prior, refits.noises, refits.templates, refits)
     fit_nulls(state, prepared, max_order=1)
     return state
@@ -68,7 +70,7 @@ def test_a_twin_has_the_evidence_of_a_refit_of_its_own(state):
 
 def test_effects_of_different_curves_are_no_twins(state):
     def of(name):
-        return state.templates.of(state.null.found, state.effects[name])
+        return state.templates.templates_of(state.null.found, state.effects[name])
 
     assert are_proportional(of("sensitivity:room"), of("depends:zero:room"))
     assert not are_proportional(of("sensitivity:room"), of("depends:slope:room"))

@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.diagnosis.apparatus import Apparatus
-from probewise.diagnosis.evidence.laplace import Blocks, Linearised
+from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
 from probewise.diagnosis.search.searched import Searched
@@ -25,7 +25,11 @@ _LEAST_NATS = 3.0 / (100 * MOST_READINGS)  # least nats per reading; less is rou
 
 @dataclass(frozen=True)
 class Alias:
-    """Two effects with nearly collinear projected templates under this plan, and the plan that would separate them."""
+    """Two effects with nearly collinear projected templates under this plan, and what would separate them.
+
+    `cosine`: of the projected templates; `settle_by`: the separating scan in words, and `readings`: how many of its
+    readings are needed. If none separates them, `settle_by` says so and `readings` is 0.
+    """
 
     effects: tuple[str, str]
     cosine: float
@@ -34,7 +38,7 @@ class Alias:
 
 
 def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray) -> float:
-    """Return the largest principal cosine of two projected templates, each (n_points, k)."""
+    """Project a fit out of two templates (n_points, k); return their largest principal cosine, 0 if one vanishes."""
     bases = []
     for columns in (first, second):
         raw = np.linalg.norm(problem.law(columns)) / problem.sd
@@ -47,8 +51,8 @@ def projected_cosine(problem: Linearised, first: FloatArray, second: FloatArray)
     return float(min(np.linalg.svd(bases[0].T @ bases[1], compute_uv=False)[0], 1.0))
 
 
-def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
-    """List pairs of effects whose projected templates have a cosine of 0.9 or more, without separating plans.
+def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwise: str) -> list[Alias]:
+    """List the pairs of effects whose projected templates have a cosine of 0.9 or more, the most collinear first.
 
     Parameters
     ----------
@@ -57,7 +61,7 @@ def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwi
     templates
         For each effect, its best-fitting template columns (n_points, k).
     otherwise
-        Text for a pair that nothing separates.
+        Text for `settle_by`, until a separating plan is found.
     """
     out = []
     for pair in itertools.combinations(sorted(templates), 2):
@@ -67,8 +71,8 @@ def aliases(problem: Linearised, templates: Mapping[str, FloatArray], *, otherwi
     return sorted(out, key=lambda alias: -alias.cosine)
 
 
-def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[Alias]:
-    """Compare the projected templates of all effects, each by its best-fitting bank entry, and find separating plans.
+def aliases_with_separating_plans(searched: Searched, problem: Linearised, found: Fit) -> list[Alias]:
+    """List the aliased pairs of effects, each effect by its best-fitting bank entry, with the plans that separate them.
 
     Parameters
     ----------
@@ -81,19 +85,23 @@ def aliased_pairs(searched: Searched, problem: Linearised, found: Fit) -> list[A
     telling: dict[str, FloatArray] = {}
     chosen: dict[str, NamedEffect[Any]] = {}
     for name, effect in prepared.effects.items():
-        if name in prepared.on_noise or effects_out_of_vocabulary((name,)) or name_of_first_copy(name) is not None:
+        if (
+            name in prepared.noise_effect_names
+            or effects_out_of_vocabulary((name,))
+            or name_of_first_copy(name) is not None
+        ):
             continue
-        templates = misfit_templates.templates.of(misfit_templates.about, effect.with_fewer_variants())
-        blocks = Blocks.of(problem, templates.columns, [name] * len(templates.columns))
+        templates = misfit_templates.templates.templates_of(misfit_templates.about, effect.with_fewer_variants())
+        blocks = OrthonormalBlocks.of(problem, templates.columns, [name] * len(templates.columns))
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
-        telling[name], chosen[name] = templates.columns[best], templates.variant(best)
+        telling[name], chosen[name] = templates.columns[best], templates.variant_of_entry(best)
     apparatus = prepared.apparatus
-    pairs = aliases(problem, telling, otherwise=apparatus.words.settles_nothing)
-    return with_separating_plans(pairs, found, chosen, problem.sd, apparatus)
+    pairs = collinear_pairs(problem, telling, otherwise=apparatus.words.settles_nothing)
+    return add_separating_plans(pairs, found, chosen, problem.sd, apparatus)
 
 
-def with_separating_plans(
+def add_separating_plans(
     pairs: Sequence[Alias], found: Fit, effects: Mapping[str, NamedEffect[Any]], sd: float, apparatus: Apparatus
 ) -> list[Alias]:
     """Return the pairs, each with the candidate plan that separates it best and the number of readings needed.
@@ -106,14 +114,14 @@ def with_separating_plans(
     shapes = {}
     for name in names:
         model = found.model.with_effect(effects[name])
-        z = np.concatenate([found.z, model.coordinates_of_last_effect(effects[name].bank()[0][:1])[0]])
+        z = np.concatenate([found.z, model.z_of_last_effect(effects[name].bank()[0][:1])[0]])
         here = model.predict(z[None, :])[0] - null
         shapes[name] = (model, z, here, 0.4 * sd / max(float(np.sqrt(np.mean(here**2))), 1e-12))
     best = {pair.effects: (_LEAST_NATS, pair) for pair in pairs}
-    scans = apparatus.commands(found.model.plan, level=null)
+    scans = apparatus.candidate_measurements(found.model.plan, level=null)
     if not (best and scans):
         return list(pairs)
-    everywhere = apparatus.as_alternatives(scans, found.model.plan)
+    everywhere = apparatus.plan_of_alternatives(scans, found.model.plan)
     null = replace(found.model, plan=everywhere).predict(found.z[None, :])[0]
     there = {
         name: (replace(model, plan=everywhere).predict(z[None, :])[0] - null) * scale

@@ -59,20 +59,20 @@ class Rival:
     probability: float
 
     def predictive(self, plan: Plan, sd: float) -> PredictiveNormal:
-        """Predict a plan's readings, in noise sds."""
-        mean, slopes = replace(self.model, plan=plan).jacobian(self.z)
+        """Return the predictive distribution of a plan's readings, in noise sds; `sd` is the noise sd of a reading."""
+        mean, slopes = replace(self.model, plan=plan).predict_and_differentiate(self.z)
         return PredictiveNormal(mean / sd, slopes @ self.root / sd)
 
 
 @dataclass(frozen=True, eq=False)
 class PredictiveNormal:
-    """Normal predictions in noise sds: mean (n_points,), covariance 1 + factor factor^T."""
+    """Normal predictive distribution in noise sds: mean (n_points,), covariance of the readings 1 + factor factor^T."""
 
     mean: FloatArray
     factor: FloatArray
 
     def take(self, rows: IntArray) -> PredictiveNormal:
-        """Keep these readings."""
+        """Return the predictive distribution of the readings in these rows."""
         return PredictiveNormal(self.mean[rows], self.factor[rows])
 
     @property
@@ -81,15 +81,17 @@ class PredictiveNormal:
         return np.asarray(np.eye(len(self.mean)) + self.factor @ self.factor.T)
 
 
-def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Apparatus) -> NextMeasurement | None:
-    """Choose scans of at most 102 readings that separate the rivals; None if no scan is possible or informative.
+def measurement_separating_rivals(
+    rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Apparatus
+) -> NextMeasurement | None:
+    """Choose scans, of at most 102 readings in all, that separate the rivals; None if none is possible or informative.
 
     Parameters
     ----------
     rivals
         Two or more hypotheses.
     sd
-        Noise of a reading.
+        Noise sd of a reading.
     plan
         The plan already measured.
     apparatus
@@ -97,13 +99,13 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
     """
     leader = max(rivals, key=lambda rival: rival.probability)
     level = leader.model.predict(leader.z[None, :])[0]
-    offered = apparatus.commands(plan, strides=_STRIDES, level=level)
+    offered = apparatus.candidate_measurements(plan, strides=_STRIDES, level=level)
     weights = np.maximum([rival.probability for rival in rivals], _LEAST_WEIGHT)
     weights /= weights.sum()
-    offered = [offered[k] for k in _shortlisted(rivals, sd, offered, plan, apparatus)]
+    offered = [offered[k] for k in _shortlist_indices(rivals, sd, offered, plan, apparatus)]
     if not offered:
         return None
-    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_by_command(offered)
+    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
     predictives = [rival.predictive(everywhere, sd) for rival in rivals]
 
     chosen: list[int] = []
@@ -114,7 +116,10 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
         for k in range(len(offered)):
             together = np.concatenate([taken, rows[k]])
             if k not in chosen and len(together) <= MOST_READINGS:
-                gains[k] = mutual_information([predictive.take(together) for predictive in predictives], weights) - told
+                gains[k] = (
+                    mutual_information_lower_bound([predictive.take(together) for predictive in predictives], weights)
+                    - told
+                )
         gains[~(gains >= (_WORTHWHILE if chosen else _ANYTHING) * uncertain)] = 0.0  # also for a model that fails there
         best = int(np.argmax(gains / [option.minutes for option in offered]))
         if gains[best] == 0.0:
@@ -125,15 +130,15 @@ def next_scans(rivals: Sequence[Rival], sd: float, plan: Plan, apparatus: Appara
         return None
     scans = [offered[k] for k in chosen]
     return NextMeasurement(
-        apparatus.in_sequence(scans, plan),
+        apparatus.plan_in_sequence(scans, plan),
         "; then ".join(scan.description for scan in scans),
         sum(scan.minutes for scan in scans),
-        _expected_log_bayes_factor([predictive.take(taken) for predictive in predictives], weights),
+        _log_bayes_factor_over_closest([predictive.take(taken) for predictive in predictives], weights),
         tuple(rival.label for rival in rivals),
     )
 
 
-def mutual_information(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
+def mutual_information_lower_bound(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
     """Return a lower bound on the mutual information of hypothesis and readings, in nats.
 
     Parameters
@@ -153,13 +158,13 @@ def mutual_information(predictives: Sequence[PredictiveNormal], weights: FloatAr
     return float(-weights @ logsumexp(-distances, b=weights, axis=1))
 
 
-def _shortlisted(
+def _shortlist_indices(
     rivals: Sequence[Rival], sd: float, offered: Sequence[Command], plan: Plan, apparatus: Apparatus
 ) -> list[int]:
-    """Keep, for each pair of rivals, the few scans in which their predictions differ most per minute."""
+    """Return the indices of the few scans, for each pair of rivals, in which predictions differ most per minute."""
     if not offered:
         return []
-    everywhere, rows = apparatus.as_alternatives(offered, plan), rows_by_command(offered)
+    everywhere, rows = apparatus.plan_of_alternatives(offered, plan), rows_by_command(offered)
     means = np.stack([replace(rival.model, plan=everywhere).predict(rival.z[None, :])[0] for rival in rivals]) / sd
     minutes = np.array([option.minutes for option in offered])
     kept: dict[int, None] = {}
@@ -171,8 +176,8 @@ def _shortlisted(
     return list(kept)
 
 
-def _expected_log_bayes_factor(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
-    """Return the expected log Bayes factor over the closest rival, averaged over the true hypothesis."""
+def _log_bayes_factor_over_closest(predictives: Sequence[PredictiveNormal], weights: FloatArray) -> float:
+    """Return the expected log Bayes factor of the truth over its closest rival, in nats, averaged over the truth."""
     covariances = [predictive.covariance for predictive in predictives]
     inverse = [np.linalg.inv(covariance) for covariance in covariances]
     log_dets = [np.linalg.slogdet(covariance)[1] for covariance in covariances]

@@ -8,7 +8,7 @@ from itertools import islice
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, next_scans
+from probewise.diagnosis.advice.next_scans import NextMeasurement, Rival, measurement_separating_rivals
 from probewise.diagnosis.evidence.laplace import Linearised, covariance_root
 from probewise.diagnosis.fitting.fit import residual_degrees_of_freedom
 from probewise.diagnosis.names import Names
@@ -24,8 +24,11 @@ _LEFT = 2.0  # factor by which its total change of the existing readings may exc
 _SIZES = 4  # sizes tried, each a quarter of the last
 
 
-def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | None:
-    """Choose the readings that separate the leading refitted hypotheses on the mean."""
+def choose_next_measurement(searched: Searched, null: WeighedFit) -> NextMeasurement | None:
+    """Choose the readings that separate the leading refitted hypotheses on the mean.
+
+    If only one is left, its rival is an effect too weak to be detected so far. None if no scan is informative.
+    """
     by_mean = searched.posterior.by_mean
     # An unknown effect makes no prediction beyond the null.
     probabilities: dict[tuple[str, ...], float] = {(): by_mean.get((), 0.0) + by_mean.get(("unknown",), 0.0)}
@@ -37,13 +40,13 @@ def next_readings(searched: Searched, null: WeighedFit) -> NextMeasurement | Non
     as_calibrated = f"{apparatus.words.null} as calibrated"
     rivals = [_as_rival(candidate, probabilities[candidate.names], as_calibrated) for candidate in found]
     if len(rivals) > 1:
-        return next_scans(rivals, sd, plan, apparatus)
-    if apparatus.refit_budget_is_spent():
+        return measurement_separating_rivals(rivals, sd, plan, apparatus)
+    if apparatus.is_refit_budget_spent():
         return None
     others = dict.fromkeys(n for names in ranked for n in names if n in prepared.effects)
-    imagined = (_insignificant_rival(searched, null, name) for name in others)
+    imagined = (_rival_with_undetected_effect(searched, null, name) for name in others)
     tried = islice((rival for rival in imagined if rival is not None), _TRIED)
-    wanted = (next_scans([*rivals, rival], sd, plan, apparatus) for rival in tried)
+    wanted = (measurement_separating_rivals([*rivals, rival], sd, plan, apparatus) for rival in tried)
     return next((asked for asked in wanted if asked is not None), None)
 
 
@@ -63,37 +66,38 @@ def _leading_fits(searched: Searched, null: WeighedFit, ranked: Mapping[Names, f
 
 def _as_rival(candidate: WeighedFit, probability: float, as_calibrated: str) -> Rival:
     label = " with ".join(map(spoken_name, candidate.names)) or as_calibrated
-    return Rival(label, candidate.found.model, candidate.found.z, _root_of(candidate), probability)
+    return Rival(label, candidate.found.model, candidate.found.z, _covariance_root_of_fit(candidate), probability)
 
 
-def _insignificant_rival(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
-    """Return a rival with an insignificant effect of the size that gives lambda 3 here, or None."""
+def _rival_with_undetected_effect(searched: Searched, null: WeighedFit, name: str) -> Rival | None:
+    """Return a rival with an effect of lambda 3 here, too weak to be detected; None if it changes readings too much."""
     effect, found = searched.prepared.effects[name], null.found
     best = max(null.evidence.values(), key=lambda e: e.log_z)
-    problem = Linearised.of(found, best.law)
-    templates = searched.misfit_templates.templates.of(found, effect)
+    problem = Linearised.of(found, best.likeliest_law)
+    templates = searched.misfit_templates.templates.templates_of(found, effect)
     sizes = [float(np.linalg.norm(problem.project(c[:, :1]))) for c in templates.columns]
     at = int(np.argmin(np.abs(np.log(np.maximum(sizes, 1e-9) / _UNDETECTED))))
     setting = templates.settings[at][0].copy()
     amplitudes = list(effect.amplitudes)
     setting[amplitudes] *= min(_UNDETECTED / max(sizes[at], 1e-9), 50.0)
-    model = found.model.with_effect(templates.variant(at))
+    model = found.model.with_effect(templates.variant_of_entry(at))
 
-    def change(z: FloatArray) -> FloatArray:
-        return np.asarray(model.predict(z[None, :])[0, searched.prepared.usable] - found.predicted)
+    def prediction_change(z: FloatArray) -> FloatArray:
+        return np.asarray(model.predict(z[None, :])[0, searched.prepared.usable_rows] - found.predicted)
 
     for _ in range(_SIZES if amplitudes else 1):
-        z = np.concatenate([found.z, model.coordinates_of_last_effect(setting[None, :])[0]])
-        z[: len(found.z)] += problem.absorbed(found, change(z))  # the sensor refitted to readings with the effect
-        if np.linalg.norm(change(z)) <= _LEFT * _UNDETECTED * null.whitened_sd:
+        z = np.concatenate([found.z, model.z_of_last_effect(setting[None, :])[0]])
+        # The sensor is refitted to readings with the effect.
+        z[: len(found.z)] += problem.absorbing_shift(found, prediction_change(z))
+        if np.linalg.norm(prediction_change(z)) <= _LEFT * _UNDETECTED * null.whitened_sd:
             root = np.zeros((len(z), len(z)))  # its size is fixed
-            root[: len(found.z), : len(found.z)] = _root_of(null)
+            root[: len(found.z), : len(found.z)] = _covariance_root_of_fit(null)
             return Rival(f"{spoken_name(name)} too weak to be detected so far", model, z, root, 0.0)
         setting[amplitudes] /= 4
     return None
 
 
-def _root_of(candidate: WeighedFit) -> FloatArray:
-    """Return a square root of the covariance of a fit's coordinates, for white noise."""
+def _covariance_root_of_fit(candidate: WeighedFit) -> FloatArray:
+    """Return a square root of the covariance of a fit's coordinates under white noise, (n_params, n_params)."""
     slopes, sd = candidate.found.slopes, candidate.whitened_sd
     return covariance_root(slopes, sd**2 * len(slopes) / residual_degrees_of_freedom(slopes, sd))

@@ -12,13 +12,13 @@ from probewise._arrays import IntArray
 from probewise.diagnosis.audit.detectability import (
     LEAST_NATS,
     LEAST_SHARE,
-    Expected,
+    ExpectedSensor,
     PlanTemplates,
     ProjectedTemplates,
-    nats_between,
+    nats_from_cosine,
 )
 from probewise.diagnosis.joining import join_plans
-from probewise.diagnosis.light_sensor.commands import commands
+from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans
 from probewise.diagnosis.light_sensor.scheduling import Scan, postponed
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.effects import NamedEffect
@@ -32,9 +32,9 @@ _WORTHWHILE_EACH = 0.005  # and per reading: at most 200 readings are spent on o
 _STRIDES = (1, 4)
 
 
-def cures_of(
+def choose_cure_scans(
     plan: Plan,
-    expected: Expected,
+    expected: ExpectedSensor,
     effects: Mapping[str, type[NamedEffect[Any]]],
     ailing: Sequence[str],
     progress: Progress = silent,
@@ -54,7 +54,7 @@ def cures_of(
     progress
         Called for every chosen scan.
     """
-    every = [*commands(plan, strides=_STRIDES), *target_swaps(plan)]
+    every = [*candidate_scans(plan, strides=_STRIDES), *target_swaps(plan)]
     chosen: list[Scan] = []
     current = plan
     while len(chosen) < _MOST_SCANS:
@@ -83,12 +83,12 @@ def cures_of(
 
 def _total_deficit(laid: PlanTemplates, rows: IntArray, ailing: Sequence[str]) -> float:
     """Return the summed deficit of effects: 0 fine, up to 1 aliased, 1 to 2 invisible."""
-    detectability = ProjectedTemplates.of(laid, rows).detectability(ailing)
+    detectability = ProjectedTemplates.of(laid, rows).shares_and_cosines(ailing)
     total = 0.0
     for name in ailing:
         share, like = detectability.get(name, (0.0, {}))
         if share < LEAST_SHARE:
             total += 2.0 - share / LEAST_SHARE
         else:
-            total += max(1.0 - nats_between(max(like.values(), default=0.0)) / LEAST_NATS, 0.0)
+            total += max(1.0 - nats_from_cosine(max(like.values(), default=0.0)) / LEAST_NATS, 0.0)
     return total

@@ -14,7 +14,7 @@ from typing import Any, Self
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence.laplace import orthonormal
+from probewise.diagnosis.evidence.laplace import orthonormalise_groups
 from probewise.diagnosis.evidence.templates import effect_templates
 from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.fitting.null import Null
@@ -29,14 +29,14 @@ LEAST_SHARE = 0.05  # least share of an effect's template that the sensor's para
 _MOST_NUMBERS = 2_000_000  # readings times settings of one effect's bank, beyond which the bank is thinned
 
 
-def nats_between(cosine: float) -> float:
+def nats_from_cosine(cosine: float) -> float:
     """Return the expected log Bayes factor between two effects of lambda 8 with this cosine of projected templates."""
     return 0.5 * LAMBDA**2 * (1 - cosine**2)
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
-    """The expected sensor: its prior, the point `z` (n_params,) of linearisation, levels, noise sd."""
+class ExpectedSensor:
+    """The expected sensor: prior `null`, point `z` (n_params,) of linearisation, low and high level, noise sd."""
 
     null: Null
     z: FloatArray
@@ -64,7 +64,7 @@ class PlanTemplates:
     @classmethod
     def of(
         cls,
-        expected: Expected,
+        expected: ExpectedSensor,
         plan: Plan,
         effects: Mapping[str, type[NamedEffect[Any]]],
         *,
@@ -76,18 +76,18 @@ class PlanTemplates:
         """
         extent = Extent(*expected.levels, plan)
         maybe = {name: kind.for_extent(extent) for name, kind in effects.items()}
-        return cls.of_built(
+        return cls.of_scaled_effects(
             expected, plan, {name: effect for name, effect in maybe.items() if effect is not None}, most=most
         )
 
     @classmethod
-    def of_built(
-        cls, expected: Expected, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
+    def of_scaled_effects(
+        cls, expected: ExpectedSensor, plan: Plan, built: Mapping[str, NamedEffect[Any]], *, most: int | None = None
     ) -> Self:
         """Build the templates of effects that are already scaled."""
         most = max(_MOST_NUMBERS // len(plan), 64) if most is None else most
         model = Model(expected.null, (), plan)
-        predicted, slopes = model.jacobian(expected.z)
+        predicted, slopes = model.predict_and_differentiate(expected.z)
         found = Fit(model, expected.z, predicted, np.zeros(len(plan)), slopes, sd=expected.sd, objective=0.0)
         columns = [np.zeros((len(plan), 0))]
         settings: list[FloatArray] = []
@@ -141,19 +141,20 @@ class ProjectedTemplates:
         return cls(
             laid,
             left,
-            _orthonormal(left, laid.entry),
+            _orthonormalise_entries(left, laid.entry),
             laid.norms_of_entries(columns),
             laid.norms_of_entries(left),
             n_points,
         )
 
-    def detectability(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
-        """Return the detectable share of each requested effect, and its cosine to every other detectable effect.
+    def shares_and_cosines(self, asked: Sequence[str] | None = None) -> dict[str, tuple[float, dict[str, float]]]:
+        """Return, by effect, its detectable share, and its cosine to every other detectable effect, by name.
 
         Both are medians over the effect's settings; the cosine is to the best-imitating setting of the other effect.
+        Only effects in `asked` have cosines, by default all that are detectable.
         """
         laid = self.laid
-        present = {name: self._active_entries(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
+        present = {name: self._active_entry_indices(k) for k, name in enumerate(laid.names) if np.any(laid.owner == k)}
         shares = {
             name: float(np.median(self.kept[mine] / self.raw[mine])) if mine.size else 0.0
             for name, mine in present.items()
@@ -166,25 +167,27 @@ class ProjectedTemplates:
         mine = np.concatenate([present[name] for name in wanted])
         columns = np.flatnonzero(np.isin(laid.entry, mine))
         onto = (self.basis.T @ self.left[:, columns]) ** 2  # of each column, on every direction of the others
-        onto = np.add.reduceat(onto, _first_of_runs(laid.entry), axis=0)
-        onto = np.add.reduceat(onto, _first_of_runs(laid.entry[columns]), axis=1)
+        onto = np.add.reduceat(onto, _run_start_indices(laid.entry), axis=0)
+        onto = np.add.reduceat(onto, _run_start_indices(laid.entry[columns]), axis=1)
         mine = np.unique(laid.entry[columns])
-        best = np.maximum.reduceat(onto, _first_of_runs(laid.owner), axis=0) / np.maximum(self.kept[mine] ** 2, 1e-300)
+        best = np.maximum.reduceat(onto, _run_start_indices(laid.owner), axis=0) / np.maximum(
+            self.kept[mine] ** 2, 1e-300
+        )
         cosines = np.sqrt(np.minimum(best, 1.0))
-        owners = [laid.names[k] for k in laid.owner[_first_of_runs(laid.owner)]]
+        owners = [laid.names[k] for k in laid.owner[_run_start_indices(laid.owner)]]
         for name in wanted:
             typical = np.median(cosines[:, laid.owner[mine] == laid.names.index(name)], axis=1)
             like = dict(zip(owners, typical.tolist(), strict=True))
             out[name] = (shares[name], {other: like[other] for other in visible if other != name})
         return out
 
-    def _active_entries(self, effect: int) -> IntArray:
-        """Return the entries of an effect that act on these rows."""
+    def _active_entry_indices(self, effect: int) -> IntArray:
+        """Return the indices of the entries of an effect, given by its index, that act on these rows."""
         mine = np.flatnonzero(self.laid.owner == effect)
         return mine[self.raw[mine] > 1e-6 * max(float(self.raw[mine].max(initial=0.0)), 1e-6)]
 
-    def smallest(self, effect: NamedEffect[Any]) -> tuple[float | None, ...]:
-        """Return the value of each amplitude that gives lambda 8, median over settings; None if undetectable."""
+    def smallest_detectable_amplitudes(self, effect: NamedEffect[Any]) -> tuple[float | None, ...]:
+        """Return the size of each amplitude that gives lambda 8, median over settings; None if undetectable."""
         at = np.flatnonzero(self.laid.owner == self.laid.names.index(effect.name))
         columns = np.flatnonzero(np.isin(self.laid.entry, at))
         settings = np.concatenate([self.laid.settings[k] for k in at])
@@ -197,12 +200,12 @@ class ProjectedTemplates:
         return tuple(out)
 
 
-def _first_of_runs(codes: IntArray) -> IntArray:
+def _run_start_indices(codes: IntArray) -> IntArray:
     """Return the first index of each run of equal codes."""
     return np.flatnonzero(np.diff(codes, prepend=-1))
 
 
-def _orthonormal(columns: FloatArray, entry: IntArray) -> FloatArray:
+def _orthonormalise_entries(columns: FloatArray, entry: IntArray) -> FloatArray:
     """Orthonormalise each entry's columns.
 
     Directions shorter than a thousandth of the longest become zero columns.
@@ -211,5 +214,5 @@ def _orthonormal(columns: FloatArray, entry: IntArray) -> FloatArray:
     widths = np.bincount(entry)
     for width in np.unique(widths):  # all entries of one width at a time
         mine = np.flatnonzero(widths[entry] == width)
-        out[:, mine], _ = orthonormal(columns[:, mine], int(width), least=1e-18, share=1e-6)
+        out[:, mine], _ = orthonormalise_groups(columns[:, mine], int(width), least=1e-18, share=1e-6)
     return out

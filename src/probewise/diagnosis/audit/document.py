@@ -17,7 +17,7 @@ def audit_json(audit: PlanAudit) -> dict[str, Any]:
         "format": "audit/1",
         "readings": len(audit.plan),
         "assumed": audit.assumed,
-        "effects": _effects(audit.effects),
+        "effects": _effects_json(audit.effects),
         "cure": None
         if plan is None
         else {
@@ -35,12 +35,12 @@ def audit_json(audit: PlanAudit) -> dict[str, Any]:
                 for cure in audit.cures
             ],
         },
-        "after": _effects(audit.after),
+        "after": _effects_json(audit.after),
         **({} if audit.classes is None else {"alias_classes": [list(names) for names in audit.classes]}),
     }
 
 
-def _effects(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
+def _effects_json(effects: Sequence[EffectAudit]) -> list[dict[str, Any]]:
     return [
         {
             "name": effect.name,

@@ -20,11 +20,17 @@ from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.apparatus import Words
-from probewise.diagnosis.audit.cures import cures_of
-from probewise.diagnosis.audit.detectability import ALIAS, LEAST_SHARE, Expected, PlanTemplates, ProjectedTemplates
+from probewise.diagnosis.audit.cures import choose_cure_scans
+from probewise.diagnosis.audit.detectability import (
+    ALIAS,
+    LEAST_SHARE,
+    ExpectedSensor,
+    PlanTemplates,
+    ProjectedTemplates,
+)
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
-from probewise.diagnosis.fitting.earlier import SensorPrior, require_sensor_prior, sensor_of
-from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.free_form import FreeFormSensor
+from probewise.diagnosis.fitting.sensor_prior import SensorPrior, require_sensor_prior, sensor_from_samples
 from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
@@ -175,10 +181,12 @@ class PlanAudit(ShowsItself):
 
     def summary(self) -> str:
         """Return a plain-text summary of the audit."""
-        lines = [f"{len(self.plan)} readings in {count_of(self.plan.scan_names, self.words.run)}; {self.assumed}"]
-        lines += _wrapped_list("fine", [e.name for e in self.seen_as("fine")])
-        lines += _wrapped_list("aliased", [_with_aliases(e) for e in self.seen_as("aliased")])
-        lines += _wrapped_list("invisible", [e.name for e in self.seen_as("invisible")])
+        lines = [
+            f"{len(self.plan)} readings in {count_with_noun(self.plan.scan_names, self.words.run)}; {self.assumed}"
+        ]
+        lines += _wrapped_lines("fine", [e.name for e in self.seen_as("fine")])
+        lines += _wrapped_lines("aliased", [_name_with_alias(e) for e in self.seen_as("aliased")])
+        lines += _wrapped_lines("invisible", [e.name for e in self.seen_as("invisible")])
         lines += _READING_GUIDE
         if not self.cures:
             cured = "not needed" if len(self.seen_as("fine")) == len(self.effects) else self.words.no_cure
@@ -190,20 +198,20 @@ class PlanAudit(ShowsItself):
             said = f"  {k}. {cure.description}, {len(cure.plan)} readings: {so_that}"
             lines += textwrap.wrap(said, 120, subsequent_indent=" " * 5, break_on_hyphens=False)
         left = [e.name for e in self.after if e.detectability != "fine"]
-        return "\n".join([*lines, *_wrapped_list("left", left or ["nothing"])])
+        return "\n".join([*lines, *_wrapped_lines("left", left or ["nothing"])])
 
 
-def count_of(names: Sequence[str], noun: str) -> str:
-    """Write the number of names with a noun."""
+def count_with_noun(names: Sequence[str], noun: str) -> str:
+    """Write the number of names with a noun, in the plural if need be."""
     return f"{len(names)} {noun}{'' if len(names) == 1 and noun != 'scan' else 's'}"
 
 
-def _with_aliases(effect: EffectAudit) -> str:
+def _name_with_alias(effect: EffectAudit) -> str:
     return f"{effect.name} ({effect.alike[0][0]} {effect.alike[0][1]:.2f})"
 
 
-def _wrapped_list(label: str, names: Sequence[str]) -> list[str]:
-    """Wrap names after a label."""
+def _wrapped_lines(label: str, names: Sequence[str]) -> list[str]:
+    """Return the lines of a list of names after a label; none without names."""
     lines, line = [], f"{label:<10} "
     for k, name in enumerate(names):
         piece = name + (", " if k + 1 < len(names) else "")
@@ -253,18 +261,18 @@ def audit_plan(
     require_described(plan)
     if noise_sd is None and isinstance(sensor, FittedSensor):
         noise_sd = float(sensor.noise_sd.mean())
-    expected, said = _expected_sensor(plan, sensor, noise_sd)
+    expected, said = _expected_sensor_and_description(plan, sensor, noise_sd)
     unit = plan.instrumentation.unit
     progress("judging the plan")
     before, cosines = audits_and_cosines(PlanTemplates.of(expected, plan, effects), effects, unit)
     ailing = [effect.name for effect in before if effect.detectability != "fine"]
-    chosen = cures_of(plan, expected, effects, ailing, progress)
+    chosen = choose_cure_scans(plan, expected, effects, ailing, progress)
     steps, current = [before], plan
     for k, command in enumerate(chosen):
         progress("judging the plan with its cures", k, len(chosen))
         current = join_plans([current, command.plan])
         steps.append(audits_and_cosines(PlanTemplates.of(expected, current, effects), effects, unit)[0])
-    cured = _steps_that_cure(steps)
+    cured = _curing_step_by_effect(steps)
     n_kept = max(cured.values(), default=0)  # drop scans that were to prepare a later one that was not added
     cures = tuple(
         Cure(c.kind, c.description, c.plan, c.minutes, tuple(name for name, step in cured.items() if step == k))
@@ -273,18 +281,18 @@ def audit_plan(
     return PlanAudit(plan, said, before, cosines, cures, steps[n_kept])
 
 
-def _steps_that_cure(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
+def _curing_step_by_effect(steps: Sequence[Sequence[EffectAudit]]) -> dict[str, int]:
     """Return, for each effect cured by the steps, the step from which it remains fine.
 
     An effect may be fine at some step and not after a later one.
     """
     fine = [{effect.name for effect in step if effect.detectability == "fine"} for step in steps]
 
-    def since(last: int) -> dict[str, int]:
+    def fine_since(last: int) -> dict[str, int]:
         names = [effect.name for effect in steps[0] if effect.name in fine[last] - fine[0]]
         return {name: max(k for k in range(last) if name not in fine[k]) + 1 for name in names}
 
-    return since(max(since(len(steps) - 1).values(), default=0))
+    return fine_since(max(fine_since(len(steps) - 1).values(), default=0))
 
 
 def audit_recorded(
@@ -313,24 +321,26 @@ def audit_recorded(
     own = mean[None, : 6 * known.n_gaussians + 2]
     null: CalibratedSensor
     if sensor is not None:
-        null = sensor_of(sensor)
+        null = sensor_from_samples(sensor)
     elif is_free_form(own[:, :-2]):
-        null = FreeForm.from_one_gaussian(default_sensor(extent, 1))
+        null = FreeFormSensor.from_one_gaussian(default_sensor(extent, 1))
     else:
         null = default_sensor(extent, known.n_gaussians)
     z = np.clip(null.z(own)[0], -FARTHEST, FARTHEST)
-    expected = Expected(null, z, (low, high), float(known.noise_sd.mean()))
+    expected = ExpectedSensor(null, z, (low, high), float(known.noise_sd.mean()))
     effects_seen, cosines = audits_and_cosines(
         PlanTemplates.of(expected, plan, effects, most=_SETTINGS), effects, plan.instrumentation.unit
     )
     return PlanAudit(plan, "the sensor as calibrated from these readings", effects_seen, cosines, (), effects_seen)
 
 
-def _expected_sensor(plan: Plan, sensor: SensorPrior | None, noise_sd: float | None) -> tuple[Expected, str]:
+def _expected_sensor_and_description(
+    plan: Plan, sensor: SensorPrior | None, noise_sd: float | None
+) -> tuple[ExpectedSensor, str]:
     """Return the expected sensor, and its description."""
     if sensor is not None:
         mean = np.asarray(sensor.samples, dtype=np.float64).mean(axis=0)
-        null = sensor_of(sensor)
+        null = sensor_from_samples(sensor)
         z = np.zeros(null.n_params)
         low, high = (float(mean[list(sensor.names).index(name)]) for name in ("I_min", "I_max"))
         said = "the sensor as calibrated"
@@ -344,7 +354,7 @@ def _expected_sensor(plan: Plan, sensor: SensorPrior | None, noise_sd: float | N
     sd = _NOISE * (high - low) if noise_sd is None else noise_sd
     if not sd > 0:
         raise ParameterError("noise_sd", sd, "greater than 0")
-    return Expected(
+    return ExpectedSensor(
         null, z, (low, high), sd
     ), f"{said}, noise {sd:.3g} {plan.instrumentation.unit_after_number}".rstrip()
 
@@ -354,7 +364,7 @@ def audits_and_cosines(
 ) -> tuple[tuple[EffectAudit, ...], FloatArray]:
     """Return the audit of every effect, and the matrix of cosines (row imitated by column)."""
     seen = ProjectedTemplates.of(laid, np.arange(len(laid.slopes)))
-    detectability = seen.detectability()
+    detectability = seen.shares_and_cosines()
     names = list(effects)
     cosines = np.zeros((len(names), len(names)))
     out = []
@@ -370,7 +380,7 @@ def audits_and_cosines(
             share, like = detectability[name]
             for other, cosine in like.items():
                 cosines[own, names.index(other)] = cosine
-            out.append(_audit_of(effect, share, like, seen.smallest(effect), unit))
+            out.append(_audit_of(effect, share, like, seen.smallest_detectable_amplitudes(effect), unit))
         cosines[own, own] = out[-1].share
     return tuple(out), cosines
 

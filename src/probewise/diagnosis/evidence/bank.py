@@ -21,8 +21,8 @@ _MOST_BYTES = 2**28
 
 
 @dataclass(eq=False)
-class Bank:
-    """Templates, concatenated.
+class TemplateBank:
+    """Labelled templates, concatenated by columns, with their Bayes factors about any fit.
 
     Parameters
     ----------
@@ -37,10 +37,10 @@ class Bank:
     columns: FloatArray
     widths: IntArray
     labels: tuple[str, ...]
-    _whitened: dict[tuple[bytes, ...], _WhitenedTemplates] = field(default_factory=dict, repr=False)
+    _whitened: dict[tuple[bytes, ...], _WhitenedTemplatesAndGrams] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> Bank:
+    def of(cls, templates: Sequence[FloatArray], labels: Sequence[str], n_points: int) -> TemplateBank:
         """Concatenate templates, each (n_points, k)."""
         widths = np.array([t.shape[1] for t in templates], dtype=np.int64)
         return cls(np.concatenate([np.zeros((n_points, 0)), *templates], axis=1), widths, tuple(labels))
@@ -56,16 +56,16 @@ class Bank:
         return np.cumsum(self.widths) - self.widths
 
     @cached_property
-    def members(self) -> dict[str, IntArray]:
+    def indices_by_label(self) -> dict[str, IntArray]:
         """Indices of the templates of each label."""
         labels = np.array(self.labels)
         return {label: np.flatnonzero(labels == label) for label in dict.fromkeys(self.labels)}
 
-    def take(self, members: IntArray) -> Bank:
+    def take(self, members: IntArray) -> TemplateBank:
         """Return the bank of these templates."""
         at = [self._first_columns[k] + np.arange(self.widths[k]) for k in members]
         columns = np.concatenate([np.zeros(0, dtype=np.int64), *at])
-        return Bank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
+        return TemplateBank(self.columns[:, columns], self.widths[members], tuple(self.labels[k] for k in members))
 
     def log_bayes_factors(self, problem: Linearised, residuals: FloatArray | None = None) -> FloatArray:
         """Return the log Bayes factor of each template against a fit, as `block_log_bayes_factors` does.
@@ -79,20 +79,20 @@ class Bank:
 
         Returns
         -------
-        (n_templates, n_draws).
+        Log Bayes factors, (n_templates, n_draws).
         """
         own = problem.residual[:, None] if residuals is None else residuals
         n = problem.n_points
-        whitened = self._scaled_under(problem.law)
+        whitened = self._whitened_under(problem.law)
         taken = problem.basis[:n].T @ whitened.templates  # the part that the fit absorbs, (n_params, n_columns)
         along = whitened.templates.T @ own[:n]
         total = np.maximum(np.sum(own**2, axis=0), 1e-300)
         out = np.empty((len(self.widths), own.shape[1]))
         for width, products in whitened.products.items():  # all templates of one width at a time
-            members, at = self._of_width(width)
+            members, at = self._indices_of_width(width)
             absorbed = taken[:, at].transpose(1, 0, 2)
             left = products - absorbed.transpose(0, 2, 1) @ absorbed
-            gain, axes = _eigenvectors_of_grams(left)
+            gain, axes = _gram_eigensystems(left)
             gain = np.where(gain > _ABSENT * n, gain, 0.0)
             turned = axes.transpose(0, 2, 1) @ along[at]
             explained = turned**2 / np.where(gain > 0, gain, np.inf)[:, :, None] / total
@@ -101,19 +101,19 @@ class Bank:
 
     def unabsorbed_shares(self, problem: Linearised) -> FloatArray:
         """Return the share of each template's norm that a fit does not absorb, (n_templates,)."""
-        templates = self._scaled_under(problem.law).templates
+        templates = self._whitened_under(problem.law).templates
         taken = problem.basis[: problem.n_points].T @ templates
         whole, lost = (np.add.reduceat(np.sum(a**2, axis=0), self._first_columns) for a in (templates, taken))
         return np.asarray(np.sqrt(np.maximum(1 - lost / np.maximum(whole, 1e-300), 0.0)))
 
-    def _of_width(self, width: int) -> tuple[IntArray, IntArray]:
+    def _indices_of_width(self, width: int) -> tuple[IntArray, IntArray]:
         """Return the indices of the templates of one width, (n,), and of their columns, (n, width)."""
         members = np.flatnonzero(self.widths == width)
         return members, self._first_columns[members, None] + np.arange(width)
 
-    def _scaled_under(self, law: NoiseLaw) -> _WhitenedTemplates:
-        """Whiten all templates and scale each to unit rms."""
-        key = law.linear
+    def _whitened_under(self, law: NoiseLaw) -> _WhitenedTemplatesAndGrams:
+        """Whiten all templates and scale each to unit rms; cached for the last few noise models."""
+        key = law.whitening_key
         if key in self._whitened:
             self._whitened[key] = self._whitened.pop(key)
         else:
@@ -126,13 +126,13 @@ class Bank:
             whitened *= np.sqrt(len(whitened) / per_column) / np.where(norms > 0, norms, 1.0)
             products = {}
             for width in map(int, np.unique(self.widths)):
-                blocks = whitened[:, self._of_width(width)[1]].transpose(1, 0, 2)
+                blocks = whitened[:, self._indices_of_width(width)[1]].transpose(1, 0, 2)
                 products[width] = blocks.transpose(0, 2, 1) @ blocks
-            self._whitened[key] = _WhitenedTemplates(whitened, products)
+            self._whitened[key] = _WhitenedTemplatesAndGrams(whitened, products)
         return self._whitened[key]
 
 
-def _eigenvectors_of_grams(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _gram_eigensystems(squares: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return eigenvalues (n, width) and eigenvectors (n, width, width) of Gram matrices (n, width, width).
 
     One or two columns, nearly all templates, have them in closed form (Jacobi's rotation).
@@ -153,7 +153,7 @@ def _eigenvectors_of_grams(squares: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
-class _WhitenedTemplates:
+class _WhitenedTemplatesAndGrams:
     """All templates, whitened, (n_points, n_columns), and by width their Gram matrices, (n, width, width)."""
 
     templates: FloatArray

@@ -12,7 +12,7 @@ from probewise.errors import NotConvergedError
 _FAR = 10.0  # nats; a fit stops when a step gains less than 0.005
 
 
-def require_finite(found: Fit) -> Fit:
+def checked_finite(found: Fit) -> Fit:
     """Return a fit after checking that its predictions are finite.
 
     Raises
@@ -33,7 +33,7 @@ def require_converged(found: Fit, problem: Linearised) -> None:
     NotConvergedError
         With the fit as its `partial`.
     """
-    shift = problem.absorbed(found, np.zeros(len(found.residuals)))
+    shift = problem.absorbing_shift(found, np.zeros(len(found.residuals)))
     slopes = problem.law(found.slopes) / problem.sd
     left = 0.5 * float(np.sum((slopes @ shift) ** 2) + shift @ shift)
     if left > _FAR and np.abs(found.z).max() < FARTHEST - 0.1:

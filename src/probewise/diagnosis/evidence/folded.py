@@ -16,8 +16,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, frozen
-from probewise.diagnosis.evidence.joint import JointProblem, StandardNormal
-from probewise.diagnosis.fitting.coordinates import SensorCoordinates
+from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem, StandardNormal
+from probewise.diagnosis.fitting.coordinates import GaussianMixtureSensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,23 +36,23 @@ class FoldedNormal(StandardNormal):
         The point, (n_params,).
     """
 
-    sensor: SensorCoordinates
+    sensor: GaussianMixtureSensor
     near: FloatArray
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "near", frozen(self.near))
 
     @cached_property
-    def _other_orders(self) -> tuple[FloatArray, FloatArray]:
+    def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:
         """Every other order's coordinates as z @ turn + shift: (n_others, n_own, n_own), (n_others, 1, n_own)."""
         n_own = self.sensor.n_params
         orders = list(itertools.permutations(range(self.sensor.n_gaussians)))[1:]
         shift = np.stack([self.sensor.permuted(np.zeros((1, n_own)), order) for order in orders])
         return np.stack([self.sensor.permuted(np.eye(n_own), order) for order in orders]) - shift, shift
 
-    def _reordered_copies(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _reordered_with_distances(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return every order's coordinates, (n_orders, n_samples, n_params), and their distances from the point."""
-        turn, shift = self._other_orders
+        turn, shift = self._reordering_maps
         images = np.repeat(z[None], len(turn) + 1, axis=0)
         n_own = self.sensor.n_params
         images[1:, :, :n_own] = z[:, :n_own] @ turn + shift
@@ -60,7 +60,7 @@ class FoldedNormal(StandardNormal):
 
     def fold(self, z: FloatArray) -> FloatArray:
         """Reorder the Gaussians to be nearest to the point, (n_samples, n_params) both ways."""
-        images, far = self._reordered_copies(z)
+        images, far = self._reordered_with_distances(z)
         return np.asarray(images[np.argmin(far, axis=0), np.arange(len(z))])
 
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
@@ -69,16 +69,16 @@ class FoldedNormal(StandardNormal):
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the log density summed over all orders, (n_samples,); -inf if another order is nearer."""
-        images, far = self._reordered_copies(theta)
+        images, far = self._reordered_with_distances(theta)
         density = logsumexp([super(FoldedNormal, self).log_prob(image) for image in images], axis=0)
         return np.where(far[0] <= far[1:].min(axis=0), density, -np.inf)
 
 
 @dataclass(frozen=True, eq=False)
-class Folded:
+class FoldedProblem:
     """A problem with the folded prior; predictions do not depend on the order of the Gaussians."""
 
-    problem: JointProblem
+    problem: HypothesisProblem
     prior: FoldedNormal
 
     def log_likelihood(self, theta: FloatArray) -> FloatArray:
@@ -86,7 +86,7 @@ class Folded:
         return self.problem.log_likelihood(theta)
 
 
-def folded(problem: JointProblem, near: FloatArray) -> JointProblem | Folded:
+def fold_problem(problem: HypothesisProblem, near: FloatArray) -> HypothesisProblem | FoldedProblem:
     """Fold a problem onto the order of its Gaussians that is nearest to a point, such as its best fit.
 
     Parameters
@@ -101,6 +101,6 @@ def folded(problem: JointProblem, near: FloatArray) -> JointProblem | Folded:
     A problem with the same evidence; the problem itself if its sensor has no exchangeable Gaussians.
     """
     sensor = problem.model.sensor
-    if not (isinstance(sensor, SensorCoordinates) and sensor.exchangeable and sensor.n_gaussians > 1):
+    if not (isinstance(sensor, GaussianMixtureSensor) and sensor.exchangeable and sensor.n_gaussians > 1):
         return problem
-    return Folded(problem, FoldedNormal(problem.model.n_params, sensor, near))
+    return FoldedProblem(problem, FoldedNormal(problem.model.n_params, sensor, near))

@@ -26,7 +26,7 @@ _BLOCKS = 5
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOutGain:
     """Gain of a model over the null on held-out readings, nats per reading, and the sd of that mean."""
 
     per_reading: float
@@ -35,7 +35,7 @@ class HeldOut:
     by_scan: tuple[tuple[str, float], ...]
 
 
-def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts) -> HeldOut:
+def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw, held_out: Parts) -> HeldOutGain:
     """Refit both models without one part at a time and compare their predictions of it, reading by reading.
 
     Each reading is predicted by itself under the noise model. If the part has parameters of its own, which other parts
@@ -45,17 +45,17 @@ def held_out_gain(null: Fit, repaired: Fit, recording: Recording, law: NoiseLaw,
     plan, usable = recording.plan, recording.usable
     parts, names = held_out
 
-    def gain(out: BoolArray) -> FloatArray:
+    def gain_per_reading(out: BoolArray) -> FloatArray:
         rows = np.zeros(len(plan), dtype=np.bool_)
         rows[np.flatnonzero(usable)[out]] = True
-        repaired_one, null_one = (_log_density(f, recording, rows, law, out) for f in (repaired, null))
+        repaired_one, null_one = (_refit_log_densities(f, recording, rows, law, out) for f in (repaired, null))
         return repaired_one - null_one
 
-    return gain_by_part(parts, gain, names)
+    return hold_out_each_part(parts, gain_per_reading, names)
 
 
-def held_out_blocks(recording: Recording) -> Parts:
-    """Divide usable readings into successive blocks of eight; every fifth block is held out together.
+def partition_into_blocks(recording: Recording) -> Parts:
+    """Partition usable readings into five parts: every fifth block of eight successive readings.
 
     An effect local in time cannot be predicted for another scan, but it can between known readings; a block is long
     enough that its middle is not adjacent to them.
@@ -64,21 +64,27 @@ def held_out_blocks(recording: Recording) -> Parts:
     return block % _BLOCKS, tuple(f"every fifth block of {LEAST_ROWS}, from {k + 1}" for k in range(_BLOCKS))
 
 
-def gain_by_part(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()) -> HeldOut:
-    """Hold out one part at a time and collect the gains of its readings.
+def hold_out_each_part(
+    scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_names: Sequence[str] = ()
+) -> HeldOutGain:
+    """Hold out one part at a time, at most ten, and average the gains of their readings.
 
     Parameters
     ----------
     scan
-        Scan of each usable reading, (n_usable,).
+        Number of the part of each usable reading, such as its scan, (n_usable,).
     gain
         Function of a mask of held-out readings (n_usable,); returns the gain of each of them, in nats.
     scan_names
-        Names of the scans; without, their numbers.
+        Names of the parts; without, their numbers.
+
+    Returns
+    -------
+    The gain; no readings and gain 0 if fewer than two parts are long enough.
     """
     long_enough = [int(k) for k in np.unique(scan) if np.sum(scan == k) >= LEAST_ROWS]
     if len(long_enough) < 2:
-        return HeldOut(0.0, 0.0, 0, ())
+        return HeldOutGain(0.0, 0.0, 0, ())
     if len(long_enough) > MOST_PARTS:
         long_enough = [long_enough[int(i)] for i in np.linspace(0, len(long_enough) - 1, MOST_PARTS).round()]
     gains = [gain(np.asarray(scan == k)) for k in long_enough]
@@ -87,10 +93,12 @@ def gain_by_part(scan: IntArray, gain: Callable[[BoolArray], FloatArray], scan_n
     )
     joined = np.concatenate(gains)
     sd = float(joined.std(ddof=1)) / math.sqrt(len(joined))
-    return HeldOut(float(joined.mean()), sd, len(joined), by_scan)
+    return HeldOutGain(float(joined.mean()), sd, len(joined), by_scan)
 
 
-def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray) -> FloatArray:
+def _refit_log_densities(
+    found: Fit, recording: Recording, rows: BoolArray, law: NoiseLaw, out: BoolArray
+) -> FloatArray:
     """Return the log predictive density of each held-out reading, from a refit to the others.
 
     `rows` (n_points,) and `out` (n_usable,) are the same readings. The contribution of lost readings, the same for
@@ -105,7 +113,7 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
     # Parameters of the part alone are linearised about the fit to all readings: their prior may be wide, and the other
     # readings may bound them on one side only, as for a ceiling.
     about = np.where(of_its_own, found.z, without.z)
-    predicted, slopes = (part[asked] for part in found.model.jacobian(about))
+    predicted, slopes = (part[asked] for part in found.model.predict_and_differentiate(about))
     free = residual_degrees_of_freedom(turned, without.sd / math.sqrt(rest.information))
     sigma_2 = without.sd**2 * (1.0 if rest.flat else rest.n_points / free)  # beside rounding it is known
     curvature = turned.T @ turned * rest.information / sigma_2 + np.eye(slopes.shape[1])
@@ -116,8 +124,8 @@ def _log_density(found: Fit, recording: Recording, rows: BoolArray, law: NoiseLa
         )
     spread = np.sum(slopes * np.linalg.solve(curvature, slopes.T).T, axis=1)
     narrow, wide = (
-        _log_normal(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
-        for times, share in ((law.widening, 1 - law.share), (law.times, law.share))
+        _log_normal_density(miss, sigma_2 * (times * own.sd) ** 2 + spread) + math.log(max(share, 1e-300))
+        for times, share in ((law.sd_factor_of_rounding, 1 - law.share), (law.times, law.share))
     )
     return np.asarray(np.logaddexp(narrow, wide) * own.kept)
 
@@ -132,14 +140,14 @@ def _sequential_log_densities(
     """
     innovations, turned = law(miss), law(slopes)
     mean, covariance, out = mean.copy(), covariance.copy(), np.zeros(len(miss))
-    noise_2 = sigma_2 * (law.widening**2 if law.flat else 1.0)
+    noise_2 = sigma_2 * (law.sd_factor_of_rounding**2 if law.flat else 1.0)
     for k in np.flatnonzero(law.kept):
         row = turned[k]
         gain = covariance @ row
         left, spread = innovations[k] - row @ mean, max(float(row @ gain), 0.0)
         parts = np.array([noise_2 + spread, noise_2 * law.times**2 + spread])
         shares = np.array([1 - law.share, law.share])
-        density = _log_normal(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
+        density = _log_normal_density(np.full(2, left), parts) + np.log(np.maximum(shares, 1e-300))
         out[k] = np.logaddexp(*density)
         variance = float(np.exp(density - out[k]) @ parts)  # the most probable noise variance of this reading
         mean += gain * left / variance
@@ -147,5 +155,5 @@ def _sequential_log_densities(
     return out
 
 
-def _log_normal(miss: FloatArray, variance: FloatArray) -> FloatArray:
+def _log_normal_density(miss: FloatArray, variance: FloatArray) -> FloatArray:
     return np.asarray(-0.5 * np.log(2 * np.pi * variance) - 0.5 * miss**2 / variance)

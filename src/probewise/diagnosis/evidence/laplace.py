@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.fitting.fit import Fit, residual_degrees_of_freedom
 from probewise.diagnosis.fitting.null import log_multiplicity
-from probewise.diagnosis.noise.law import NoiseLaw, forms
+from probewise.diagnosis.noise.law import NoiseLaw, stacked_density
 from probewise.diagnosis.noise.models import NoiseModel, NoiseNodes
 
 SCALES = np.geomspace(0.05, 25.0, 8)
@@ -45,9 +45,12 @@ class NoiseEvidence:
         """Posterior weight of each node."""
         return np.exp(self.log_z_nodes - logsumexp(self.log_z_nodes))
 
-    def likely_nodes(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """Return up to four nodes of one effect with the largest weight, (n_nodes, n_params), and their log weights."""
-        own = self.nodes.settings[:, self.noise.columns_of(name)]
+    def likeliest_nodes_of_effect(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Return the (up to) four likeliest nodes of one effect, (n_nodes, n_params), and their log prior weights.
+
+        These are raised by a constant, so that the evidence of the returned nodes alone is that of all.
+        """
+        own = self.nodes.settings[:, self.noise.column_slice(name)]
         settings, node_of = np.unique(own, axis=0, return_inverse=True)
         node_of = node_of.ravel()
         weights = np.bincount(node_of, self.weights)
@@ -57,37 +60,37 @@ class NoiseEvidence:
         return settings[best], log_prior[best] - math.log(float(weights[best].sum()))
 
     @property
-    def law(self) -> NoiseLaw:
-        """Noise model at the most probable node."""
+    def likeliest_law(self) -> NoiseLaw:
+        """Noise distribution at the most probable node."""
         return self.nodes.laws[int(np.argmax(self.log_z_nodes))]
 
     @property
-    def at_best(self) -> NoiseEvidence:
-        """Return the evidence restricted to the most probable node."""
+    def at_likeliest_node(self) -> NoiseEvidence:
+        """The evidence with the most probable node alone; `log_z` remains that of all nodes."""
         at = [int(np.argmax(self.log_z_nodes))]
-        own = NoiseNodes(self.nodes.settings[at], (self.law,), self.nodes.log_weights[at])
+        own = NoiseNodes(self.nodes.settings[at], (self.likeliest_law,), self.nodes.log_weights[at])
         return NoiseEvidence(self.noise, self.log_z, self.log_z_nodes[at], own)
 
 
-def weigh(found: Fit, noise: NoiseModel) -> NoiseEvidence:
+def laplace_evidence(found: Fit, noise: NoiseModel) -> NoiseEvidence:
     """Integrate a fit's likelihood over its parameters and the noise sd (Laplace) and the nodes of the noise model.
 
     At each node the linearised model moves the fit to its new optimum, which avoids the bias of residuals fitted as if
     white. If the floor of the sd exceeds the residuals, the integral over the sd is given its usual width.
     """
-    every = noise.laws(found.predicted)
+    every = noise.nodes_for_predictions(found.predicted)
     joined = np.concatenate([found.slopes, found.residuals[:, None]], axis=1)
     out = np.empty(len(every.laws))
-    normal = [node for node, law in enumerate(every.laws) if law.density.is_normal]
+    normal = [node for node, law in enumerate(every.laws) if law.whitened_density.is_normal]
     chunk = max(_MOST_NUMBERS // joined.size, 1)
     for nodes in (normal[at : at + chunk] for at in range(0, len(normal), chunk)):
-        out[nodes] = _of_normal_laws(found, [every.laws[node] for node in nodes], joined)
+        out[nodes] = _normal_log_evidences(found, [every.laws[node] for node in nodes], joined)
     tailed: dict[tuple[tuple[bytes, ...], bool], list[int]] = {}  # grouped by whitening, rounded noise separately
     for node in sorted({*range(len(out))} - {*normal}):
         law = every.laws[node]
-        tailed.setdefault((law.linear, law.flat > 0), []).append(node)
+        tailed.setdefault((law.whitening_key, law.flat > 0), []).append(node)
     for nodes in tailed.values():
-        out[nodes] = _of_tails(found, [every.laws[node] for node in nodes], joined)
+        out[nodes] = _tailed_log_evidences(found, [every.laws[node] for node in nodes], joined)
     out += [law.log_extra for law in every.laws]
     out += every.log_weights + log_multiplicity(found.model.sensor)
     return NoiseEvidence(noise, float(logsumexp(out)) if out.size else -math.inf, out, every)
@@ -102,7 +105,7 @@ def covariance_root(slopes: FloatArray, variance: float) -> FloatArray:
     return np.asarray(np.linalg.inv(np.linalg.cholesky(curvature)).T)
 
 
-def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
+def _normal_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under Gaussian noise models, (n_laws,); `joined`: slopes and residual."""
     p, n_points = joined.shape[1] - 1, np.array([law.n_points for law in laws])
     if any(law.walk.size for law in laws):
@@ -114,42 +117,42 @@ def _of_normal_laws(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) ->
         turned[:, 1:] = (turned[:, 1:] - carry * turned[:, :-1]) / np.sqrt(1 - carry**2)
     gram = turned.transpose(0, 2, 1) @ turned
     jj, jr, rr = gram[:, :p, :p], gram[:, :p, p], gram[:, p, p]
-    steps, least = np.zeros_like(jr), np.array([law.floor**2 for law in laws])
+    steps, least = np.zeros_like(jr), np.array([law.sigma_floor**2 for law in laws])
 
-    def squares() -> FloatArray:
+    def sums_of_squares() -> FloatArray:
         rss = rr - 2 * np.sum(steps * jr, axis=1) + np.einsum("lp,lpq,lq->l", steps, jj, steps)
         return np.asarray(np.maximum(rss, 0.0))
 
     for _ in range(3):
-        variance = np.maximum(squares() / n_points, least)
+        variance = np.maximum(sums_of_squares() / n_points, least)
         curvature = jj / variance[:, None, None] + np.eye(p)
         steps = _newton_steps(curvature, jr / variance[:, None] - found.z)
-    fit_and_prior = _laplace_terms(found.z + steps, curvature, n_points) - [law.log_det() for law in laws]
-    rss = squares()
+    fit_and_prior = _laplace_terms(found.z + steps, curvature, n_points) - [law.half_log_det() for law in laws]
+    rss = sums_of_squares()
     variance = np.maximum(rss / n_points, least)
     misfit = 0.5 * n_points * np.log(variance) + 0.5 * rss / variance
     return np.asarray(fit_and_prior - misfit + 0.5 * np.log(math.pi / n_points))
 
 
-def _of_tails(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
+def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArray) -> FloatArray:
     """Return the log evidence under noise models of one whitening with different tails or rounding, (n_laws,)."""
     turned = laws[0](joined)
     p, n_points = turned.shape[1] - 1, laws[0].n_points
     slopes, residual = turned[:, :p], turned[:, p:]
     gram = slopes.T @ slopes
-    tail, least = forms(laws), laws[0].floor
-    steps, sigma = np.zeros((p, len(laws))), tail.scale(residual, n_points, floor=least)
+    tail, least = stacked_density(laws), laws[0].sigma_floor
+    steps, sigma = np.zeros((p, len(laws))), tail.likeliest_sigma(residual, n_points, floor=least)
     for _ in range(3):
         left = residual - slopes @ steps
-        sigma = tail.scale(left, n_points, floor=least, start=sigma)
+        sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
         variance = sigma**2 / tail.information
         curvature = gram / variance[:, None, None] + np.eye(p)
-        downhill = slopes.T @ tail.as_normal(left, sigma) / variance - found.z[:, None] - steps
+        downhill = slopes.T @ tail.normal_pseudo_observations(left, sigma) / variance - found.z[:, None] - steps
         steps += _newton_steps(curvature, downhill.T).T
     left = residual - slopes @ steps
-    sigma = tail.scale(left, n_points, floor=least, start=sigma)
-    fit_and_prior = _laplace_terms((found.z[:, None] + steps).T, curvature, n_points) - laws[0].log_det()
-    scale = 0.5 * np.log(2 * math.pi / tail.scale_curvature(left, sigma, n_points))
+    sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
+    fit_and_prior = _laplace_terms((found.z[:, None] + steps).T, curvature, n_points) - laws[0].half_log_det()
+    scale = 0.5 * np.log(2 * math.pi / tail.log_sigma_curvature(left, sigma, n_points))
     return np.asarray(fit_and_prior - tail.minus_log_likelihood(left, sigma, n_points) + scale)
 
 
@@ -174,7 +177,7 @@ class Linearised:
     """A fit linearised to a Gaussian problem with its parameters, including their prior, projected out.
 
     Rows are the whitened readings in units of the noise sd, then one row for each parameter's prior.
-    Under the null every row is standard normal, so r* = P eps needs no refit.
+    Under the null every row is standard normal, so that residuals are drawn by projection alone, without refits.
     """
 
     basis: FloatArray  # Q of the augmented slopes, (n_rows, n_params)
@@ -191,14 +194,14 @@ class Linearised:
             slopes, z = np.concatenate([slopes, beside], axis=1), np.concatenate([z, np.zeros(beside.shape[1])])
         n_points, p = slopes.shape
         whitened = law(found.residuals)[:, None]
-        turned, sigma = law(slopes), law.scale(whitened)
-        known = bool(law.flat) or (law.least > 0 and float(sigma[0]) <= law.floor)
+        turned, sigma = law(slopes), law.likeliest_sigma(whitened)
+        known = bool(law.flat) or (law.least > 0 and float(sigma[0]) <= law.sigma_floor)
         sigma = np.where(sigma > 0, sigma, found.sd)
         free = residual_degrees_of_freedom(turned, float(sigma[0]) / math.sqrt(law.information))
         sigma = sigma if known else sigma * math.sqrt(n_points / free)
         sd = float(sigma[0]) / math.sqrt(law.information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
-        augmented = np.concatenate([law.pseudo_observations(whitened, sigma)[:, 0] / sd, -z])
+        augmented = np.concatenate([law.bounded_pseudo_observations(whitened, sigma)[:, 0] / sd, -z])
         residual = augmented - basis @ (basis.T @ augmented)
         if known:
             # Rounded readings carry less information, which must not make the noise sd smaller.
@@ -213,32 +216,35 @@ class Linearised:
 
     def project(self, columns: FloatArray) -> FloatArray:
         """Whiten columns of readings (n_points, k) and project the fit's parameters out: (n_rows, k)."""
-        return self.without_fit(self.law(columns) / self.sd)
+        return self.project_whitened(self.law(columns) / self.sd)
 
-    def without_fit(self, whitened: FloatArray) -> FloatArray:
+    def project_whitened(self, whitened: FloatArray) -> FloatArray:
         """Project the fit's parameters out of columns in units of the noise sd: (n_points, k) -> (n_rows, k)."""
         out = -self.basis @ (self.basis[: self.n_points].T @ whitened)
         out[: self.n_points] += whitened
         return out
 
-    def absorbed(self, found: Fit, change: FloatArray) -> FloatArray:
-        """Return the shift of the fit's coordinates that absorbs a change of the readings (n_points,): (n_params,)."""
+    def absorbing_shift(self, found: Fit, change: FloatArray) -> FloatArray:
+        """Return the shift of a fit's coordinates, (n_params,), that absorbs a change of predictions (n_points,)."""
         slopes = self.law(found.slopes) / self.sd
         left = self.law(found.residuals - change)[:, None]
-        normal = self.law.as_normal(left, np.array([self.sd * math.sqrt(self.law.information)]))[:, 0]
+        normal = self.law.normal_pseudo_observations(left, np.array([self.sd * math.sqrt(self.law.information)]))[:, 0]
         shift = slopes.T @ (normal / self.sd) - found.z
         return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
 
-    def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw residuals under the null, shape (n_rows, n_draws)."""
+    def draw_null_residuals(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw projected residuals under the null, in noise sds, (n_rows, n_draws)."""
         eps = np.concatenate(
-            [self.law.draws(n_draws, rng=rng), rng.standard_normal((self.n_rows - self.n_points, n_draws))]
+            [
+                self.law.draw_pseudo_observations(n_draws, rng=rng),
+                rng.standard_normal((self.n_rows - self.n_points, n_draws)),
+            ]
         )
         return np.asarray(eps - self.basis @ (self.basis.T @ eps))
 
 
 @dataclass(frozen=True, eq=False)
-class Blocks:
+class OrthonormalBlocks:
     """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, with squared lengths `gain`.
 
     `gain` (n_columns,) is the squared length of the projection of a template of unit rms (times n_points); `starts`
@@ -252,35 +258,35 @@ class Blocks:
     share: FloatArray  # surviving share of each block's norm, (n_blocks,)
 
     @classmethod
-    def of(cls, problem: Linearised, templates: Sequence[FloatArray], labels: Sequence[str]) -> Blocks:
+    def of(cls, problem: Linearised, templates: Sequence[FloatArray], labels: Sequence[str]) -> OrthonormalBlocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
-        return cls.of_projected(project_scaled(problem, templates), [t.shape[1] for t in templates], labels, problem)
+        return cls.of_projected(scale_and_project(problem, templates), [t.shape[1] for t in templates], labels, problem)
 
     @classmethod
     def of_projected(
         cls, projected: FloatArray, widths: Sequence[int], labels: Sequence[str], problem: Linearised
-    ) -> Blocks:
-        """Orthonormalise each of the concatenated templates from `project_scaled`, (n_rows, n_columns)."""
+    ) -> OrthonormalBlocks:
+        """Orthonormalise each of the concatenated templates from `scale_and_project`, (n_rows, n_columns)."""
         starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
         u, gain = np.empty_like(projected), np.empty(projected.shape[1])
         for width in set(widths):  # all templates of one width at a time
             columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
-            u[:, columns], gain[columns] = orthonormal(projected[:, columns], width)
+            u[:, columns], gain[columns] = orthonormalise_groups(projected[:, columns], width)
         shares = np.sqrt(np.add.reduceat(gain, starts) / problem.n_points)
         return cls(u, gain, starts, tuple(labels), shares)
 
 
-def project_scaled(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
+def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:
     """Whiten templates (n_points, k), scale to unit rms, project the fit out; concatenated, (n_rows, n_columns)."""
     widths = [t.shape[1] for t in templates]
     whitened = problem.law(np.concatenate(templates, axis=1))
     per_column = np.repeat(widths, widths)
     norms = np.sqrt(np.einsum("ij,ij->j", whitened, whitened))
     whitened *= np.sqrt(problem.n_points / per_column) / np.where(norms > 0, norms, 1.0)
-    return problem.without_fit(whitened)
+    return problem.project_whitened(whitened)
 
 
-def orthonormal(
+def orthonormalise_groups(
     columns: FloatArray, width: int, *, least: float = 1e-12, share: float = 0.0
 ) -> tuple[FloatArray, FloatArray]:
     """Orthonormalise groups of `width` adjacent columns: (n_rows, n_columns) and squared lengths (n_columns,).
@@ -296,7 +302,7 @@ def orthonormal(
     return u.reshape(columns.shape), np.maximum(squares, 0.0).ravel()
 
 
-def block_log_bayes_factors(blocks: Blocks, residuals: FloatArray, n_points: int) -> FloatArray:
+def block_log_bayes_factors(blocks: OrthonormalBlocks, residuals: FloatArray, n_points: int) -> FloatArray:
     """Return the log Bayes factor of each block against the null, with amplitude and noise sd integrated out.
 
     The prior of the amplitude of a unit-rms template is normal with sd kappa times the noise sd, with kappa mixed over

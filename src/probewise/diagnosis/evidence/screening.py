@@ -10,24 +10,29 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.laplace import Blocks, Linearised, block_log_bayes_factors, project_scaled
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.laplace import (
+    Linearised,
+    OrthonormalBlocks,
+    block_log_bayes_factors,
+    scale_and_project,
+)
 from probewise.diagnosis.evidence.templates import EffectTemplates
 from probewise.diagnosis.names import Names
 
 _BEST_ENTRIES = 2  # best entries of each effect's bank, for pairs
 
 
-def log_mean(scores: FloatArray) -> float:
-    """Return the log of the mean of Bayes factors given as logs."""
+def log_mean_exp(scores: FloatArray) -> float:
+    """Return the log of the mean of Bayes factors that are given as logs."""
     top = float(scores.max())  # thousands of short lists: scipy's general function is ten times slower
     return top + math.log(float(np.exp(scores - top).mean())) if math.isfinite(top) else top
 
 
-def score_effects(problem: Linearised, bank: Bank) -> dict[str, FloatArray]:
+def score_bank_entries(problem: Linearised, bank: TemplateBank) -> dict[str, FloatArray]:
     """Return the log Bayes factors of the entries of each effect's bank, by name, (n_entries,)."""
     scores = bank.log_bayes_factors(problem)[:, 0]
-    return {name: scores[members] for name, members in bank.members.items()}
+    return {name: scores[members] for name, members in bank.indices_by_label.items()}
 
 
 def score_pairs(
@@ -42,14 +47,16 @@ def score_pairs(
     columns = [templates[name].columns[i] for name, i in entries]
     widths = [c.shape[1] for c in columns]
     # In a basis of their joint span, with one more axis for the rest of the residual.
-    axes, turned = np.linalg.qr(project_scaled(problem, columns))
+    axes, turned = np.linalg.qr(scale_and_project(problem, columns))
     along = axes.T @ problem.residual
     rest = math.sqrt(max(float(problem.residual @ problem.residual - along @ along), 0.0))
     turned = np.concatenate([turned, np.zeros((1, turned.shape[1]))])
     own = dict(zip(entries, np.split(turned, np.cumsum(widths)[:-1], axis=1), strict=True))
     asked = [((a, int(i)), (b, int(j))) for a, b in pairs for i in best[a] for j in best[b]]
     both = [_joined_templates(own[first], own[second]) for first, second in asked]
-    blocks = Blocks.of_projected(np.concatenate(both, axis=1), [c.shape[1] for c in both], [""] * len(both), problem)
+    blocks = OrthonormalBlocks.of_projected(
+        np.concatenate(both, axis=1), [c.shape[1] for c in both], [""] * len(both), problem
+    )
     together = block_log_bayes_factors(blocks, np.append(along, rest)[:, None], problem.n_points)[:, 0]
     apart = np.array([singles[a][i] + singles[b][j] for (a, i), (b, j) in asked])
     out: dict[Names, float] = {}
@@ -58,7 +65,7 @@ def score_pairs(
         block = slice(at, at + len(best[a]) * len(best[b]))
         at = block.stop
         gained = float(logsumexp(together[block]) - logsumexp(apart[block]))
-        out[a, b] = log_mean(singles[a]) + log_mean(singles[b]) + gained
+        out[a, b] = log_mean_exp(singles[a]) + log_mean_exp(singles[b]) + gained
     return out
 
 

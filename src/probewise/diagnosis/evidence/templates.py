@@ -1,6 +1,7 @@
 """Templates of the effects that could be added to a fit.
 
-A template is a set of columns (n_usable, k), the change of the readings per unit amplitude.
+A template is a set of columns (n_usable, k), changes of the readings at given settings of an effect, which span its
+change to first order; its nonlinear parameters are fixed.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.fitting.coordinates import effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.effects import NamedEffect, scan_indicator
@@ -33,34 +34,38 @@ class EffectTemplates:
     variants: tuple[NamedEffect[Any], ...]
     choice: IntArray  # number of each entry's variant, (n_entries,)
 
-    def variant(self, at: int) -> NamedEffect[Any]:
+    def variant_of_entry(self, at: int) -> NamedEffect[Any]:
         """Return the variant of one entry."""
         variant: NamedEffect[Any] = self.variants[self.choice[at]]
         return variant
 
-    def weights(self, scores: FloatArray) -> FloatArray:
+    def variant_probabilities(self, scores: FloatArray) -> FloatArray:
         """Return the posterior probability of each variant, (n_variants,), from the entries' log Bayes factors."""
         shares = np.bincount(self.choice, np.exp(scores - scores.max()), len(self.variants))
         return np.asarray(shares / shares.sum())
 
 
 @dataclass(eq=False)
-class TemplateMemory:
+class TemplateCache:
     """Cache of the templates of effects about fits."""
 
     usable: IntArray
     known: dict[tuple[Fit, NamedEffect[Any]], EffectTemplates] = field(default_factory=dict)
-    banks: dict[tuple[Fit, tuple[str, ...]], Bank] = field(default_factory=dict)
+    banks: dict[tuple[Fit, tuple[str, ...]], TemplateBank] = field(default_factory=dict)
 
-    def bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> Bank:
+    def coarse_bank(self, found: Fit, effects: Sequence[NamedEffect[Any]]) -> TemplateBank:
         """Return the bank of coarse templates of several effects about one fit, labelled by name."""
         key = found, tuple(effect.name for effect in effects)
         if key not in self.banks:
-            own = [(effect.name, t) for effect in effects for t in self.of(found, effect.with_fewer_variants()).columns]
-            self.banks[key] = Bank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
+            own = [
+                (effect.name, t)
+                for effect in effects
+                for t in self.templates_of(found, effect.with_fewer_variants()).columns
+            ]
+            self.banks[key] = TemplateBank.of([t for _, t in own], [name for name, _ in own], len(found.residuals))
         return self.banks[key]
 
-    def of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
+    def templates_of(self, found: Fit, effect: NamedEffect[Any]) -> EffectTemplates:
         """Return the templates of one effect about one fit."""
         key = found, effect
         if key not in self.known:
@@ -71,7 +76,7 @@ class TemplateMemory:
 def effect_templates(
     found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
 ) -> EffectTemplates:
-    """Subtract predictions without the effect from those with each variant, for `most` evenly spread entries."""
+    """Predict the change of the readings by each bank entry of all variants, or by `most` evenly spread entries."""
     variants = effect.variants()
     banks = [variant.bank() for variant in variants]
     choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
@@ -99,18 +104,18 @@ def _scans_and_patterns_of(variant: NamedEffect[Any]) -> tuple[object, object]:
 
 
 def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
-    """Predict the settings of a bank, in the scans that the effect is bound to: each (n_usable, n_columns)."""
+    """Return the change of readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans."""
     plain, plan = found.model, found.model.plan
     model = plain.with_effect(effect)
     n_rows = bank.shape[0] * bank.shape[1]
-    own = {e.name: effect_values(e, found.z[None, plain.coordinates_of(e.name)]) for e in plain.effects}
+    own = {e.name: effect_values(e, found.z[None, plain.coordinate_slice(e.name)]) for e in plain.effects}
     sensor = plain.sensor.theta(found.z[None, : plain.sensor.n_params])
     before = np.zeros(len(plan))
     before[usable] = found.predicted
     inside = np.flatnonzero(scan_indicator(plan, effect.scans)) if effect.scans else slice(None)
     there = plan.take(inside) if isinstance(inside, np.ndarray) else plan
     # Effects after the light integral reuse it.
-    seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.theta_of(sensor, own), there)
+    seen = None if effect.stage < Stage.SEEN else plain.chain.simulated_view(plain.joined_theta(sensor, own), there)
     change = np.zeros((n_rows, len(plan)))
     step = max(_AT_ONCE // len(there), 1)
     for first in range(0, n_rows, step):
@@ -118,7 +123,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
         n = rows.stop - first
         each = {name: np.repeat(values, n, axis=0) for name, values in own.items()}
         each[effect.name] = bank.reshape(n_rows, -1)[rows]
-        theta = model.theta_of(np.repeat(sensor, n, axis=0), each)
+        theta = model.joined_theta(np.repeat(sensor, n, axis=0), each)
         read = model.chain.predict(theta, there) if seen is None else model.chain.readings_of_view(seen, theta, there)
         change[rows, inside] = read - before[inside]
     columns = change[:, usable].T
@@ -127,7 +132,7 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
     return np.split(columns, len(bank), axis=1)
 
 
-def combinations_of(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
+def combinations_up_to(names: Sequence[str], most: int) -> Iterator[tuple[str, ...]]:
     """List every combination of up to `most` names, each sorted, the empty one first."""
     for size in range(most + 1):
         yield from itertools.combinations(sorted(names), size)

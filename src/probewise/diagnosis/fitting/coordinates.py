@@ -59,8 +59,8 @@ class CalibratedSensor(ABC):
 
     @property
     @abstractmethod
-    def degrees_of_freedom(self) -> int:
-        """Effective degrees of freedom of its SSF, counted in Gaussians."""
+    def effective_n_gaussians(self) -> int:
+        """Number of Gaussians that its SSF counts as, the measure of its complexity."""
 
     @property
     @abstractmethod
@@ -68,12 +68,12 @@ class CalibratedSensor(ABC):
         """Description of its SSF."""
 
     @property
-    def in_bulk(self) -> bool:
+    def predicts_in_bulk(self) -> bool:
         """False: every sample costs as much as the first."""
         return False
 
     @property
-    def known_nearby(self) -> bool:
+    def predicts_cheaply_nearby(self) -> bool:
         """False: a prediction costs as much near another one."""
         return False
 
@@ -92,11 +92,11 @@ class CalibratedSensor(ABC):
 
     @property
     def starts(self) -> FloatArray:
-        """Start from the centre, (1, n_params)."""
+        """One starting point: the centre of the prior, (1, n_params)."""
         return np.zeros((1, self.n_params))
 
     @property
-    def nuisance(self) -> tuple[str, ...]:
+    def nuisance_names(self) -> tuple[str, ...]:
         """Empty: all its parameters belong to the sensor."""
         return ()
 
@@ -111,26 +111,28 @@ class CalibratedSensor(ABC):
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to a_1 .. C_N, I_min, I_max."""
-        return self.from_natural(self._natural_parameters(z))
+        return self.from_natural(self._natural_from_z(z))
 
     def z(self, theta: FloatArray) -> FloatArray:
         """Invert `theta`."""
-        return self._z_of_natural(self.to_natural(theta))
+        return self._z_from_natural(self.to_natural(theta))
 
-    def _natural_parameters(self, z: FloatArray) -> FloatArray:
+    def _natural_from_z(self, z: FloatArray) -> FloatArray:
         return self.center + z @ self.factor.T
 
-    def _z_of_natural(self, natural: FloatArray) -> FloatArray:
-        """Return coordinates z of natural parameters, (n_samples, n_params): the inverse of `_natural_parameters`."""
+    def _z_from_natural(self, natural: FloatArray) -> FloatArray:
+        """Return coordinates z of natural parameters, (n_samples, n_params): the inverse of `_natural_from_z`."""
         return np.asarray(np.linalg.solve(self.factor, (natural - self.center).T).T)
 
     def chain(self, plan: Plan, effects: Sequence[NamedEffect[Any]], *, n_nodes: int) -> Chain:
         """Build the chain over the plan's patterns."""
-        return Chain(FreeMixture(self.n_gaussians), FreeLevels(), known_scene(plan), tuple(effects), n_nodes=n_nodes)
+        return Chain(
+            FreeMixture(self.n_gaussians), FreeLevels(), cached_known_scene(plan), tuple(effects), n_nodes=n_nodes
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class SensorCoordinates(CalibratedSensor):
+class GaussianMixtureSensor(CalibratedSensor):
     """A sensor whose SSF is a mixture: 6 n_gaussians + 1 coordinates, one less than the paper's parameters.
 
     Only ratios of amplitudes matter. The evidence counts the permutations of `exchangeable` Gaussians.
@@ -147,7 +149,7 @@ class SensorCoordinates(CalibratedSensor):
         return 6 * self.n_gaussians + 1
 
     @property
-    def degrees_of_freedom(self) -> int:
+    def effective_n_gaussians(self) -> int:
         """Its number of Gaussians."""
         return self.n_gaussians
 
@@ -166,16 +168,16 @@ class SensorCoordinates(CalibratedSensor):
 
     def permuted(self, z: FloatArray, order: Sequence[int]) -> FloatArray:
         """Return the coordinates, (n_samples, n_params), of the same SSF with its Gaussians permuted."""
-        n, natural = self.n_gaussians, self._natural_parameters(z)
+        n, natural = self.n_gaussians, self._natural_from_z(z)
         logits = np.pad(natural[:, : n - 1], ((0, 0), (1, 0)))[:, list(order)]
         blocks = natural[:, n - 1 : -2].reshape(len(z), n, 5)[:, list(order)]
         parts = [logits[:, 1:] - logits[:, :1], blocks.reshape(len(z), 5 * n), natural[:, -2:]]
-        return self._z_of_natural(np.concatenate(parts, axis=1))
+        return self._z_from_natural(np.concatenate(parts, axis=1))
 
 
 @lru_cache(maxsize=32)
-def known_scene(plan: Plan) -> KnownScene:
-    """Build a plan's scene, cached for all models."""
+def cached_known_scene(plan: Plan) -> KnownScene:
+    """Build the scene of a plan's patterns, cached for all models."""
     return KnownScene(plan.patterns)
 
 
@@ -210,14 +212,14 @@ def theta_to_natural(theta: FloatArray, n_gaussians: int) -> FloatArray:
     return np.concatenate([logits, parts.reshape(len(theta), 5 * n_gaussians), theta[:, -2:]], axis=1)
 
 
-def default_sensor(extent: Extent, n_gaussians: int) -> SensorCoordinates:
-    """Return the default prior: a footprint of about a fourteenth of the longest scan, within a factor of two."""
+def default_sensor(extent: Extent, n_gaussians: int) -> GaussianMixtureSensor:
+    """Return a sensor with the default prior: a footprint of a fourteenth of the longest scan, to a factor of two."""
     length = extent.length_mm
     one_center = [0.0, 0.0, math.log(length / 14), math.log(length / 14), 0.0]
     one_sd = [length / 10, length / 10, 0.8, 0.8, 0.7]
     center = np.array([0.0] * (n_gaussians - 1) + one_center * n_gaussians + [extent.low, extent.high])
     sd = np.array([1.5] * (n_gaussians - 1) + one_sd * n_gaussians + [extent.span / 2] * 2)
-    return SensorCoordinates(n_gaussians, center, np.diag(sd))
+    return GaussianMixtureSensor(n_gaussians, center, np.diag(sd))
 
 
 def effect_values(effect: NamedEffect[Any], z: FloatArray) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.fitting.coordinates import FARTHEST, SensorCoordinates, effect_coordinates, effect_values
+from probewise.diagnosis.fitting.coordinates import FARTHEST, GaussianMixtureSensor, effect_coordinates, effect_values
 from probewise.diagnosis.fitting.null import Null, Predictor
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.effects import NamedEffect
@@ -25,7 +25,7 @@ _AS_EXPECTED = 0.5  # of the gain to second order, from which a step without dam
 _DAMPINGS = np.array([0.0, 0.05, 0.7, 10.0, 200.0])
 
 
-def _points_about(z: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _difference_points_and_steps(z: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return z (n_params,) and points one step along each coordinate, (n_params + 1, n_params), and the steps."""
     # Steps point inwards, to stay within the bounds.
     steps = np.where(z > 0, -_STEP, _STEP)
@@ -40,7 +40,7 @@ def _value_and_slopes(batch: FloatArray, steps: FloatArray) -> tuple[FloatArray,
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """A chain with its effects, in coordinates of standard normal prior.
+    """A null with effects over a plan, in coordinates with a standard normal prior.
 
     Noise effects are not part of it; they are in the noise model.
     """
@@ -51,7 +51,7 @@ class Model:
 
     @cached_property
     def chain(self) -> Predictor:
-        """The sensor model itself."""
+        """The null's chain with the effects."""
         return self.sensor.chain(self.plan, self.effects, n_nodes=FAST_NODES)
 
     @property
@@ -64,39 +64,39 @@ class Model:
         """Number of coordinates."""
         return self.sensor.n_params + sum(len(effect.prior.names) for effect in self.effects)
 
-    def coordinates_of(self, name: str) -> slice:
+    def coordinate_slice(self, name: str) -> slice:
         """Return the slice of one effect's coordinates."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects, self.sensor.n_params)}[name]
 
     def theta(self, z: FloatArray) -> FloatArray:
         """Map coordinates, (n_samples, n_params), to the chain's parameters."""
-        own = {effect.name: effect_values(effect, z[:, self.coordinates_of(effect.name)]) for effect in self.effects}
-        return self.theta_of(self.sensor.theta(z[:, : self.sensor.n_params]), own)
+        own = {effect.name: effect_values(effect, z[:, self.coordinate_slice(effect.name)]) for effect in self.effects}
+        return self.joined_theta(self.sensor.theta(z[:, : self.sensor.n_params]), own)
 
-    def theta_of(self, sensor: FloatArray, own: Mapping[str, FloatArray]) -> FloatArray:
+    def joined_theta(self, sensor: FloatArray, own: Mapping[str, FloatArray]) -> FloatArray:
         """Join the sensor's columns with each effect's, in the order of the chain: that of the stages."""
         return np.concatenate([sensor, *(own[effect.name] for effect in self.chain.effects)], axis=1)
 
     def predict(self, z: FloatArray, plan: Plan | None = None) -> FloatArray:
-        """Noise-free readings of every row of a plan, (n_samples, n_points)."""
+        """Return the noise-free readings of every row of a plan, its own by default, (n_samples, n_points)."""
         return self.chain.predict(self.theta(z), self.plan if plan is None else plan)
 
-    def jacobian(self, z: FloatArray, plan: Plan | None = None) -> tuple[FloatArray, FloatArray]:
-        """Predict and differentiate at one point z (n_params,): (n_points,), (n_points, n_params)."""
-        points, steps = _points_about(z)
+    def predict_and_differentiate(self, z: FloatArray, plan: Plan | None = None) -> tuple[FloatArray, FloatArray]:
+        """Return predictions, (n_points,), and slopes, (n_points, n_params), at one point z (n_params,)."""
+        points, steps = _difference_points_and_steps(z)
         return _value_and_slopes(self.predict(points, plan), steps)
 
     def with_effect(self, effect: NamedEffect[Any]) -> Model:
-        """Append an effect."""
+        """Return the model with one more effect, the last."""
         return Model(self.sensor, (*self.effects, effect), self.plan)
 
-    def without(self, name: str) -> tuple[Model, BoolArray]:
+    def model_and_mask_without(self, name: str) -> tuple[Model, BoolArray]:
         """Return the model without an effect, and the mask of the remaining coordinates, (n_params,)."""
         stay = np.ones(self.n_params, dtype=np.bool_)
-        stay[self.coordinates_of(name)] = False
+        stay[self.coordinate_slice(name)] = False
         return Model(self.sensor, tuple(e for e in self.effects if e.name != name), self.plan), stay
 
-    def coordinates_of_last_effect(self, values: FloatArray) -> FloatArray:
+    def z_of_last_effect(self, values: FloatArray) -> FloatArray:
         """Return the last effect's coordinates z of values of its parameters, (n_samples, n_params) both."""
         return effect_coordinates(self.effects[-1], values)
 
@@ -120,7 +120,7 @@ class Fit:
 
     def change_by(self, name: str, usable: IntArray) -> FloatArray:
         """Return the change of the usable readings by one of its effects, other parameters fixed, (n_usable,)."""
-        without, stay = self.model.without(name)
+        without, stay = self.model.model_and_mask_without(name)
         return np.asarray(self.predicted - without.predict(self.z[None, stay])[0, usable])
 
 
@@ -151,11 +151,11 @@ def fit(
     tolerance
         Gain of a step, in nats, below which to stop.
     """
-    (found,) = fits(model, recording, [start], law, max_steps=max_steps, tolerance=tolerance)
+    (found,) = fit_each_start(model, recording, [start], law, max_steps=max_steps, tolerance=tolerance)
     return found
 
 
-def fits(
+def fit_each_start(
     model: Model,
     recording: Recording,
     starts: Sequence[FloatArray],
@@ -164,13 +164,13 @@ def fits(
     max_steps: int = 30,
     tolerance: float = 5e-3,
 ) -> list[Fit]:
-    """Fit as `fit` does from each of several starts.
+    """Fit as `fit` does from each of several starts; return the fits in that order.
 
     If predictions broadcast, the fits run in parallel, in batches that fit a processor's cache.
     """
-    walks = [_minimise(model, recording, start, law, max_steps, tolerance) for start in starts]
+    walks = [_minimisation(model, recording, start, law, max_steps, tolerance) for start in starts]
     at_once = 1
-    if model.sensor.in_bulk:
+    if model.sensor.predicts_in_bulk:
         at_once = max(_AT_ONCE // (len(_DAMPINGS) * (model.n_params + 1) * len(recording.readings)), 1)
     found: dict[int, Fit] = {}
     for first in range(0, len(walks), at_once):
@@ -187,45 +187,47 @@ def fits(
     return [found[k] for k in range(len(walks))]
 
 
-def _minimise(
+def _minimisation(
     model: Model, recording: Recording, start: FloatArray, law: NoiseLaw, max_steps: int, tolerance: float
 ) -> Generator[FloatArray, FloatArray, Fit]:
     """Minimise from one start: yields points to predict, (n, n_params), and is sent predictions, (n, n_points)."""
     usable = recording.usable
     readings = recording.readings[usable]
-    nearby = model.sensor.known_nearby
+    nearby = model.sensor.predicts_cheaply_nearby
 
     def objective(predicted: FloatArray, z: FloatArray) -> FloatArray:
         whitened = law((readings - predicted).T)
-        sigma = law.scale(whitened)
+        sigma = law.likeliest_sigma(whitened)
         return np.asarray(law.minus_log_likelihood(whitened, sigma) + 0.5 * np.sum(z**2, axis=1))
 
-    def jacobian(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
-        points, steps = _points_about(z)
+    def request_slopes(z: FloatArray) -> Generator[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+        points, steps = _difference_points_and_steps(z)
         return _value_and_slopes((yield points)[:, usable], steps)
 
     z = np.clip(np.asarray(start, dtype=np.float64), -FARTHEST, FARTHEST)
     eye = np.eye(len(z))
     if nearby:
         yield z[None, :]
-    predicted, slopes = yield from jacobian(z)
+    predicted, slopes = yield from request_slopes(z)
     best = float(objective(predicted[None, :], z[None, :])[0])
     if not (np.isfinite(best) and np.isfinite(slopes).all()):  # no finite starting point
         return Fit(model, z, predicted, readings - predicted, slopes, sd=np.inf, objective=np.inf)
     settled = False
     for _ in range(max_steps):
         whitened, turned = law(readings - predicted)[:, None], law(slopes)
-        sigma = law.scale(whitened)
+        sigma = law.likeliest_sigma(whitened)
         variance = float(sigma[0]) ** 2 / law.information
         curvature = turned.T @ turned / variance + eye
-        downhill = turned.T @ law.as_normal(whitened, sigma)[:, 0] / variance - z
+        downhill = turned.T @ law.normal_pseudo_observations(whitened, sigma)[:, 0] / variance - z
         tries = _damped_steps(curvature, downhill)
         if not len(tries):
             break
         expected = float(tries[0] @ downhill - 0.5 * tries[0] @ curvature @ tries[0])
         tries = np.clip(z + np.clip(tries, -2.0, 2.0), -FARTHEST, FARTHEST)
         # If predictions broadcast, slopes are computed along with them, unless they cost little near the best of them.
-        about = [_points_about(at) for at in tries] if model.sensor.in_bulk and not nearby else []
+        about = (
+            [_difference_points_and_steps(at) for at in tries] if model.sensor.predicts_in_bulk and not nearby else []
+        )
         batch = yield np.concatenate([points for points, _ in about]) if about else tries[: 1 if nearby else None]
         if nearby and not best - objective(batch[:, usable], tries[:1])[0] > _AS_EXPECTED * expected:
             batch = np.concatenate([batch, (yield tries[1:])])
@@ -242,10 +244,10 @@ def _minimise(
         if about:
             predicted, slopes = _value_and_slopes(all_predicted[at], about[at][1])
         else:
-            predicted, slopes = yield from jacobian(z)
+            predicted, slopes = yield from request_slopes(z)
         if settled:
             break
-    sd = float(law.scale(law(readings - predicted)[:, None])[0])
+    sd = float(law.likeliest_sigma(law(readings - predicted)[:, None])[0])
     return Fit(model, z, predicted, readings - predicted, slopes, sd=sd, objective=best, settled=settled)
 
 
@@ -276,18 +278,18 @@ def residual_degrees_of_freedom(slopes: FloatArray, sd: float) -> float:
     return max(len(slopes) - float(np.sum(squares / (1 + squares))), 1.0)
 
 
-def starts_of_one_gaussian(sensor: SensorCoordinates) -> FloatArray:
+def starts_of_one_gaussian(sensor: GaussianMixtureSensor) -> FloatArray:
     """Return starting points for one Gaussian: typical, narrow and wide, shape (3, n_params)."""
-    return np.stack([_set_widths(np.zeros(sensor.n_params), step) for step in (0.0, -1.5, 1.5)])
+    return np.stack([_with_widths(np.zeros(sensor.n_params), step) for step in (0.0, -1.5, 1.5)])
 
 
-def _set_widths(z: FloatArray, step: float) -> FloatArray:
+def _with_widths(z: FloatArray, step: float) -> FloatArray:
     z = z.copy()
     z[2:4] = step
     return z
 
 
-def start_with_more_gaussians(found: Null, z: FloatArray, wanted: SensorCoordinates) -> FloatArray:
+def starts_with_more_gaussians(found: Null, z: FloatArray, wanted: GaussianMixtureSensor) -> FloatArray:
     """Return starting points with the heaviest Gaussian split in several ways, shape (n_starts, wanted.n_params)."""
     theta = found.theta(z[None, : found.n_params])[0]
     n = found.n_gaussians

@@ -15,7 +15,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.diagnosis.fitting.coordinates import (
     CalibratedSensor,
-    SensorCoordinates,
+    GaussianMixtureSensor,
     natural_to_theta,
     theta_to_natural,
 )
@@ -25,7 +25,7 @@ _SHARE = 0.1  # prior sd of each weight, as a share of the mass
 
 
 @dataclass(frozen=True, eq=False)
-class FreeForm(CalibratedSensor):
+class FreeFormSensor(CalibratedSensor):
     """A sensor with a free-form SSF.
 
     Its natural coordinates are those of one Gaussian and the two levels, then the bends: 7 + N_BENDS.
@@ -36,13 +36,13 @@ class FreeForm(CalibratedSensor):
     n_gaussians: int = field(default=N_FREE_FORM, init=False)
 
     @classmethod
-    def from_one_gaussian(cls, one: SensorCoordinates) -> Self:
+    def from_one_gaussian(cls, one: GaussianMixtureSensor) -> Self:
         """Build the prior from place and size of one Gaussian, with small weights of the free form."""
         factor = np.diag(np.concatenate([np.zeros(one.n_params), np.full(N_BENDS, _SHARE)]))
         factor[: one.n_params, : one.n_params] = one.factor
         return cls(np.concatenate([one.center, np.zeros(N_BENDS)]), factor)
 
-    def start_from(self, one: FloatArray) -> FloatArray:
+    def start_from_one_gaussian(self, one: FloatArray) -> FloatArray:
         """Return a start of a fit: one Gaussian's coordinates, (7,), the free form's bends zero: (1, n_params)."""
         return np.pad(one, (0, N_BENDS))[None, :]
 
@@ -52,8 +52,8 @@ class FreeForm(CalibratedSensor):
         return 7 + N_BENDS
 
     @property
-    def degrees_of_freedom(self) -> int:
-        """2: the step from one Gaussian to the free form counts as one."""
+    def effective_n_gaussians(self) -> int:
+        """2: the free form counts as one Gaussian more than one."""
         return 2
 
     @property
@@ -72,7 +72,7 @@ class FreeForm(CalibratedSensor):
 
 
 def free_form_to_natural(theta: FloatArray) -> FloatArray:
-    """Invert the map of `FreeForm.theta` to natural coordinates, (n_samples, 6 N + 2) -> (n_samples, 7 + N_BENDS)."""
+    """Map theta, (n_samples, 6 N + 2), to a free form's natural coordinates, (n_samples, 7 + N_BENDS)."""
     # The amplitude of the first does not enter its natural coordinates.
     one = np.concatenate([np.ones((len(theta), 1)), theta[:, 1:6], theta[:, -2:]], axis=1)
     return np.concatenate([theta_to_natural(one, 1), bends_of(theta[:, :-2])], axis=1)

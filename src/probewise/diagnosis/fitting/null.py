@@ -29,7 +29,7 @@ class Predictor(Protocol):
         ...
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        """Return noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         ...
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> Any:
@@ -40,15 +40,15 @@ class Predictor(Protocol):
         ...
 
     def readings_of_view(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Apply the effects from `Stage.SEEN` on to the view that `look` simulated: readings (n_samples, n_points)."""
+        """Apply the effects from `Stage.SEEN` on to a result of `simulated_view`: readings (n_samples, n_points)."""
         ...
 
 
 class Null(Protocol):
     """A model to be diagnosed, in coordinates in which its prior is a standard normal.
 
-    The sensor of the paper (`SensorCoordinates`), one with a free-form SSF (`FreeForm`), a sensor over an unknown shape
-    (`SensorAndShape`), or any simulator (`OwnModel`).
+    The sensor of the paper (`GaussianMixtureSensor`), one with a free-form SSF (`FreeFormSensor`), a sensor over an
+    unknown shape (`SensorAndShape`), or any simulator (`OwnModel`).
     """
 
     @property
@@ -62,8 +62,8 @@ class Null(Protocol):
         return 0
 
     @property
-    def degrees_of_freedom(self) -> int:
-        """Effective degrees of freedom of its SSF, counted in Gaussians; by default none."""
+    def effective_n_gaussians(self) -> int:
+        """Number of Gaussians that its SSF counts as, the measure of its complexity; by default 0."""
         return 0
 
     @property
@@ -77,12 +77,12 @@ class Null(Protocol):
         return False
 
     @property
-    def in_bulk(self) -> bool:
+    def predicts_in_bulk(self) -> bool:
         """Whether predictions of many samples cost little more than one; by default False."""
         return False
 
     @property
-    def known_nearby(self) -> bool:
+    def predicts_cheaply_nearby(self) -> bool:
         """Whether predictions near a point cost little once it was predicted itself; by default False."""
         return False
 
@@ -92,7 +92,7 @@ class Null(Protocol):
         ...
 
     @property
-    def nuisance(self) -> tuple[str, ...]:
+    def nuisance_names(self) -> tuple[str, ...]:
         """Names of parameters that apply to this recording only, such as those of a shape; by default none.
 
         They are not part of a written sensor model.

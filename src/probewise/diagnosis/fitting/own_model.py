@@ -62,7 +62,7 @@ class OwnModel(Null):
 
     @cached_property
     def starts(self) -> FloatArray:
-        """Return starting points: the centre of the prior and quasi-random points, (8, n_params)."""
+        """Starting points: the centre of the prior and quasi-random points, (8, n_params)."""
         from scipy.stats import qmc  # imported here, since it takes a second that a sensor's diagnosis does not need
 
         spread = qmc.Halton(self.n_params, scramble=False).random(_N_STARTS)[1:]
@@ -70,7 +70,7 @@ class OwnModel(Null):
 
     @property
     def least_readings(self) -> int:
-        """Three readings per parameter."""
+        """Three readings per parameter, at least 24."""
         return max(LEAST_READINGS, 3 * self.n_params)
 
     def admits(self, effect: NamedEffect[Any]) -> bool:
@@ -109,7 +109,7 @@ class _OwnChain:
         return (*self.model.prior.names, *parameter_names_of_effects(self.effects))
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
+        """Return noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
         return self.readings_of_view(self.simulated_view(theta, plan), theta, plan)
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> FloatArray:
@@ -121,7 +121,7 @@ class _OwnChain:
             If the simulator's readings have another shape than (n_samples, n_points).
         """
         parameters: Parameters = {name: theta[:, k : k + 1] for k, name in enumerate(self.model.prior.names)}
-        for effect, columns in self._theta_columns:
+        for effect, columns in self._effects_and_columns:
             if effect.stage is Stage.SCENE:
                 parameters = effect.apply(parameters, theta[:, columns], plan)
         readings = np.asarray(self.model.simulate(parameters, plan), dtype=np.float64)
@@ -131,12 +131,12 @@ class _OwnChain:
 
     def readings_of_view(self, view: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effects on the readings, in the order of their stages."""
-        for effect, columns in self._theta_columns:
+        for effect, columns in self._effects_and_columns:
             if Stage.OFFSET <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
 
     @cached_property
-    def _theta_columns(self) -> list[tuple[AnyEffect, slice]]:
-        """Columns of theta that belong to each effect."""
+    def _effects_and_columns(self) -> list[tuple[AnyEffect, slice]]:
+        """Each effect with its columns of theta."""
         return effects_with_columns(self.effects, self.model.n_params)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.fitting.coordinates import SensorCoordinates, default_sensor
-from probewise.diagnosis.fitting.fit import Fit, start_with_more_gaussians, starts_of_one_gaussian
-from probewise.diagnosis.fitting.free_form import FreeForm
+from probewise.diagnosis.fitting.coordinates import GaussianMixtureSensor, default_sensor
+from probewise.diagnosis.fitting.fit import Fit, starts_of_one_gaussian, starts_with_more_gaussians
+from probewise.diagnosis.fitting.free_form import FreeFormSensor
 from probewise.diagnosis.fitting.null import Null
 from probewise.effects import Extent
 
@@ -17,23 +17,23 @@ Start = tuple[Null, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class SsfForms:
-    """Sensors with priors scaled to a recording, each with starting coordinates."""
+    """The forms as sensors, with priors scaled to a recording; each with coordinates to fit it from."""
 
     extent: Extent
 
-    def simplest(self) -> Start:
-        """One Gaussian: typical, narrow and wide."""
+    def one_gaussian_start(self) -> Start:
+        """Return one Gaussian, starting typical, narrow and wide."""
         one = default_sensor(self.extent, 1)
         return one, starts_of_one_gaussian(one)
 
-    def free(self, found: Fit) -> Start:
+    def free_form_start(self, found: Fit) -> Start:
         """Return the free form, starting from the fit of one Gaussian."""
         one = found.model.sensor
-        assert isinstance(one, SensorCoordinates)
-        free = FreeForm.from_one_gaussian(one)
-        return free, free.start_from(found.z)
+        assert isinstance(one, GaussianMixtureSensor)
+        free = FreeFormSensor.from_one_gaussian(one)
+        return free, free.start_from_one_gaussian(found.z)
 
-    def one_more(self, found: Fit, order: int) -> Start:
-        """Return `order` Gaussians, starting from splits of the heaviest of the fit."""
+    def more_gaussians_start(self, found: Fit, order: int) -> Start:
+        """Return `order` Gaussians, one more than the fit has, starting from splits of its heaviest."""
         wanted = default_sensor(self.extent, order)
-        return wanted, start_with_more_gaussians(found.model.sensor, found.z, wanted)
+        return wanted, starts_with_more_gaussians(found.model.sensor, found.z, wanted)

@@ -40,23 +40,24 @@ def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTe
         If the fit of the null did not converge, with enough readings to tell.
     """
     prepared, null, noise = searched.prepared, searched.null, searched.posterior.likeliest_noise()
-    problem = Linearised.of(null.found, null.evidence[noise].law)
-    if not prepared.too_little:
+    problem = Linearised.of(null.found, null.evidence[noise].likeliest_law)
+    if not prepared.has_too_little_data:
         require_converged(null.found, Linearised.of(null.found, null.law))
-    draws = problem.draws(N_DRAWS, rng=rng)
+    draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
     p_value = bayes_factor_p_value(problem, searched.banks_for_test(null.found), draws)
-    p_value = _at_every_order(searched, null, noise, p_value, rng=rng)
+    p_value = _max_p_value_over_orders(searched, null, noise, p_value, rng=rng)
     # Constant readings have no noise to compare a residual with.
-    return GlobalTest(null, noise, problem, draws, 1.0 if prepared.has_equal_readings else p_value)
+    return GlobalTest(null, noise, problem, draws, 1.0 if prepared.has_only_equal_readings else p_value)
 
 
-def _at_every_order(
+def _max_p_value_over_orders(
     searched: Searched, null: WeighedFit, noise: Names, p_value: float, *, rng: np.random.Generator
 ) -> float:
     """Return the largest p-value over SSFs of the null's order, of higher orders, and with fine structure.
 
     The evidence accepts another Gaussian only if it gains ten nats or more; a smaller misfit of an SSF that is no
-    mixture is not physics. So an alarm must hold at every order, and with fine structure about the freest form.
+    mixture is not physics. So an alarm must hold at every order, and with fine structure about the freest form. Once a
+    p-value exceeds .05, the rest is not tested.
     """
     prepared, fits = searched.prepared, searched.evidences.fits
     rivals = [fits[n, ()] for n in sorted(n for n, names in fits if not names and n > null.n_gaussians)]
@@ -67,8 +68,8 @@ def _at_every_order(
         if p_value > _NO_ALARM:
             break
         found = rival.found
-        beside = prepared.apparatus.fine_structure(found, prepared.usable) if fine else None
-        problem = Linearised.of(found, rival.evidence[noise].law, beside)
-        draws = problem.draws(N_DRAWS, rng=rng)
+        beside = prepared.apparatus.fine_structure_slopes(found, prepared.usable_rows) if fine else None
+        problem = Linearised.of(found, rival.evidence[noise].likeliest_law, beside)
+        draws = problem.draw_null_residuals(N_DRAWS, rng=rng)
         p_value = max(p_value, bayes_factor_p_value(problem, searched.banks_for_test(found), draws))
     return p_value

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
-from probewise.diagnosis.advice.aliases import Alias, aliased_pairs
+from probewise.diagnosis.advice.aliases import Alias, aliases_with_separating_plans
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.residuals.locate import ALARM
@@ -70,7 +70,7 @@ class Judged:
     withdrawn: bool = False
 
     def withdraw(self) -> Judged:
-        """Return the verdict with its named effects withdrawn."""
+        """Return the verdict `cannot_tell` in place of the effects it named."""
         return replace(self, verdict="cannot_tell", combination=(), withdrawn=True)
 
     @property
@@ -86,11 +86,11 @@ class Judged:
     @property
     def credible(self) -> tuple[str, ...]:
         """Labels of the 95 % credible set."""
-        return credible_set(self.hypotheses)
+        return credible_labels(self.hypotheses)
 
     @property
     def unknown_candidates(self) -> tuple[tuple[str, float], ...]:
-        """Families of the unknown effect with their probabilities."""
+        """Families of the unknown effect with their probabilities, largest first; empty if there hardly is one."""
         if self.unknown_probability < 1e-3:
             return ()
         shares = sorted(self.unknown_shares.items(), key=lambda item: -item[1])
@@ -100,24 +100,24 @@ class Judged:
 def judge(searched: Searched, test: GlobalTest) -> Judged:
     """Return the verdict on a search and its test."""
     prepared, posterior = searched.prepared, searched.posterior
-    hypotheses = hypotheses_of(posterior.probabilities, searched.evidences.reported_names)
-    pairs = tuple(aliased_pairs(searched, test.problem, test.null.found))
+    hypotheses = ranked_hypotheses(posterior.probabilities, searched.evidences.reported_names)
+    pairs = tuple(aliases_with_separating_plans(searched, test.problem, test.null.found))
 
-    def aliased_with(combination: Names) -> frozenset[Names]:
+    def aliased_combinations(combination: Names) -> frozenset[Names]:
         """Return the combinations with the same noise whose effects on the mean are aliased with these."""
-        noise = prepared.on_noise & {*combination}
+        noise = prepared.noise_effect_names & {*combination}
         others = searched.aliased_with(tuple(name for name in combination if name not in noise))
         return frozenset(tuple(sorted({*names, *noise})) for names in others)
 
     verdict, combination = (
         ("cannot_tell", ())
-        if prepared.too_little
-        else verdict_on(
+        if prepared.has_too_little_data
+        else verdict_and_combination(
             hypotheses,
             test.p_value,
-            noise_names=prepared.faults_of_the_noise,
+            noise_names=prepared.pure_noise_effect_names,
             aliases=pairs,
-            aliased_with=aliased_with,
+            aliased_with=aliased_combinations,
             certain=frozenset(searched.certain),
         )
     )
@@ -138,16 +138,17 @@ def judge(searched: Searched, test: GlobalTest) -> Judged:
         aliases=pairs,
         order_probabilities=dict(posterior.order_probabilities),
         unknown_shares=searched.probabilities_of_unknown_forms(),
-        too_little=prepared.too_little,
+        too_little=prepared.has_too_little_data,
     )
 
 
-def _without_formulas(mean: Names) -> Names:
+def _unknown_if_out_of_vocabulary(mean: Names) -> Names:
     return ("unknown",) if effects_out_of_vocabulary(mean) else mean
 
 
-def hypotheses_of(
-    probabilities: Mapping[tuple[Names, Names], float], reported_as: Callable[[Names], Names] = _without_formulas
+def ranked_hypotheses(
+    probabilities: Mapping[tuple[Names, Names], float],
+    reported_as: Callable[[Names], Names] = _unknown_if_out_of_vocabulary,
 ) -> tuple[Hypothesis, ...]:
     """Join effects on mean and noise into hypotheses; unknown is one hypothesis under any noise.
 
@@ -163,7 +164,7 @@ def hypotheses_of(
     return tuple(Hypothesis(key, p / total) for key, p in ranked)
 
 
-def verdict_on(
+def verdict_and_combination(
     hypotheses: tuple[Hypothesis, ...],
     p_value: float,
     *,
@@ -172,16 +173,16 @@ def verdict_on(
     aliased_with: Callable[[Names], frozenset[Names]],
     certain: frozenset[str] = frozenset(),
 ) -> tuple[Verdict, Names]:
-    """Return the verdict by `decide`; effects on the mean are named only if the global test is significant too.
+    """Return the verdict and the combination it names; effects on the mean also need a significant global test.
 
     Effects in `certain`, which the readings show beyond doubt, need no significant test.
     """
-    verdict, combination = decide(hypotheses, noise_names, aliases, aliased_with)
+    verdict, combination = verdict_from_probabilities(hypotheses, noise_names, aliases, aliased_with)
     doubtful = verdict == "named" and not {*combination} <= noise_names | certain
     return ("cannot_tell", ()) if doubtful and p_value > ALARM else (verdict, combination)
 
 
-def credible_set(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
+def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
     """Return the labels of the smallest set of hypotheses with a probability of 95 %."""
     out, held = [], 0.0
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
@@ -192,13 +193,13 @@ def credible_set(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
     return tuple(out)
 
 
-def decide(
+def verdict_from_probabilities(
     hypotheses: tuple[Hypothesis, ...],
     noise_names: frozenset[str],
     aliases: tuple[Alias, ...],
     aliased_with: Callable[[Names], frozenset[Names]],
 ) -> tuple[Verdict, Names]:
-    """Return the verdict from probabilities, and the combination it names.
+    """Return the verdict by probabilities and aliases alone, and the combination it names.
 
     A class of aliases is the set of combinations that differ only by swapping aliased effects; if it has half the
     probability and none of its members has, the verdict is `cannot_tell`. The same holds if clean leads with less than
@@ -218,7 +219,7 @@ def decide(
         if any(named.get(other, 0.0) > _OUT_OF_THE_QUESTION * named[top] for other in aliased_with(top)):
             return "cannot_tell", top
         return ("noise" if set(top) <= noise_names else "named"), top
-    of_class = _alias_class_of(top, aliases)
+    of_class = _alias_class_of_combination(top, aliases)
     if len(of_class) > 1 and sum(named.get(member, 0.0) for member in of_class) >= 0.5:
         return "cannot_tell", top
     if max(probability.get((), 0.0), probability.get(("unknown",), 0.0)) > named[top]:
@@ -226,7 +227,7 @@ def decide(
     return ("noise" if set(top) <= noise_names else "named"), top
 
 
-def _alias_class_of(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
+def _alias_class_of_combination(names: Names, aliases: tuple[Alias, ...]) -> set[Names]:
     """Return a combination and those that differ from it by one effect swapped for its alias."""
     both_ways = [pair for a in aliases for pair in (a.effects, a.effects[::-1])]
     return {names} | {tuple(sorted({*names} - {name} | {other})) for name, other in both_ways if name in names}

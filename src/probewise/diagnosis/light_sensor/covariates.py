@@ -17,7 +17,7 @@ from probewise.scene import edge_distance, region_of
 _MOST_SCANS = 24  # number of scans above which residuals are not located in single scans
 
 
-def slope_along_the_move(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
+def slope_along_motion(predict: Callable[[Plan], FloatArray], plan: Plan) -> FloatArray:
     """Differentiate predictions of a plan's rows along each one's direction of motion, per mm, shape (n_points,)."""
     step = 0.25
     ahead, behind = (
@@ -32,7 +32,7 @@ def slope_along_the_move(predict: Callable[[Plan], FloatArray], plan: Plan) -> F
     return np.asarray((predict(ahead) - predict(behind)) / (2 * step))
 
 
-def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatArray) -> list[Covariate]:
+def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatArray) -> list[Covariate]:
     """List the covariates that vary in this recording.
 
     Parameters
@@ -52,7 +52,7 @@ def covariates_of(plan: Plan, usable: IntArray, level: FloatArray, slope: FloatA
     pooled: Mapping[str, FloatArray] = {
         "time": plan.time_s[usable],
         "level": level,
-        "edge_distance": _edge_distance(plan)[usable],
+        "edge_distance": _edge_distance_mm(plan)[usable],
         **{name: values[usable] for name, values in plan.covariates.items()},
     }
     out: list[Covariate] = []
@@ -126,7 +126,7 @@ def _places_along_larger_change(change: FloatArray, plan: Plan) -> Covariate | N
     return Covariate("place", values[rows], rows) if rows.size else None
 
 
-def _edge_distance(plan: Plan) -> FloatArray:
+def _edge_distance_mm(plan: Plan) -> FloatArray:
     """Return the distance of each row from the nearest described edge, mm; infinite if there is none."""
     out = np.full(len(plan), np.inf)
     for name, rows in plan.rows_by_pattern():

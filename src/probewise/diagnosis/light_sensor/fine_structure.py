@@ -12,7 +12,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.calibration import mixture_moments
-from probewise.diagnosis.fitting.coordinates import CalibratedSensor, known_scene
+from probewise.diagnosis.fitting.coordinates import CalibratedSensor, cached_known_scene
 from probewise.diagnosis.fitting.fit import Model
 from probewise.sensor import FAST_NODES, Chain, FreeLevels, FreeMixture
 
@@ -23,7 +23,7 @@ _WIDTH = 0.35
 _SHARE = 0.03  # prior sd of each weight, as a share of the mass
 
 
-def fine_structure(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
+def fine_structure_slopes(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
     """Return the slopes of the readings by fine structure about an SSF, in coordinates with a standard normal prior.
 
     Parameters
@@ -52,12 +52,12 @@ def fine_structure(model: Model, z: FloatArray, usable: IntArray) -> FloatArray:
     (aa, cc), (_, bb) = np.linalg.inv(_WIDTH**2 * covariance) / 2
     levels = theta[0, 6 * sensor.n_gaussians :]
     narrow = np.array([[1.0, u, v, aa, bb, cc, *levels] for u, v in places])
-    chain = Chain(FreeMixture(1), FreeLevels(), known_scene(model.plan), (), n_nodes=FAST_NODES)
+    chain = Chain(FreeMixture(1), FreeLevels(), cached_known_scene(model.plan), (), n_nodes=FAST_NODES)
     whole = model.predict(z[None, :])[0]  # normalised, so that the total weight is unchanged
     return np.asarray(_SHARE * (chain.predict(narrow, model.plan) - whole)[:, usable].T)
 
 
-def _hexagons() -> FloatArray:
+def _hexagonal_grid() -> FloatArray:
     """Return places on a hexagonal grid over a disc, (n, 2)."""
     steps = np.arange(-8, 9)
     i, j = (a.ravel() for a in np.meshgrid(steps, steps))
@@ -65,4 +65,4 @@ def _hexagons() -> FloatArray:
     return np.asarray(places[np.hypot(*places.T) <= _REACH])
 
 
-_PLACES = _hexagons()
+_PLACES = _hexagonal_grid()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from probewise.diagnosis.joining import join_plans, last_known
+from probewise.diagnosis.joining import join_plans, last_known_value
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
 
@@ -27,25 +27,25 @@ class Scan:
     @property
     def minutes(self) -> float:
         """Duration in minutes, including the break before it."""
-        return minutes_of(self.plan) + self.lay_s / 60.0
+        return duration_minutes(self.plan) + self.sheet_laying_s / 60.0
 
     @property
-    def lay_s(self) -> float:
+    def sheet_laying_s(self) -> float:
         """Additional break before it for laying a sheet, in seconds."""
         return LAY_S if self.kind == "lay" else 0.0
 
 
-def start_after(plan: Plan) -> float:
+def earliest_start_s(plan: Plan) -> float:
     """Return the earliest start of a scan after a plan, in s."""
     return float(plan.time_s.max(initial=0.0)) + BREAK_S
 
 
-def minutes_of(plan: Plan) -> float:
+def duration_minutes(plan: Plan) -> float:
     """Estimate the duration of a plan in minutes, including the break before it."""
     return (float(np.ptp(plan.time_s)) + BREAK_S) / 60.0 if len(plan) else 0.0
 
 
-def as_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
+def plan_of_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate alternative scans, each timed as if directly after a plan, to predict all of them at once.
 
     Covariates that they lack, such as battery voltage, keep their last value of that plan.
@@ -53,20 +53,20 @@ def as_alternatives(scans: Sequence[Scan], after: Plan) -> Plan:
     return _with_last_known_covariates(_joined_plan(scans), after)
 
 
-def in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
+def plan_in_sequence(scans: Sequence[Scan], after: Plan) -> Plan:
     """Concatenate scans with a break before each, a longer one if a sheet has to be laid.
 
-    Covariates that they lack are filled as in `as_alternatives`, to be replaced by measured values.
+    Covariates that they lack are filled as in `plan_of_alternatives`, to be replaced by measured values.
     """
     out: list[Scan] = []
     for scan in scans:
-        out.append(_started_at(scan, start_after(out[-1].plan) if out else float(scan.plan.time_s[0])))
+        out.append(_started_at(scan, earliest_start_s(out[-1].plan) if out else float(scan.plan.time_s[0])))
     return _with_last_known_covariates(_joined_plan(out), after)
 
 
 def _with_last_known_covariates(plan: Plan, after: Plan) -> Plan:
     """Fill covariates that cannot be commanded with their last values of the plan before."""
-    read = {name: last_known(values) for name, values in after.covariates.items() if name not in COMMANDED}
+    read = {name: last_known_value(values) for name, values in after.covariates.items() if name not in COMMANDED}
     kept = {name: np.full(len(plan), last) for name, last in read.items() if math.isfinite(last)}
     return replace(plan, covariates={**kept, **plan.covariates})
 
@@ -77,10 +77,10 @@ def _joined_plan(scans: Sequence[Scan]) -> Plan:
 
 def postponed(scan: Scan, plan: Plan) -> Scan:
     """Move a scan to after a plan, with time to lay its sheet."""
-    return _started_at(scan, start_after(plan))
+    return _started_at(scan, earliest_start_s(plan))
 
 
 def _started_at(scan: Scan, start_s: float) -> Scan:
     """Start a scan at a time, plus the time to lay its sheet."""
-    delay_s = start_s + scan.lay_s - float(scan.plan.time_s[0])
+    delay_s = start_s + scan.sheet_laying_s - float(scan.plan.time_s[0])
     return replace(scan, plan=replace(scan.plan, time_s=scan.plan.time_s + delay_s))

@@ -13,11 +13,11 @@ from probewise.diagnosis.apparatus import Words
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.fitting.ssf_forms import SsfForms
-from probewise.diagnosis.light_sensor.commands import commands, rows_that_need_no_hand
-from probewise.diagnosis.light_sensor.covariates import covariate_of, covariates_of, slope_along_the_move
-from probewise.diagnosis.light_sensor.fine_structure import fine_structure
+from probewise.diagnosis.light_sensor.candidate_scans import candidate_scans, rows_that_need_no_hand
+from probewise.diagnosis.light_sensor.covariates import covariate_of, slope_along_motion, varying_covariates
+from probewise.diagnosis.light_sensor.fine_structure import fine_structure_slopes
 from probewise.diagnosis.light_sensor.held_out_parts import held_out_parts
-from probewise.diagnosis.light_sensor.scheduling import Scan, as_alternatives, in_sequence
+from probewise.diagnosis.light_sensor.scheduling import Scan, plan_in_sequence, plan_of_alternatives
 from probewise.diagnosis.light_sensor.target_swaps import target_swaps
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -56,19 +56,19 @@ class LightSensor:
             if (null.admits(effect) if null is not None else not effect.is_absorbed_by_ssf(plan))
         }
 
-    def proposals(self) -> dict[str, NamedEffect[Any]]:
+    def proposed_effects(self) -> dict[str, NamedEffect[Any]]:
         """Return none: effects with a formula are among `effects` here."""
         return {}
 
-    def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+    def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Return the names of effects defined outside this library."""
         return frozenset(effects.keys() - EFFECTS)
 
-    def spent_refit_budget(self) -> float:
+    def refit_budget_share_spent(self) -> float:
         """Return 0: predictions are cheap here."""
         return 0.0
 
-    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
+    def is_refit_budget_spent(self, share: float = 1.0) -> bool:
         """Return False: predictions are cheap here."""
         return False
 
@@ -76,25 +76,27 @@ class LightSensor:
         """Return the forms of its SSF."""
         return SsfForms(Extent.of(recording))
 
-    def covariates(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
+    def covariates_and_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
         """Return the covariates that vary, and the slope of the readings along the direction of motion."""
         usable, model, z = np.flatnonzero(recording.usable), found.model, found.z[None, :]
-        slope = slope_along_the_move(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
-        return covariates_of(recording.plan, usable, found.predicted, slope), slope
+        slope = slope_along_motion(lambda moved: model.predict(z, moved)[0], model.plan)[usable]
+        return varying_covariates(recording.plan, usable, found.predicted, slope), slope
 
-    prior_odds = staticmethod(PriorOdds.over)
+    prior_odds = staticmethod(PriorOdds.for_effects)
     covariate_of = staticmethod(covariate_of)
     held_out_parts = staticmethod(held_out_parts)
-    as_alternatives = staticmethod(as_alternatives)
-    in_sequence = staticmethod(in_sequence)
+    plan_of_alternatives = staticmethod(plan_of_alternatives)
+    plan_in_sequence = staticmethod(plan_in_sequence)
 
-    def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
+    def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
         """Return the slopes by fine structure of the SSF."""
-        return fine_structure(found.model, found.z, usable)
+        return fine_structure_slopes(found.model, found.z, usable)
 
-    def commands(self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
-        """List the scans that the arm can take, and those with the target exchanged or turned by hand."""
+    def candidate_measurements(
+        self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
+    ) -> list[Scan]:
+        """List the scans that the arm can take, and with `hands` those over an exchanged or turned target."""
         if self.hands:
-            return [*commands(plan, strides=strides, level=level), *target_swaps(plan)]
+            return [*candidate_scans(plan, strides=strides, level=level), *target_swaps(plan)]
         rows = rows_that_need_no_hand(plan)
-        return commands(plan.take(rows), strides=strides, level=None if level is None else level[rows])
+        return candidate_scans(plan.take(rows), strides=strides, level=None if level is None else level[rows])

@@ -13,8 +13,13 @@ import numpy as np
 from scipy.special import ndtr
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.light_sensor.commands import distinct_scans, excerpts, reading_s, rescheduled
-from probewise.diagnosis.light_sensor.scheduling import Scan, start_after
+from probewise.diagnosis.light_sensor.candidate_scans import (
+    excerpts,
+    median_reading_interval_s,
+    rows_as_new_scan,
+    rows_of_distinct_scans,
+)
+from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
 from probewise.recordings.patterns import HalfPlane, Pattern, Stripes, Uniform
 from probewise.recordings.plan import Plan
 
@@ -31,19 +36,19 @@ def target_swaps(plan: Plan) -> list[Scan]:
 
     They start like the plan's first moving scan, or its first over a `HalfPlane`, with the same orientation.
     """
-    scans = distinct_scans(plan)
+    scans = rows_of_distinct_scans(plan)
     if not scans:
         return []
     first = scans[0]
     out = []
     for colour, albedo in (("white", 1.0), ("black", 0.0)):
-        flat = _repeated_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
+        flat = _rows_as_next_scan(plan, first[:: max(len(first) // _FLAT_ROWS, 1)], f"{colour}_next")
         out.append(
             Scan("lay", f"scan a plain {colour} surface", _with_pattern(flat, f"plain_{colour}", Uniform(albedo)))
         )
     name = plan.scan_names[int(plan.scan[first[0]])]
     for part in excerpts(first, strides=(_STRIDE // 2, _STRIDE)):
-        across = _rotated_scan(_repeated_scan(plan, part.rows, f"across{part.suffix}"))
+        across = _rotated_scan(_rows_as_next_scan(plan, part.rows, f"across{part.suffix}"))
         out.append(Scan("across", f"scan at right angles to scan {name}, through its middle{part.words}", across))
     edges = ((scan, _pattern_under(plan, scan)) for scan in scans)
     laid = (_scans_over_moved_targets(plan, scan, edge) for scan, edge in edges if isinstance(edge, HalfPlane))
@@ -53,11 +58,11 @@ def target_swaps(plan: Plan) -> list[Scan]:
 def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> list[Scan]:
     """List scans over an edge turned by 180 or 90 degrees or moved, and over stripes."""
     name = plan.pattern_names[int(plan.pattern[scan[0]])]
-    beyond = _distance_inside(plan, scan, edge)
+    beyond = _distance_inside_mm(plan, scan, edge)
     length = float(np.ptp(beyond))
     if length < _LEAST_CROSSED * math.hypot(np.ptp(plan.x_mm[scan]), np.ptp(plan.y_mm[scan])):
         return []
-    once = _repeated_scan(plan, scan, name)
+    once = _rows_as_next_scan(plan, scan, name)
     half_round = replace(edge, normal_rad=edge.normal_rad + math.pi, offset_mm=-edge.offset_mm)
     laid = [
         (f"{name}_half_round", f"turn pattern {name} by 180 degrees about its edge and scan it", once, half_round),
@@ -79,16 +84,16 @@ def _scans_over_moved_targets(plan: Plan, scan: IntArray, edge: HalfPlane) -> li
     out = []
     for label, words, whole, pattern in laid:
         rows = np.arange(len(whole))
-        seen = ndtr(_distance_inside(whole, rows, pattern) / (_FOOTPRINT * length))
+        seen = ndtr(_distance_inside_mm(whole, rows, pattern) / (_FOOTPRINT * length))
         for part in excerpts(rows, strides=(_STRIDE,), level=seen):
-            taken = _with_pattern(_repeated_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
+            taken = _with_pattern(_rows_as_next_scan(whole, part.rows, f"{label}{part.suffix}"), label, pattern)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     for number in _STRIPES:
         period_mm = float(np.round(length / number)) or length / number
         stripes = Stripes(edge.normal_rad, period_mm, 0.5, 0.0, edge.inside, edge.outside)
         label, words = f"stripes_{period_mm:g}_mm", f"scan stripes {period_mm:g} mm apart in place of pattern {name}"
         for part in excerpts(scan, strides=(_STRIDE // 2, _STRIDE)):
-            taken = _with_pattern(_repeated_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
+            taken = _with_pattern(_rows_as_next_scan(plan, part.rows, f"{label}{part.suffix}"), label, stripes)
             out.append(Scan("lay", f"{words}{part.words}", taken))
     return out
 
@@ -97,13 +102,13 @@ def _pattern_under(plan: Plan, scan: IntArray) -> Pattern | None:
     return plan.patterns.get(plan.pattern_names[int(plan.pattern[scan[0]])])
 
 
-def _repeated_scan(plan: Plan, rows: IntArray, name: str) -> Plan:
+def _rows_as_next_scan(plan: Plan, rows: IntArray, name: str) -> Plan:
     """Return these rows as a new scan after the plan."""
-    return rescheduled(plan, rows, start_after(plan), reading_s(plan), name)
+    return rows_as_new_scan(plan, rows, earliest_start_s(plan), median_reading_interval_s(plan), name)
 
 
 def _with_pattern(scan: Plan, name: str, pattern: Pattern) -> Plan:
-    """Set the pattern of a scan, under a name not yet in use."""
+    """Set the pattern of a scan, under a new name if this one is that of another pattern."""
     while name in scan.pattern_names and scan.patterns.get(name) != pattern:
         name += "_new"
     names = tuple(dict.fromkeys((*scan.pattern_names, name)))
@@ -128,6 +133,6 @@ def _rotated_scan_and_edge(scan: Plan, edge: HalfPlane) -> tuple[Plan, HalfPlane
     return _rotated_scan(scan), replace(edge, normal_rad=normal_rad, offset_mm=float(edge.offset_mm + moved_mm))
 
 
-def _distance_inside(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
+def _distance_inside_mm(plan: Plan, rows: IntArray, edge: HalfPlane) -> FloatArray:
     """Return the signed distance of places inside an edge, in mm."""
     return plan.x_mm[rows] * math.cos(edge.normal_rad) + plan.y_mm[rows] * math.sin(edge.normal_rad) - edge.offset_mm

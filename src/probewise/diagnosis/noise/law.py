@@ -16,14 +16,14 @@ from scipy.linalg import cholesky_banded, solve_banded
 from scipy.special import expit
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.noise.flat import Flat
+from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.recordings.plan import Recording
 
 _EM_STEPS = 12
 _LEAST = 1e-150  # least scale, for readings that are exactly as predicted
 
 
-def steps_within_scans(recording: Recording) -> IntArray:
+def rows_to_previous_usable(recording: Recording) -> IntArray:
     """Return the number of rows back to the previous usable reading of the same scan, 0 if there is none.
 
     Shape (n_usable,): neighbours of a missing reading are two steps apart.
@@ -83,11 +83,11 @@ class NoiseLaw:
         return len(self.sd) - int(self.lost.sum())
 
     @property
-    def linear(self) -> tuple[bytes, ...]:
+    def whitening_key(self) -> tuple[bytes, ...]:
         """Key of the whitening: distributions with the same key differ only in their tails."""
         return self.sd.tobytes(), self.carry.tobytes(), self.lost.tobytes(), self.walk.tobytes()
 
-    def alike(self, other: NoiseLaw) -> bool:
+    def is_practically_equal(self, other: NoiseLaw) -> bool:
         """Return whether another distribution is practically the same."""
         return (
             (self.share, self.times, self.flat, self.sigma) == (other.share, other.times, other.flat, other.sigma)
@@ -106,7 +106,7 @@ class NoiseLaw:
     @property
     def information(self) -> float:
         """Fisher information of one whitened reading about its mean, in units of 1 / sigma^2."""
-        return float(self.density.information)
+        return float(self.whitened_density.information)
 
     def take(self, rows: BoolArray) -> NoiseLaw:
         """Return the distribution of some readings, which must be whole scans."""
@@ -118,7 +118,7 @@ class NoiseLaw:
         flat = columns.ndim == 1
         y = columns[:, None] if flat else columns
         if self.walk.size:
-            y = self._without_walk(y)
+            y = self._whiten_with_walk(y)
             return y[:, 0] if flat else y
         y = y * (self.kept / self.sd)[:, None]
         if np.any(self.carry):
@@ -131,16 +131,16 @@ class NoiseLaw:
             y = innovation
         return y[:, 0] if flat else y
 
-    def _without_walk(self, columns: FloatArray) -> FloatArray:
+    def _whiten_with_walk(self, columns: FloatArray) -> FloatArray:
         """Whiten columns (n_points, n_columns) with a random walk: differences correlate only with their neighbours."""
         out = np.zeros(columns.shape)
         kept = ~self.lost
         steps = np.diff(columns[kept], axis=0, prepend=0.0)
-        out[kept] = solve_banded((1, 0), self._walk_root, steps, check_finite=False)
+        out[kept] = solve_banded((1, 0), self._difference_covariance_root, steps, check_finite=False)
         return out
 
     @cached_property
-    def _walk_root(self) -> FloatArray:
+    def _difference_covariance_root(self) -> FloatArray:
         """Banded Cholesky factor of the covariance of successive differences, (2, n_kept)."""
         kept = ~self.lost
         variance = self.sd[kept] ** 2
@@ -151,77 +151,77 @@ class NoiseLaw:
         bands[1, :-1] = -variance[:-1]
         return np.asarray(cholesky_banded(bands, lower=True))
 
-    def log_det(self) -> float:
+    def half_log_det(self) -> float:
         """Return half the log determinant of the relative covariance."""
         kept = ~self.lost
         if self.walk.size:
-            return float(np.log(self._walk_root[0]).sum())
+            return float(np.log(self._difference_covariance_root[0]).sum())
         return float(np.log(self.sd[kept]).sum() + 0.5 * np.log1p(-(self.carry[kept] ** 2)).sum())
 
     @cached_property
-    def density(self) -> Tail | Flat:
-        """Density of one whitened reading: a mixture of two normals (`Tail`) or a rounded normal (`Flat`)."""
-        return forms([self])
+    def whitened_density(self) -> Tail | RoundedNormal:
+        """Density of one whitened reading: a mixture of two normals (`Tail`) or a rounded normal (`RoundedNormal`)."""
+        return stacked_density([self])
 
     @cached_property
-    def floor(self) -> float:
+    def sigma_floor(self) -> float:
         """Least sigma for which every reading's sd, given those before it, is at least `least`."""
-        return self.least / self._narrowest if self.least else 0.0
+        return self.least / self._smallest_conditional_sd if self.least else 0.0
 
     @cached_property
-    def _narrowest(self) -> float:
+    def _smallest_conditional_sd(self) -> float:
         """Smallest sd of a reading given those before it, in units of sigma; 1 if all are lost."""
         if not self.n_points:
             return 1.0
         if self.walk.size:
-            return float(self._walk_root[0].min())
+            return float(self._difference_covariance_root[0].min())
         return float(np.min((self.sd * np.sqrt(1 - self.carry**2))[~self.lost]))
 
-    def at_least(self, sigma: float) -> NoiseLaw:
+    def with_least_sigma(self, sigma: float) -> NoiseLaw:
         """Return the distribution with a lower bound on sigma."""
-        return replace(self, least=sigma * self._narrowest)
+        return replace(self, least=sigma * self._smallest_conditional_sd)
 
     @property
-    def widening(self) -> float:
+    def sd_factor_of_rounding(self) -> float:
         """Sd of a whitened reading in units of sigma, including rounding but not a tail."""
         return math.sqrt(1 + self.flat**2 / 3)
 
-    def plain(self) -> NoiseLaw:
+    def without_tail_or_rounding(self) -> NoiseLaw:
         """Return normal noise with the same whitening and free sd, without tail or rounding."""
         return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
 
-    def scale(self, whitened: FloatArray) -> FloatArray:
+    def likeliest_sigma(self, whitened: FloatArray) -> FloatArray:
         """Return the most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
-        return self.density.scale(whitened, self.n_points, floor=self.floor)
+        return self.whitened_density.likeliest_sigma(whitened, self.n_points, floor=self.sigma_floor)
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Return minus the log likelihood of whitened residuals (n_points, k) at sigma (k,): (k,).
 
         Without n/2 log 2 pi.
         """
-        return self.density.minus_log_likelihood(whitened, sigma, self.n_points)
+        return self.whitened_density.minus_log_likelihood(whitened, sigma, self.n_points)
 
-    def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+    def normal_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Convert whitened residuals (n_points, k) to equally informative normal pseudo-observations."""
-        return self.density.as_normal(whitened, sigma)
+        return self.whitened_density.normal_pseudo_observations(whitened, sigma)
 
-    def pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Return pseudo-observations as `as_normal` does; for rounded readings, never larger than the residual.
+    def bounded_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Return normal pseudo-observations that, for rounded readings, are never larger than the residual.
 
         A rounded reading has a flat-topped density. On its steep flank, the score over the Fisher information would
         exceed the residual.
         """
-        normal = self.as_normal(whitened, sigma)
+        normal = self.normal_pseudo_observations(whitened, sigma)
         return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
 
-    def draws(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw pseudo-observations as from `pseudo_observations`, in units of their sd, (n_points, n_draws)."""
+    def draw_pseudo_observations(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw pseudo-observations as from `bounded_pseudo_observations`, in units of their sd, (n_points, n_draws)."""
         eps = rng.standard_normal((len(self.sd), n_draws))
-        if not self.density.is_normal:
+        if not self.whitened_density.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
             if self.flat:
                 eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
-            eps = self.pseudo_observations(eps, np.ones(n_draws)) * math.sqrt(self.information)
+            eps = self.bounded_pseudo_observations(eps, np.ones(n_draws)) * math.sqrt(self.information)
         return eps * self.kept[:, None]
 
 
@@ -243,9 +243,9 @@ class Tail:
     @cached_property
     def information(self) -> FloatArray:
         """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
-        return np.asarray(np.vectorize(_information, otypes=[np.float64])(self.share, self.times))
+        return np.asarray(np.vectorize(_fisher_information, otypes=[np.float64])(self.share, self.times))
 
-    def scale(
+    def likeliest_sigma(
         self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
     ) -> FloatArray:
         """Return the most likely sigma, (k,), by EM; rows beyond `n_points` are 0 and do not count."""
@@ -260,7 +260,7 @@ class Tail:
         else:
             sigma = start
         for _ in range(_EM_STEPS if start is None else 3):
-            weighed = self._weights(squares / sigma**2) * squares
+            weighed = self._relative_precisions(squares / sigma**2) * squares
             sigma = np.maximum(np.sqrt(weighed.sum(axis=0) / n_points), floor) + _LEAST
         return np.asarray(sigma)
 
@@ -269,12 +269,12 @@ class Tail:
         if self.is_normal:
             return np.asarray(n_points * np.log(sigma) + 0.5 * np.einsum("ij,ij->j", whitened, whitened) / sigma**2)
         squares = (whitened / sigma) ** 2
-        log_density = -0.5 * squares + np.logaddexp(0.0, self._log_odds(squares))
-        at_zero = np.logaddexp(0.0, self._log_odds(np.zeros((1, 1))))[0]
+        log_density = -0.5 * squares + np.logaddexp(0.0, self._log_odds_of_wide(squares))
+        at_zero = np.logaddexp(0.0, self._log_odds_of_wide(np.zeros((1, 1))))[0]
         of_kept = log_density.sum(axis=0) - (len(whitened) - n_points) * at_zero
         return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share)) - of_kept)
 
-    def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+    def normal_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
         """Convert residuals to equally informative normal pseudo-observations.
 
         The score of the density over its Fisher information, with sd sigma / sqrt(information); outlying residuals have
@@ -282,43 +282,43 @@ class Tail:
         """
         if self.is_normal:
             return whitened
-        return np.asarray(whitened * self._weights((whitened / sigma) ** 2) / self.information)
+        return np.asarray(whitened * self._relative_precisions((whitened / sigma) ** 2) / self.information)
 
-    def scale_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+    def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return minus the second derivative of the log likelihood by log sigma, (k,)."""
         squares = (whitened / sigma) ** 2
-        wide = self.wide(squares)
+        wide = self.wide_probability(squares)
         less = (1 - np.asarray(self.times) ** -2) ** 2 * np.sum(squares**2 * wide * (1 - wide), axis=0)
         return np.asarray(np.maximum(2.0 * n_points - less, 0.2 * n_points))
 
-    def wide(self, squares: FloatArray) -> FloatArray:
+    def wide_probability(self, squares: FloatArray) -> FloatArray:
         """Return the probability that a residual is from the wide component, from its square over sigma^2."""
-        return np.asarray(expit(self._log_odds(squares)))
+        return np.asarray(expit(self._log_odds_of_wide(squares)))
 
-    def _log_odds(self, squares: FloatArray) -> FloatArray:
+    def _log_odds_of_wide(self, squares: FloatArray) -> FloatArray:
         """Return the log odds that a residual is from the wide component, from its square over sigma^2."""
         share, times = np.asarray(self.share), np.asarray(self.times)
         return np.asarray(np.log(share / (1 - share) / times) + 0.5 * (1 - times**-2) * squares)
 
-    def _weights(self, squares: FloatArray) -> FloatArray:
+    def _relative_precisions(self, squares: FloatArray) -> FloatArray:
         """Return the expected precision of each residual relative to the narrow component."""
-        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide(squares))
+        return np.asarray(1 - (1 - np.asarray(self.times) ** -2) * self.wide_probability(squares))
 
 
-def forms(laws: Sequence[NoiseLaw]) -> Tail | Flat:
+def stacked_density(laws: Sequence[NoiseLaw]) -> Tail | RoundedNormal:
     """Stack the densities of several distributions, all with a tail or all rounded."""
     one = len(laws) == 1
     if laws[0].flat:
         if one:
-            return Flat(laws[0].flat, laws[0].sigma)
-        return Flat(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]))
+            return RoundedNormal(laws[0].flat, laws[0].sigma)
+        return RoundedNormal(np.array([law.flat for law in laws]), np.array([law.sigma for law in laws]))
     if one:
         return Tail(laws[0].share, laws[0].times)
     return Tail(np.array([law.share for law in laws]), np.array([law.times for law in laws]))
 
 
 @lru_cache(maxsize=256)
-def _information(share: float, times: float) -> float:
+def _fisher_information(share: float, times: float) -> float:
     if share == 0:
         return 1.0
     # The integrand extends as far as the wide component.
@@ -334,7 +334,7 @@ def white_noise(n_points: int, *, least: float = 0.0) -> NoiseLaw:
     return NoiseLaw(np.ones(n_points), np.zeros(n_points), np.zeros(n_points, dtype=np.bool_), least=least)
 
 
-def white_of(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
+def white_noise_of_recording(recording: Recording, *, least: float = 0.0) -> NoiseLaw:
     """Return independent noise of a recording's usable readings, with its declared relative sds."""
     return replace(white_noise(int(recording.usable.sum()), least=least), sd=recording.relative_sd[recording.usable])
 

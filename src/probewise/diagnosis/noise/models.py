@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.noise.flat import Flat
-from probewise.diagnosis.noise.law import NoiseLaw, steps_within_scans
+from probewise.diagnosis.noise.law import NoiseLaw, rows_to_previous_usable
+from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
@@ -47,7 +47,7 @@ class NoiseModel:
     recording
         What was read.
     likely
-        For some effects by name, the important nodes (n_nodes, n_params) and their log weights.
+        For some effects by name, the important nodes (n_nodes, n_params) and their log prior weights.
     rounding
         Rounding step of all readings, if there is no other noise effect, or 0.
     least_sd
@@ -65,12 +65,12 @@ class NoiseModel:
         """Names of its effects; () for white noise."""
         return tuple(effect.name for effect in self.effects)
 
-    def columns_of(self, name: str) -> slice:
+    def column_slice(self, name: str) -> slice:
         """Return the columns of one effect's settings."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
-    def every_third(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Thin the nodes of each effect with more than twelve to every third, for `likely`."""
+    def thinned_nodes(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """Return every third node, and log weights, of each effect with more than twelve, by name, for `likely`."""
         out = {}
         for effect in self.effects:
             nodes = effect.bank()[:, 0, :]
@@ -78,39 +78,41 @@ class NoiseModel:
                 out[effect.name] = nodes[1::3], np.full(len(nodes[1::3]), -math.log(len(nodes[1::3])))
         return out
 
-    def laws(self, predicted: FloatArray) -> NoiseNodes:
+    def nodes_for_predictions(self, predicted: FloatArray) -> NoiseNodes:
         """Return the nodes of all combinations of the effects, given predictions of the usable rows, (n_usable,)."""
-        residuals = (self._readings - predicted) / self._relative_sd
+        residuals = (self._usable_readings - predicted) / self._relative_sd
         # Rounded readings can all be as predicted; rounding errors alone are not outliers.
         sd = max(float(np.median(np.abs(residuals))) / 0.6745, self._rounding_step / math.sqrt(12)) or 1.0
         span = float(np.ptp(predicted)) or 1.0
         seen = np.clip((predicted - predicted.min()) / span, 0.0, 1.0)
         rows = FittedReadings(predicted, sd, self.recording.plan.scan[self.recording.usable])
-        banks = [self._nodes(effect, residuals / sd, rows) for effect in self.effects]
+        banks = [self._weighted_nodes(effect, residuals / sd, rows) for effect in self.effects]
         settings, log_weights = np.zeros((1, 0)), np.zeros(1)
         for bank, log_each in banks:
             settings = np.concatenate(
                 [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
             )
             log_weights = (log_weights[:, None] + log_each).ravel()
-        level = self._noise_at_nodes(settings, seen)
+        level = self._noise_levels_at_nodes(settings, seen)
         far = np.abs(residuals) > _FAR * sd
-        laws = tuple(self._law(level, k, far) for k in range(len(settings)))
+        laws = tuple(self._law_at_node(level, k, far) for k in range(len(settings)))
         if self.rounding:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
-            halves, beside = _beside_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
+            halves, beside = _sd_nodes_with_rounding(law(residuals), 0.5 * self.rounding, law.n_points)
             laws = tuple(replace(law, flat=x, sigma=0.5 * self.rounding / x) for x in halves)
             return NoiseNodes(np.repeat(settings, len(laws), axis=0), laws, beside)
         return NoiseNodes(settings, laws, log_weights)
 
-    def _nodes(self, effect: NoiseEffect, residuals: FloatArray, rows: FittedReadings) -> tuple[FloatArray, FloatArray]:
+    def _weighted_nodes(
+        self, effect: NoiseEffect, residuals: FloatArray, rows: FittedReadings
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the nodes of one effect and their log prior weights."""
         if effect.name in self.likely:
             return self.likely[effect.name]
         return effect.weighed_nodes(residuals, rows)
 
-    def _noise_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
+    def _noise_levels_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
         """Return the noise at all nodes at once: relative sds and correlations with every noise effect applied.
 
         `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) are the predictions.
@@ -123,41 +125,55 @@ class NoiseModel:
             level = effect.apply(level, settings[:, own], plan)
         return level
 
-    def _law(self, level: NoiseLevel, node: int, far: BoolArray) -> NoiseLaw:
-        def at(values: FloatArray) -> float:
+    def _law_at_node(self, level: NoiseLevel, node: int, far: BoolArray) -> NoiseLaw:
+        def value_at_node(values: FloatArray) -> float:
             return float(values[min(node, len(values) - 1), 0])
 
         sd = level.sd[min(node, len(level.sd) - 1)]
         sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
-        lost_share = at(level.lost_share)
-        value = at(level.lost_value)
-        lost = far & (np.abs(self._readings - value) <= 1e-9 * (1 + abs(value))) & (lost_share > 0)
-        carry = np.where(self._steps > 0, at(level.rho) ** np.maximum(self._steps, 1), 0.0)
+        lost_share = value_at_node(level.lost_share)
+        value = value_at_node(level.lost_value)
+        lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * (1 + abs(value))) & (lost_share > 0)
+        carry = np.where(
+            self._rows_to_previous_in_scan > 0,
+            value_at_node(level.rho) ** np.maximum(self._rows_to_previous_in_scan, 1),
+            0.0,
+        )
         carry[lost] = 0.0
         carry[1:][lost[:-1]] = 0.0
-        walk = at(level.walk) ** 2 * self._rows_on if np.any(level.walk) else np.zeros(0)
+        walk = value_at_node(level.walk) ** 2 * self._rows_to_previous_in_table if np.any(level.walk) else np.zeros(0)
         log_extra = 0.0
         if lost_share > 0:
-            n_lost, cells = int(lost.sum()), max(float(np.ptp(self._readings)) / self._lost_value_resolution, 1.0)
+            n_lost, cells = (
+                int(lost.sum()),
+                max(float(np.ptp(self._usable_readings)) / self._lost_reading_resolution, 1.0),
+            )
             # Each lost reading has that value to within a cell.
-            log_extra = n_lost * math.log(lost_share / self._lost_value_resolution)
-            log_extra += log_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
+            log_extra = n_lost * math.log(lost_share / self._lost_reading_resolution)
+            log_extra += log_prior_of_lost_value(value, cells, self.recording.plan.instrumentation.declared_ends)
             log_extra += (len(lost) - n_lost) * math.log1p(-lost_share)
         return NoiseLaw(
-            sd, carry, lost, at(level.wide_share), at(level.wide_times), log_extra, least=self.least_sd, walk=walk
+            sd,
+            carry,
+            lost,
+            value_at_node(level.wide_share),
+            value_at_node(level.wide_times),
+            log_extra,
+            least=self.least_sd,
+            walk=walk,
         )
 
     @cached_property
-    def _readings(self) -> FloatArray:
+    def _usable_readings(self) -> FloatArray:
         return self.recording.readings[self.recording.usable]
 
     @cached_property
-    def _steps(self) -> IntArray:
-        return steps_within_scans(self.recording)
+    def _rows_to_previous_in_scan(self) -> IntArray:
+        return rows_to_previous_usable(self.recording)
 
     @cached_property
-    def _rows_on(self) -> FloatArray:
-        """Rows from the previous usable row, even of another run; for the first, from the start of the table."""
+    def _rows_to_previous_in_table(self) -> FloatArray:
+        """Number of rows since the previous usable one, even of another run; for the first, since the table's start."""
         return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
 
     @cached_property
@@ -165,17 +181,17 @@ class NoiseModel:
         return self.recording.relative_sd[self.recording.usable]
 
     @cached_property
-    def _lost_value_resolution(self) -> float:
+    def _lost_reading_resolution(self) -> float:
         """Resolution of a lost reading's value, in reading units."""
         return self._rounding_step or _FINE * rough_sd(self.recording) or 1e-12
 
     @cached_property
     def _rounding_step(self) -> float:
         """Rounding step of all readings, 0 if there is none."""
-        return lattice_step(self._readings)
+        return lattice_step(self._usable_readings)
 
 
-def log_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
+def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
     """Return the log prior probability of the value of lost readings.
 
     Half is for the ends of the declared range, and half for any of the cells.
@@ -186,7 +202,7 @@ def log_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
     return math.log(0.5 * at_end / len(ends) + 0.5 / cells)
 
 
-def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
+def _sd_nodes_with_rounding(residuals: FloatArray, half_step: float, n_points: int) -> tuple[FloatArray, FloatArray]:
     """Return nodes and log weights, (n,), for the noise sd with rounding, as half steps per sd.
 
     They are coarse, and refined about the best down to the accuracy of log sigma without rounding; they extend to the
@@ -195,7 +211,7 @@ def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> 
 
     def log_likelihood(halves: FloatArray) -> FloatArray:
         sigma = half_step / halves
-        return -Flat(halves, sigma).minus_log_likelihood(residuals[:, None], sigma, n_points)
+        return -RoundedNormal(halves, sigma).minus_log_likelihood(residuals[:, None], sigma, n_points)
 
     rms = math.sqrt(float(residuals @ residuals) / n_points)
     widest = math.floor(math.log(half_step / (2 * rms)) / _APART) if rms > 0 else _NARROWEST
@@ -212,7 +228,7 @@ def _beside_rounding(residuals: FloatArray, half_step: float, n_points: int) -> 
     return np.exp(x[likely]), log_weights[likely]
 
 
-def hides_the_noise(step: float, recording: Recording) -> bool:
+def rounding_hides_noise(step: float, recording: Recording) -> bool:
     """Return whether rounding is too coarse for a normal density of the readings.
 
     False if no three readings are successive, which are needed to tell.
@@ -220,7 +236,7 @@ def hides_the_noise(step: float, recording: Recording) -> bool:
     return 0 < rough_sd(recording) < _HIDDEN * step
 
 
-def least_sd(recording: Recording) -> float:
+def least_sd_given_rounding(recording: Recording) -> float:
     """Return the least sd of a normal density of the readings, given their rounding.
 
     On a coarse lattice, a smaller sd would favour models whose levels fall on the lattice, by a nat in ten readings at
@@ -234,7 +250,7 @@ def rough_sd(recording: Recording) -> float:
 
     The estimate includes rounding; equal readings are spread over a step, so that the median is not one of few values.
     """
-    readings, steps = recording.readings[recording.usable], steps_within_scans(recording)
+    readings, steps = recording.readings[recording.usable], rows_to_previous_usable(recording)
     inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1
     bends = np.sort(readings[inner - 1] - 2 * readings[inner] + readings[inner + 1])
     step = lattice_step(readings)

@@ -20,7 +20,7 @@ from probewise.recordings.plan import Plan
 from probewise.sensor import ACCURATE_NODES, footprint_of
 
 
-def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
+def mix_over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.random.Generator) -> ModelSamples:
     """Mix samples of one hypothesis at several SSF orders by their probability.
 
     All are converted to the largest order, by splitting Gaussians into two equal halves.
@@ -46,7 +46,7 @@ def over_orders(parts: Sequence[ModelSamples], weights: FloatArray, *, rng: np.r
     return replace(largest, theta=np.concatenate(theta)[order], noise_sd=np.concatenate(noise_sd)[order])
 
 
-def side_by_side(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
+def can_share_one_model(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect[Any]]) -> bool:
     """Return whether hypotheses of these effects can be combined in one model.
 
     Shared effects must be bound to the same scans; an effect that one lacks must have a null setting.
@@ -57,7 +57,7 @@ def side_by_side(first: Sequence[NamedEffect[Any]], second: Sequence[NamedEffect
     return alike and all(effect.nothing for effect in (*first, *second) if effect.name not in shared)
 
 
-def over_hypotheses(
+def mix_over_hypotheses(
     parts: Sequence[ModelSamples], shares: FloatArray, null: Null, plan: Plan, *, rng: np.random.Generator
 ) -> ModelSamples:
     """Mix samples of several hypotheses by their probability; effects that one lacks have their null setting.
@@ -65,7 +65,7 @@ def over_hypotheses(
     Parameters
     ----------
     parts
-        Samples of each hypothesis, in equal numbers; they are compatible (`side_by_side`) and share a noise model.
+        Samples of each hypothesis, in equal numbers; they fit in one model (`can_share_one_model`).
     shares
         Probability of each, (n_parts,).
     null

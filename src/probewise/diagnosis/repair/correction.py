@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.held_out import HeldOut, gain_by_part, held_out_blocks
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.held_out import HeldOutGain, hold_out_each_part, partition_into_blocks
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
-from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.improvement import N_DRAWS, Improvement
 from probewise.diagnosis.residuals.locate import ALARM, bayes_factor_p_value
 from probewise.diagnosis.search.searched import Searched
@@ -29,11 +29,11 @@ _MOST_BASES = 6
 
 @dataclass(frozen=True, eq=False)
 class Correction:
-    """A correction: `change` of the readings (n_points,), and its gain on held-out parts."""
+    """A correction: `change` of the readings (n_usable,), the basis `columns`, and the gain on held-out parts."""
 
     change: FloatArray
     columns: FloatArray
-    held_out: HeldOut
+    held_out: HeldOutGain
 
     @property
     def gains_nothing(self) -> bool:
@@ -41,17 +41,17 @@ class Correction:
         return bool(self.held_out.by_scan) and self.held_out.per_reading <= 0
 
 
-def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Correction:
+def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, scan: IntArray) -> Correction:
     """Correct a fit by the basis with the largest evidence.
 
     Parameters
     ----------
     found, problem
-        The null, and its linearisation under the noise model found.
+        The fit, and its linearisation under the noise model found.
     bases
         The candidate bases.
     scan
-        Scan of each usable row, for holding scans out, shape (n_points,).
+        Number of the part of each usable row, to hold parts out in turn, (n_usable,).
     """
     scores = bases.log_bayes_factors(problem)[:, 0]
     # Among bases of about equal evidence, the one with the fewest columns: a basis with one amplitude per scan cannot
@@ -62,18 +62,20 @@ def correct(found: Fit, problem: Linearised, bases: Bank, scan: IntArray) -> Cor
     columns = columns[:, norms > 0] / norms[norms > 0]
     everything = np.ones(len(found.residuals), dtype=np.bool_)
     plain = np.zeros((len(columns), 0))
-    change = found.residuals - _fit_without_rows(found, problem, columns, everything, everything)[0]
+    change = found.residuals - _residuals_and_variances(found, problem, columns, everything, everything)[0]
 
-    def gain(out: BoolArray) -> FloatArray:
-        return _log_density(found, problem, columns, out) - _log_density(found, problem, plain, out)
+    def gain_per_reading(out: BoolArray) -> FloatArray:
+        return _held_out_log_densities(found, problem, columns, out) - _held_out_log_densities(
+            found, problem, plain, out
+        )
 
-    return Correction(change, columns, gain_by_part(scan, gain))
+    return Correction(change, columns, hold_out_each_part(scan, gain_per_reading))
 
 
-def corrected(
-    searched: Searched, test: GlobalTest, best: Best, *, rng: np.random.Generator
+def improvement_and_correction(
+    searched: Searched, test: GlobalTest, best: BestRepair, *, rng: np.random.Generator
 ) -> tuple[Improvement, FloatArray]:
-    """Correct the residuals of the named effects by basis functions, if this improves held-out predictions.
+    """Correct the residuals of the best fit by basis functions, if this improves held-out predictions.
 
     Bases are added one at a time until the test passes or the next one gains nothing. If the first gains nothing on
     other scans, blocks within scans are held out instead, for residuals that are local in time.
@@ -86,10 +88,10 @@ def corrected(
     prepared, bases, problem = searched.prepared, searched.misfit_templates.unknown_bases, best.problem
     found, gain = best.fit.found, best.improvement
     parts, part_names = prepared.apparatus.held_out_parts(prepared.recording)
-    fixed = correct(found, problem, bases, parts)
+    fixed = correct_by_best_basis(found, problem, bases, parts)
     if fixed.gains_nothing:
-        parts, part_names = held_out_blocks(prepared.recording)
-        fixed = correct(found, problem, bases, parts)
+        parts, part_names = partition_into_blocks(prepared.recording)
+        fixed = correct_by_best_basis(found, problem, bases, parts)
         gain = replace(gain, heldout_by_scan=())
     change = np.zeros(len(fixed.change))
     if fixed.gains_nothing:
@@ -99,7 +101,7 @@ def corrected(
     log_evidence = searched.evidences.unknown.get(key, plain_z) - plain_z
     for step in range(_MOST_BASES):
         if step:
-            fixed = correct(found, problem, bases, parts)
+            fixed = correct_by_best_basis(found, problem, bases, parts)
         held = fixed.held_out
         if step and held.per_reading <= held.sd:
             break
@@ -121,7 +123,7 @@ def corrected(
             heldout_by_scan=tuple((name, gained + before.get(name, 0.0)) for name, gained in by_scan),
             rms_after=float(np.sqrt(np.mean(found.residuals**2))),
             p_value_after=bayes_factor_p_value(
-                problem, searched.banks_for_test(best.fit.found), problem.draws(N_DRAWS, rng=rng)
+                problem, searched.banks_for_test(best.fit.found), problem.draw_null_residuals(N_DRAWS, rng=rng)
             ),
         )
         if gain.p_value_after >= ALARM or not held.by_scan:
@@ -129,7 +131,7 @@ def corrected(
     return gain, change
 
 
-def _fit_without_rows(
+def _residuals_and_variances(
     found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray, asked: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Fit parameters and amplitudes to the `kept` rows; return residuals and variances of the mean for `asked` rows."""
@@ -151,9 +153,9 @@ def _fit_without_rows(
     )
 
 
-def _log_density(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
-    miss, spread = _fit_without_rows(found, problem, columns, ~out, out)
-    kept_miss, _ = _fit_without_rows(found, problem, columns, ~out, ~out)
+def _held_out_log_densities(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
+    miss, spread = _residuals_and_variances(found, problem, columns, ~out, out)
+    kept_miss, _ = _residuals_and_variances(found, problem, columns, ~out, ~out)
     n_free = max(len(kept_miss) - found.slopes.shape[1] - columns.shape[1], 1)
     total = float(kept_miss @ kept_miss) / n_free + spread
     return np.asarray(-0.5 * np.log(2 * math.pi * total) - 0.5 * miss**2 / total)

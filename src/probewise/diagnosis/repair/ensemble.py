@@ -12,8 +12,8 @@ import numpy as np
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.repair.averaging import over_hypotheses, over_orders, side_by_side
-from probewise.diagnosis.repair.best import Best, predicts_far_worse
+from probewise.diagnosis.repair.averaging import can_share_one_model, mix_over_hypotheses, mix_over_orders
+from probewise.diagnosis.repair.best_repair import BestRepair, predicts_far_worse
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary
@@ -48,7 +48,7 @@ class HypothesisSamples:
             weights = np.exp(log_z - log_z.max())
             kept = weights > _LEAST_OF_AN_ORDER * weights.sum()
             parts = [self._draw_samples(c) for c in itertools.compress(alike, kept)]
-            self._known[key] = over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
+            self._known[key] = mix_over_orders(parts, weights[kept] / weights[kept].sum(), rng=self.rng)
         return self._known[key]
 
     def compatible_probabilities(self, best: WeighedFit) -> dict[Names, float]:
@@ -58,12 +58,12 @@ class HypothesisSamples:
         """
         out: dict[Names, float] = {}
         prepared = self.searched.prepared
-        own = prepared.apparatus.own_effects(prepared.effects)
+        own = prepared.apparatus.user_effect_names(prepared.effects)
         for names in dict.fromkeys(names for _, names in self.searched.evidences.fits):
             log_z = [c.evidence[self.noise].log_z for c in self._candidates_of_same_form(best, names)]
             # A file cannot hold a user's own effect; it is kept only if it is in the best hypothesis.
             if log_z and not own & ({*names} - {*best.names}):
-                out[names] = float(np.logaddexp.reduce(log_z)) + self.searched.prior.log_mean(names)
+                out[names] = float(np.logaddexp.reduce(log_z)) + self.searched.prior.log_prior_on_mean(names)
         total = np.logaddexp.reduce(list(out.values()))
         return {names: math.exp(value - total) for names, value in out.items()}
 
@@ -77,13 +77,13 @@ class HypothesisSamples:
             if probabilities[names] < _LEAST_OF_A_RIVAL or len(kept) == _MOST:
                 break
             rival = max(self._candidates_of_same_form(best, names), key=lambda c: c.evidence[self.noise].log_z)
-            if all(side_by_side(c.found.model.effects, rival.found.model.effects) for _, c, _ in kept):
+            if all(can_share_one_model(c.found.model.effects, rival.found.model.effects) for _, c, _ in kept):
                 kept.append((self.averaged_over_orders(rival), rival, probabilities[names]))
         if len(kept) == 1:
             return kept[0][0]
         parts, shares = [part for part, _, _ in kept], np.array([p for _, _, p in kept])
         null = self.searched.nulls[max(part.n_gaussians for part in parts)]
-        return over_hypotheses(parts, shares, null, self.searched.prepared.recording.plan, rng=self.rng)
+        return mix_over_hypotheses(parts, shares, null, self.searched.prepared.recording.plan, rng=self.rng)
 
     def _candidates_of_same_form(self, best: WeighedFit, names: Names) -> list[WeighedFit]:
         """List the refitted candidates of a combination, one per SSF order, whose SSF has the best one's form."""
@@ -114,7 +114,7 @@ def draw_models(
     searched: Searched,
     test: GlobalTest,
     judged: Judged,
-    best: Best,
+    best: BestRepair,
     *,
     rng: np.random.Generator,
     progress: Progress = silent,
@@ -144,7 +144,7 @@ def _average_of_named_and_null(
     by_mean = searched.posterior.by_mean
     named = {names for _, names in searched.evidences.fits if not effects_out_of_vocabulary(names)}
     fit = searched.best_refit_of(max(named, key=lambda names: by_mean.get(names, 0.0)), noise) or test.null
-    if fit.names and predicts_far_worse(Best.of(searched, test, fit, noise, rng=cached.rng).improvement):
+    if fit.names and predicts_far_worse(BestRepair.of(searched, test, fit, noise, rng=cached.rng).improvement):
         return cached.averaged_over_orders(test.null)
     shares = {names: by_mean.get(names, 0.0) for names in cached.compatible_probabilities(fit) if names}
     return cached.averaged_over_hypotheses(fit, {**shares, (): max(1 - sum(shares.values()), 0.0)})

@@ -53,8 +53,10 @@ def improvement_of(
     log_evidence = best.evidence[noise].log_z - null.evidence[searched.certain].log_z
     if best is null:
         return Improvement(log_evidence, 0.0, 0.0, (), rms[0], rms[1], p_value_after=test.p_value)
-    law, prepared = best.evidence[noise].law, searched.prepared
+    law, prepared = best.evidence[noise].likeliest_law, searched.prepared
     parts = prepared.apparatus.held_out_parts(prepared.recording)
     held = held_out_gain(null.found, best.found, prepared.recording, law, parts)
-    p_after = bayes_factor_p_value(after, searched.banks_for_test(best.found), after.draws(N_DRAWS, rng=rng))
+    p_after = bayes_factor_p_value(
+        after, searched.banks_for_test(best.found), after.draw_null_residuals(N_DRAWS, rng=rng)
+    )
     return Improvement(log_evidence, held.per_reading, held.sd, held.by_scan, rms[0], rms[1], p_value_after=p_after)

@@ -9,7 +9,7 @@ import numpy as np
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.judgement.global_test import N_DRAWS, GlobalTest
 from probewise.diagnosis.judgement.judged import Judged
-from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.residuals.locate import Place, places_of_effect, significant_places
 from probewise.diagnosis.search.searched import Searched
 
@@ -18,7 +18,7 @@ def locate_effects_and_residuals(
     searched: Searched,
     test: GlobalTest,
     judged: Judged,
-    best: Best,
+    best: BestRepair,
     sizes: Mapping[str, float],
     *,
     rng: np.random.Generator,
@@ -38,11 +38,11 @@ def locate_effects_and_residuals(
     """
     prepared, problem, law = searched.prepared, test.problem, test.problem.law
     covariates, residuals = searched.misfit_templates.covariates, test.null.found.residuals
-    plan, found = prepared.recording.plan.take(prepared.usable), best.fit.found
+    plan, found = prepared.recording.plan.take(prepared.usable_rows), best.fit.found
     scans = next((c for c in covariates if c.name == "scan"), None)
     named: list[Place] = []
     for effect in sorted(found.model.effects, key=lambda e: -sizes.get(e.name, 0.0)):
-        change = found.change_by(effect.name, prepared.usable)
+        change = found.change_by(effect.name, prepared.usable_rows)
         shows_in = prepared.apparatus.covariate_of(effect, change, found.predicted - change, plan, covariates)
         if shows_in is not None:
             size = sizes.get(effect.name, 0.0)
@@ -53,8 +53,10 @@ def locate_effects_and_residuals(
     scanned = significant_places(problem, covariates, scan_names, residuals, test.draws)
     if judged.verdict == "unknown" and not (named or scanned) and law.share:
         # Under heavy-tailed noise, residuals in outlying readings only are not significant.
-        white = Linearised.of(test.null.found, law.plain())
-        scanned = significant_places(white, covariates, scan_names, residuals, white.draws(N_DRAWS, rng=rng))
+        white = Linearised.of(test.null.found, law.without_tail_or_rounding())
+        scanned = significant_places(
+            white, covariates, scan_names, residuals, white.draw_null_residuals(N_DRAWS, rng=rng)
+        )
     first: dict[str, Place] = {}
     for place in [*named, *scanned]:
         first.setdefault(place.figure_name, place)

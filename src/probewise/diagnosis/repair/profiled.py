@@ -63,7 +63,7 @@ class ProfiledDensity:
         None if there is no such coordinate, or none whose slices can be fitted.
         """
         slopes = law(found.slopes)
-        sd = max(float(law.scale(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.information)
+        sd = max(float(law.likeliest_sigma(law(found.residuals)[:, None])[0]), 1e-150) / np.sqrt(law.information)
         covariance = np.linalg.inv(slopes.T @ slopes / sd**2 + np.eye(len(found.z)))
         tried = [
             cls._of_coordinate(found, law, recording, at, covariance, float(sd)) for at in _nonlinear_coordinates(found)
@@ -95,9 +95,9 @@ class ProfiledDensity:
             near = z[:, None, :] + _STEP * np.concatenate([np.zeros((1, len(rest))) @ eye[rest], eye[rest]])
             predicted = found.model.predict(near.reshape(-1, z.shape[1]))[:, usable]
             whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
-            sigma = law.scale(whitened[:, 0].T)
+            sigma = law.likeliest_sigma(whitened[:, 0].T)
             height = -law.minus_log_likelihood(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
-            normal = law.as_normal(whitened[:, 0].T, sigma).T
+            normal = law.normal_pseudo_observations(whitened[:, 0].T, sigma).T
             joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
             return np.where(np.isfinite(height), height, -np.inf), joined
 
@@ -219,7 +219,7 @@ def _nonlinear_coordinates(found: Fit) -> list[int]:
     """List the indices of the effects' coordinates other than amplitudes."""
     out = []
     for effect in found.model.effects:
-        first = found.model.coordinates_of(effect.name).start
+        first = found.model.coordinate_slice(effect.name).start
         out += [first + k for k in range(len(effect.prior.names)) if k not in effect.amplitudes]
     return out
 

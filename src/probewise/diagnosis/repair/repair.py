@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray, frozen
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.prepared import Prepared
-from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.ensemble import DrawnModels
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.samples import ModelSamples
@@ -91,7 +91,7 @@ class Repair:
     """The old name of `unstated_effects`."""
 
 
-def repair_of(prepared: Prepared, test: GlobalTest, best: Best, drawn: DrawnModels, change: FloatArray) -> Repair:
+def repair_of(prepared: Prepared, test: GlobalTest, best: BestRepair, drawn: DrawnModels, change: FloatArray) -> Repair:
     """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
 
     Parameters
@@ -103,15 +103,15 @@ def repair_of(prepared: Prepared, test: GlobalTest, best: Best, drawn: DrawnMode
     """
     null, fit = test.null.found, best.fit.found
     everything = prepared.everything
-    if prepared.thinned:
+    if prepared.is_thinned:
         readings = np.where(everything.usable, everything.readings, np.nan)
         plans = (replace(found.model, plan=everything.plan).predict(found.z[None, :])[0] for found in (null, fit))
         before, after = (Predicted(predicted, readings - predicted) for predicted in plans)
     else:
         by_rows = np.zeros(len(prepared.recording))
-        by_rows[prepared.usable] = change
-        before = Predicted(_predictions_of_all_rows(null), prepared.spread(null.residuals))
-        after = Predicted(_predictions_of_all_rows(fit) + by_rows, prepared.spread(fit.residuals - change))
+        by_rows[prepared.usable_rows] = change
+        before = Predicted(_predictions_of_all_rows(null), prepared.expand_to_all_rows(null.residuals))
+        after = Predicted(_predictions_of_all_rows(fit) + by_rows, prepared.expand_to_all_rows(fit.residuals - change))
     return Repair(drawn.null, drawn.model, best.improvement, before, after, by_rows=bool(np.any(change)))
 
 

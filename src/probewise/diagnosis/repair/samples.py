@@ -14,7 +14,7 @@ from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
 from probewise.calibration.fields import choose_pixel_mm, mean_field, sorted_by_mass
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
-from probewise.diagnosis.evidence.joint import JointProblem
+from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
@@ -134,12 +134,12 @@ def sample_model(
     progress
         Called with the progress of annealing.
     """
-    law, n_samples = noise.law, N_SAMPLES
+    law, n_samples = noise.likeliest_law, N_SAMPLES
     z = np.clip(_posterior_draws(found, noise, recording, annealed, progress, rng=rng), -FARTHEST, FARTHEST)
     # Samples that are not annealed serve for the effects only: their noise is that of the fit.
     predicted = found.model.predict(z)[:, recording.usable] if annealed else found.predicted[None, :]
     residuals = recording.readings[recording.usable] - predicted
-    sigma = law.scale(law(residuals.T))
+    sigma = law.likeliest_sigma(law(residuals.T))
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, n_samples))
     noise_sd = np.maximum(noise_sd, found.sd * 1e-6 + 1e-12)
     on_noise = [effect for effect in noise.noise.effects if effect.name not in NUISANCES]
@@ -148,11 +148,11 @@ def sample_model(
     chain = null.chain(recording.plan, effects, n_nodes=ACCURATE_NODES)
     own = {
         effect.name: effect.redraw_by_variant(
-            effect_values(effect, z[:, found.model.coordinates_of(effect.name)]), weights[effect.name], rng=rng
+            effect_values(effect, z[:, found.model.coordinate_slice(effect.name)]), weights[effect.name], rng=rng
         )
         for effect in found.model.effects
     }
-    theta = found.model.theta_of(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
+    theta = found.model.joined_theta(found.model.sensor.theta(z[:, : found.model.sensor.n_params]), own)
     nodes = rng.choice(len(noise.weights), n_samples, p=noise.weights)
     theta = np.concatenate([theta, *(_draws_about_nodes(effect, noise, nodes, rng=rng) for effect in on_noise)], axis=1)
     names = tuple(effect.name for effect in chain.effects)
@@ -162,12 +162,12 @@ def sample_model(
         theta[:, i] += sd * rng.standard_normal(n_samples)
     rounding = theta[:, of_lattice].sum(axis=1)
     if law.flat:  # sd at each noise node, without rounding if that is an effect, else including it
-        each = [own.sigma * (1.0 if of_lattice else own.widening) for own in noise.nodes.laws]
+        each = [own.sigma * (1.0 if of_lattice else own.sd_factor_of_rounding) for own in noise.nodes.laws]
         noise_sd = np.array(each)[nodes]
     else:
         noise_sd = _sd_without_rounding(noise_sd, rounding, law.n_points)
     return ModelSamples(
-        chain, theta, noise_sd, names, null.n_gaussians, nuisance=null.nuisance, exchangeable=null.exchangeable
+        chain, theta, noise_sd, names, null.n_gaussians, nuisance=null.nuisance_names, exchangeable=null.exchangeable
     )
 
 
@@ -181,9 +181,9 @@ def _posterior_draws(
     rng: np.random.Generator,
 ) -> FloatArray:
     """Draw coordinates, (N_SAMPLES, n_params), from the posterior; from Laplace's approximation unless `annealed`."""
-    law, model = noise.law, found.model
+    law, model = noise.likeliest_law, found.model
     whitened, turned = law(found.residuals)[:, None], law(found.slopes)
-    sigma = law.scale(whitened)
+    sigma = law.likeliest_sigma(whitened)
     sd = max(float(sigma[0]) / math.sqrt(law.information), 1e-150)
     curvature = turned.T @ turned / sd**2 + np.eye(len(found.z))
     # A step in one coordinate also moves the later ones. With the effects first and the sensor last, most steps leave
@@ -191,19 +191,19 @@ def _posterior_draws(
     order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
     at, steps = np.ix_(order, order), np.empty_like(curvature)
     steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
-    normal = law.as_normal(whitened, np.maximum(sigma, 1e-150))[:, 0]
+    normal = law.normal_pseudo_observations(whitened, np.maximum(sigma, 1e-150))[:, 0]
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
     center = np.clip(center, -FARTHEST, FARTHEST)
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)
-    problem, usable = JointProblem(model, recording, noise.at_best), recording.usable
+    problem, usable = HypothesisProblem(model, recording, noise.at_likeliest_node), recording.usable
 
     def log_posterior(z: FloatArray) -> FloatArray:
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)
 
-    profiled = ProfiledDensity.of(found, law, recording) if model.sensor.in_bulk else None
+    profiled = ProfiledDensity.of(found, law, recording) if model.sensor.predicts_in_bulk else None
     if profiled is not None:
         weighed = profiled.importance_resample(log_posterior, n_first=_N_PROFILED, n_wanted=N_SAMPLES, rng=rng)
         if weighed is not None:
@@ -239,7 +239,7 @@ def _draws_about_nodes(
 
     `nodes` (n_samples,) are indices of nodes; parameters that are the same in all nodes stay as they are.
     """
-    settings = noise.nodes.settings[:, noise.noise.columns_of(effect.name)]
+    settings = noise.nodes.settings[:, noise.noise.column_slice(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)
     if own is not None:
         return own

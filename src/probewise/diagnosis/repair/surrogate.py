@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.joint import log_likelihood_of_whitened
+from probewise.diagnosis.evidence.hypothesis_problem import log_likelihood_of_whitened_residuals
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.noise.law import NoiseLaw
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
@@ -41,14 +41,14 @@ class SurrogatePosterior:
     ) -> Self:
         """Build from quadratic predictions of the usable readings, the readings, (n_points,), and the noise."""
         residual = law(readings - quadratic.center)[:, None]
-        residual = law.as_normal(residual, np.maximum(law.scale(residual), 1e-150))
+        residual = law.normal_pseudo_observations(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
         _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
-        normal = law.plain()
+        normal = law.without_tail_or_rounding()
         return cls(quadratic, center, steps, normal, turned[:, -1], turned[:, :-1])
 
     def log_density(self, e: FloatArray) -> FloatArray:
         """Return the unnormalised log posterior at steps e, (n_samples,); minus infinity beyond six prior sds."""
         z = self.center + e @ self.steps
         whitened = self.residual[:, None] - self.changes @ self.quadratic.amounts_of_changes(e).T
-        height = log_likelihood_of_whitened(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
+        height = log_likelihood_of_whitened_residuals(self.law, whitened) - 0.5 * np.sum(z**2, axis=1)
         return np.where((np.abs(z) < FARTHEST).all(axis=1), height, -np.inf)

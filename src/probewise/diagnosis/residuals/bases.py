@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.laplace import Blocks, Linearised
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
 from probewise.diagnosis.residuals.covariate import Covariate
 
 _LIKE = 0.9  # cosine from which a basis duplicates a named effect
@@ -41,7 +41,7 @@ class _BasisMultipliers:
 
 def bank_of_unknown_effects(
     covariates: Sequence[Covariate], signal: FloatArray, slope: FloatArray, starts: IntArray
-) -> Bank:
+) -> TemplateBank:
     """Build the template bank of unknown effects: basis functions over every covariate.
 
     Parameters
@@ -71,10 +71,10 @@ def bank_of_unknown_effects(
     found += [("what was seen before", template) for template in _memory_bases(signal, starts)]
     found += [("ends of scans", template) for template in _end_transients(len(signal), starts)]
     kept = [(name, template) for name, template in found if np.any(template)]
-    return Bank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
+    return TemplateBank.of([t for _, t in kept], [name for name, _ in kept], len(signal))
 
 
-def bases_unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
+def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linearised) -> TemplateBank:
     """Return the bases without those of one column that are nearly collinear with a named effect's template.
 
     That is, whose projections orthogonal to the null have a cosine of 0.9 or more. A window that extends to the end of
@@ -84,8 +84,8 @@ def bases_unlike_named(bases: Bank, named: Bank, problem: Linearised) -> Bank:
     if single.size == 0 or named.widths.size == 0:
         return bases
     alone = bases.take(single).columns
-    own = Blocks.of(problem, list(alone.T[:, :, None]), [""] * len(single)).u
-    blocks = Blocks.of(problem, [named[k] for k in range(len(named.widths))], named.labels)
+    own = OrthonormalBlocks.of(problem, list(alone.T[:, :, None]), [""] * len(single)).u
+    blocks = OrthonormalBlocks.of(problem, [named[k] for k in range(len(named.widths))], named.labels)
     cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own) ** 2, blocks.starts, axis=0))
     like = single[cosines.max(axis=0, initial=0.0) >= _LIKE]
     return bases.take(np.setdiff1d(np.arange(len(bases.widths)), like))

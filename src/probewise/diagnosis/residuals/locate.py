@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray, frozen
-from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.effects import NamedEffect
@@ -70,7 +70,7 @@ class Place:
     """The old name of `figure_name`."""
 
 
-def bayes_factor_p_value(problem: Linearised, banks: Sequence[Bank], draws: FloatArray) -> float:
+def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], draws: FloatArray) -> float:
     """Test for a missing effect on the mean, by the weighted mean of the Bayes factors of all templates.
 
     Parameters

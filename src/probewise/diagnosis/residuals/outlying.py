@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import betaln
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.screening import log_mean
+from probewise.diagnosis.evidence.screening import log_mean_exp
 from probewise.diagnosis.noise.law import NoiseLaw, Tail
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import window_columns_and_bounds
@@ -26,7 +26,7 @@ _A = 0.5  # parameter of the beta prior of the share of outlying readings (Jeffr
 def outlier_probabilities(residuals: FloatArray, law: NoiseLaw) -> FloatArray:
     """Return each reading's probability to be of the wide component of heavy-tailed noise, (n_points,)."""
     whitened = law(residuals)
-    return Tail(law.share, law.times).wide((whitened / law.scale(whitened[:, None])[0]) ** 2)
+    return Tail(law.share, law.times).wide_probability((whitened / law.likeliest_sigma(whitened[:, None])[0]) ** 2)
 
 
 def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covariate]) -> dict[str, float]:
@@ -53,4 +53,4 @@ def clustering_log_bayes_factors(far_out: FloatArray, covariates: Sequence[Covar
             outside, few = total - inside, n - many
             apart = betaln(inside + _A, many - inside + _A) + betaln(outside + _A, few - outside + _A)
             scores.setdefault(f"{covariate.name}{FAR_OUT}", []).append(apart - 2 * betaln(_A, _A) - even)
-    return {family: log_mean(np.concatenate(own)) for family, own in scores.items()}
+    return {family: log_mean_exp(np.concatenate(own)) for family, own in scores.items()}

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.screening import log_mean, score_effects
-from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.evidence.screening import log_mean_exp, score_bank_entries
+from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.search.noises import WITH_MEMORY
 from probewise.diagnosis.search.search import search
 from probewise.diagnosis.search.searched import Searched
@@ -32,24 +32,28 @@ def search_with_formulas(searched: Searched, *, progress: Progress = silent) -> 
     product. Noise with memory absorbs slow changes.
     """
     prepared = searched.prepared
-    if not needs_more_than_memoryless_noise(searched) or prepared.apparatus.refit_budget_is_spent():
+    if not needs_more_than_memoryless_noise(searched) or prepared.apparatus.is_refit_budget_spent():
         return searched
-    proposals = prepared.apparatus.proposals()
+    proposals = prepared.apparatus.proposed_effects()
     if not proposals:
         return searched
     progress("weighing formulas")
     every = {**prepared.effects, **proposals}
     prior = prepared.apparatus.prior_odds(every)
     score = _log_evidence_by_formula(searched, proposals)
-    odds = {name: value + prior.log_mean((name,)) - prior.log_mean(()) for name, value in score.items()}
-    best = max(fit.log_z + searched.prior.log_mean(names) for (_, names), fit in searched.evidences.fits.items())
+    odds = {
+        name: value + prior.log_prior_on_mean((name,)) - prior.log_prior_on_mean(()) for name, value in score.items()
+    }
+    best = max(
+        fit.log_z + searched.prior.log_prior_on_mean(names) for (_, names), fit in searched.evidences.fits.items()
+    )
     ranked = sorted(odds, key=lambda name: -odds[name])[:_MOST]
     kept = {name: proposals[name] for name in ranked if odds[name] > best - _WITHIN}
     if not kept:
         return searched
     more = replace(prepared, effects={**prepared.effects, **kept})
     again = search(more, prior=prior, after=searched, progress=progress)
-    return searched if prepared.apparatus.refit_budget_is_spent() else again
+    return searched if prepared.apparatus.is_refit_budget_spent() else again
 
 
 def needs_more_than_memoryless_noise(searched: Searched) -> bool:
@@ -63,15 +67,15 @@ def _log_evidence_by_formula(searched: Searched, proposals: Mapping[str, NamedEf
 
     The log prior of that null or effect is included, that of the formula is not.
     """
-    usable, null = searched.prepared.usable, searched.null
+    usable, null = searched.prepared.usable_rows, searched.null
     singles = [fit for (_, names), fit in searched.evidences.fits.items() if len(names) == 1]
     parents = [null, *sorted(singles, key=lambda fit: -fit.log_z)[:1]]
-    memory, out = TemplateMemory(usable), dict[str, float]()
-    bank: Bank = memory.bank(null.found, list(proposals.values()))
+    memory, out = TemplateCache(usable), dict[str, float]()
+    bank: TemplateBank = memory.coarse_bank(null.found, list(proposals.values()))
     for parent in parents:
         for _, evidence in parent.leading_noises():
-            scores = score_effects(Linearised.of(parent.found, evidence.law), bank)
+            scores = score_bank_entries(Linearised.of(parent.found, evidence.likeliest_law), bank)
             for name, own in scores.items():
-                value = evidence.log_z + searched.prior.log_mean(parent.names) + log_mean(own)
+                value = evidence.log_z + searched.prior.log_prior_on_mean(parent.names) + log_mean_exp(own)
                 out[name] = max(value, out.get(name, value))
     return out

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.screening import log_mean, score_pairs
+from probewise.diagnosis.evidence.screening import log_mean_exp, score_pairs
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.constants import (
     ABSORBED,
@@ -89,14 +89,14 @@ def _proposals_to_refit(
 def _screen_pairs(state: SearchState, null: WeighedFit) -> None:
     """Store the log evidence of pairs of the best effects by templates about a null, under its leading noises."""
     for noise, evidence in null.leading_noises():
-        singles = state.log_bayes_factors_by_effect(null, evidence.law, null)
+        singles = state.log_bayes_factors_by_effect(null, evidence.likeliest_law, null)
         alone = [name for name in singles if name_of_first_copy(name) is None]
         ranked = sorted(alone, key=lambda name: -float(singles[name].max()))[:PAIRED]
-        if not ranked or log_mean(singles[ranked[0]]) < PAIRED_FROM:
+        if not ranked or log_mean_exp(singles[ranked[0]]) < PAIRED_FROM:
             continue
         singles = {name: singles[name] for name in ranked}
-        templates = {name: state.templates.of(null.found, state.effects[name]) for name in ranked}
-        for pair, value in score_pairs(Linearised.of(null.found, evidence.law), templates, singles).items():
+        templates = {name: state.templates.templates_of(null.found, state.effects[name]) for name in ranked}
+        for pair, value in score_pairs(Linearised.of(null.found, evidence.likeliest_law), templates, singles).items():
             state.about_null[pair, noise] = evidence.log_z + value
 
 
@@ -114,12 +114,12 @@ def proposals_for(state: SearchState, parent: WeighedFit, proposals: Mapping[Nam
     known = state.about_parts if parent.names else state.about_null
     out = dict(proposals)
     for noise, evidence in parent.leading_noises():
-        for name, own in state.log_bayes_factors_by_effect(parent, evidence.law, null).items():
+        for name, own in state.log_bayes_factors_by_effect(parent, evidence.likeliest_law, null).items():
             first = name_of_first_copy(name)
             if name in parent.names or (first is not None and first not in parent.names):
                 continue
             names = tuple(sorted((*parent.names, name)))
-            score = evidence.log_z + log_mean(own) - against
+            score = evidence.log_z + log_mean_exp(own) - against
             if names not in state.undetected:  # a refit has said more
                 known[names, noise] = max(score, known.get((names, noise), score))
             if names not in out or score > out[names].score:
@@ -134,7 +134,7 @@ def promising_combinations(
 
     Those more than `behind` nats behind the best refitted combination that they compete with are left out.
     """
-    odds = {names: proposal.score + state.prior.log_mean(names) for names, proposal in proposals.items()}
+    odds = {names: proposal.score + state.prior.log_prior_on_mean(names) for names, proposal in proposals.items()}
     ranked = sorted(odds, key=lambda names: -odds[names])
     named, rest = (
         [n for n in ranked if not effects_out_of_vocabulary(n)],
@@ -153,11 +153,11 @@ def _single_effects_to_refit(state: SearchState, null: WeighedFit, proposals: Ma
     Screening is linear: it cannot judge a user's own effect with a large, nonlinear change, nor an effect that the
     null absorbs nearly completely to first order, nor one of two copies of an effect. Each is a combination of one.
     """
-    ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_mean(names)))
+    ranked = sorted(proposals, key=lambda names: -(proposals[names].score + state.prior.log_prior_on_mean(names)))
     faint, about = set[str](), Linearised.of(null.found, null.law)
     for bank in state.template_banks(null):
         left = bank.unabsorbed_shares(about)
-        faint |= {name for name, of in bank.members.items() if ABSORBED < left[of].max() < FAINT}
+        faint |= {name for name, of in bank.indices_by_label.items() if ABSORBED < left[of].max() < FAINT}
     # One of two waves alone explains little: the other is noise to it.
     twice = {name for name in state.effects if name + AGAIN in state.effects}
     always = state.tried_always | faint | twice
@@ -192,12 +192,12 @@ def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[P
         return []
     scores = state.log_bayes_factors_by_effect(plain, plain.law, plain)
     odds = {
-        name: log_mean(own) + state.prior.log_mean((name,))
+        name: log_mean_exp(own) + state.prior.log_prior_on_mean((name,))
         for name, own in scores.items()
         if name_of_first_copy(name) is None
     }
     ranked = sorted(odds, key=lambda name: -odds[name])[:LEADING_PLAINLY]
-    return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_mean(())]
+    return [Proposal(odds[name], plain, name) for name in ranked if odds[name] > state.prior.log_prior_on_mean(())]
 
 
 def _with_scores_raised(state: SearchState, proposals: Mapping[Names, Proposal]) -> dict[Names, Proposal]:

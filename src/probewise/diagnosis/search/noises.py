@@ -10,11 +10,11 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.laplace import NoiseEvidence, weigh
-from probewise.diagnosis.evidence.templates import combinations_of
+from probewise.diagnosis.evidence.laplace import NoiseEvidence, laplace_evidence
+from probewise.diagnosis.evidence.templates import combinations_up_to
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.noise.models import NoiseModel, hides_the_noise, least_sd, rough_sd
+from probewise.diagnosis.noise.models import NoiseModel, least_sd_given_rounding, rough_sd, rounding_hides_noise
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.constants import MOST_FAULTS, NOISE_PAIR_WITHIN
 from probewise.effects import CorrelatedNoise, NoiseEffect, Quantisation, RandomWalk, lattice_step
@@ -40,7 +40,7 @@ class NoiseModels:
     models: dict[Names, NoiseModel] = field(init=False)
 
     def __post_init__(self) -> None:
-        self.least_sd = least_sd(self.recording)
+        self.least_sd = least_sd_given_rounding(self.recording)
         self._step = lattice_step(self.recording.readings[self.recording.usable])
         # Readings that are all multiples of a coarse step are rounded; this is an effect if it was not declared.
         seen = 0 < Quantisation.seen_above * rough_sd(self.recording) < self._step
@@ -52,9 +52,9 @@ class NoiseModels:
         }
         self._known = {name: (values[None, :], np.zeros(1)) for name, values in (rounded | shown).items()}
         self.certain = tuple(sorted(self._known))
-        self._hidden = hides_the_noise(self._step, self.recording)
+        self._hidden = rounding_hides_noise(self._step, self.recording)
         others = [name for name in self.effects if name not in (Quantisation.name, *self.certain)]
-        single = [tuple(sorted({*names, *self.certain})) for names in combinations_of(others, 1)]
+        single = [tuple(sorted({*names, *self.certain})) for names in combinations_up_to(others, 1)]
         self.models = {names: self._build_model(names) for names in single}
 
     def _build_model(
@@ -67,7 +67,7 @@ class NoiseModels:
 
     def log_prior(self, names: Names) -> float:
         """Return the log prior probability of a noise model; certain effects do not count."""
-        return self.prior.log_noise(self._uncertain_names(names))
+        return self.prior.log_prior_on_noise(self._uncertain_names(names))
 
     def average_log_evidence(self, log_z: Mapping[Names, float]) -> float:
         """Return the log of the evidence averaged over these noise models by their priors; minus infinity for none."""
@@ -76,7 +76,7 @@ class NoiseModels:
 
     def evidence_by_noise(self, found: Fit) -> dict[Names, NoiseEvidence]:
         """Compute the evidence of a fit under every noise model, by its names."""
-        return {names: weigh(found, model) for names, model in self.models.items()}
+        return {names: laplace_evidence(found, model) for names, model in self.models.items()}
 
     def best_evidence(self, evidence: Mapping[Names, NoiseEvidence]) -> NoiseEvidence:
         """Return that of these evidences whose noise model is most probable, priors included."""
@@ -98,14 +98,14 @@ class NoiseModels:
             parts = [n for n in known if set(n) < set(first)]
             if not parts or known[first].log_z < max(known[n].log_z for n in parts) + NOISE_PAIR_WITHIN:
                 return size > 1
-            likely = {name: known[first].likely_nodes(name) for name in self._uncertain_names(first)}
+            likely = {name: known[first].likeliest_nodes_of_effect(name) for name in self._uncertain_names(first)}
             best = max(e.log_z + self.log_prior(names) for names, e in known.items())
             for other in singles:
                 both = tuple(sorted({*first, *other}))
                 if len(self._uncertain_names(both)) != size + 1 or set(both) >= WITH_MEMORY:
                     continue
-                model = self._build_model(both, likely | self.models[other].every_third())
-                own = weigh(found, model)
+                model = self._build_model(both, likely | self.models[other].thinned_nodes())
+                own = laplace_evidence(found, model)
                 if own.log_z + self.log_prior(both) > best - NOISE_PAIR_WITHIN:
                     self.models[both], known[both] = model, own
         return True

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from probewise.diagnosis.fitting.fit import Model
 from probewise.diagnosis.fitting.ssf_forms import Start
-from probewise.diagnosis.noise.law import NoiseLaw, white_of
+from probewise.diagnosis.noise.law import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.search.constants import STEERING
 from probewise.diagnosis.search.state import SearchState
@@ -19,7 +19,7 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
     """
     noises, refits, null = state.noises, state.refits, prepared.null
     recording = prepared.recording
-    plan, law = recording.plan, white_of(recording, least=noises.least_sd)
+    plan, law = recording.plan, white_noise_of_recording(recording, least=noises.least_sd)
 
     n_forms = 1 if null is not None or max_order == 1 else max_order + 2
 
@@ -33,14 +33,14 @@ def fit_nulls(state: SearchState, prepared: Prepared, *, max_order: int) -> None
         fit_and_keep((null, null.starts), law)
     else:
         forms = prepared.apparatus.null_forms(recording)
-        last = fit_and_keep(forms.simplest(), law)
+        last = fit_and_keep(forms.one_gaussian_start(), law)
         if max_order > 1:
-            best = max(fit_and_keep(forms.free(last.found), refits.likeliest_law(last)).log_z, last.log_z)
+            best = max(fit_and_keep(forms.free_form_start(last.found), refits.likeliest_law(last)).log_z, last.log_z)
             for n in range(2, max_order + 2):
                 # One more than the best is always a rival; beyond one that is far behind nothing is to be found.
                 if n > 2 and last.log_z < best - STEERING:
                     break
-                last = fit_and_keep(forms.one_more(last.found, n), refits.likeliest_law(last))
+                last = fit_and_keep(forms.more_gaussians_start(last.found, n), refits.likeliest_law(last))
                 best = max(best, last.log_z)
     if noises.add_significant_pairs(state.null.found, state.null.evidence):
         state.progress("weighing pairs of noises")

@@ -39,8 +39,8 @@ def _orders_to_refit(state: SearchState, source: WeighedFit) -> list[int]:
         for n, sensor in state.sensors.items()
         if (n, source.names) not in state.candidates
         # A freer SSF that the evidence rejects by itself is also rejected with an effect.
-        and (sensor.degrees_of_freedom < source.ssf_degrees_of_freedom or state.candidates[n, ()].log_z > behind)
-        and (sensor.degrees_of_freedom <= source.ssf_degrees_of_freedom + 1 or state.candidates[n, ()].log_z > own)
+        and (sensor.effective_n_gaussians < source.ssf_degrees_of_freedom or state.candidates[n, ()].log_z > behind)
+        and (sensor.effective_n_gaussians <= source.ssf_degrees_of_freedom + 1 or state.candidates[n, ()].log_z > own)
     ]
 
 
@@ -57,7 +57,7 @@ def _refit_at_order(state: SearchState, source: WeighedFit, n: int) -> None:
     log_share = (
         source.log_share
         + state.complexity_penalty(source.ssf_degrees_of_freedom)
-        - state.complexity_penalty(sensor.degrees_of_freedom)
+        - state.complexity_penalty(sensor.effective_n_gaussians)
     )
     candidate = candidate.with_factor_and_weights(log_share, source.weights)
     if is_significant(candidate, null):

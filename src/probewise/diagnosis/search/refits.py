@@ -10,13 +10,13 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.convergence import require_finite
-from probewise.diagnosis.evidence.detectable import log_detectable
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.convergence import checked_finite
+from probewise.diagnosis.evidence.detectable import log_probability_detectable
 from probewise.diagnosis.evidence.laplace import SCALES, Linearised
-from probewise.diagnosis.evidence.screening import log_mean, score_effects
-from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateMemory
-from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
+from probewise.diagnosis.evidence.screening import log_mean_exp, score_bank_entries
+from probewise.diagnosis.evidence.templates import EffectTemplates, TemplateCache
+from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
@@ -41,26 +41,26 @@ class Refits:
 
     sensor: Null | None
     noises: NoiseModels
-    templates: TemplateMemory
+    templates: TemplateCache
     known: dict[tuple[WeighedFit, NamedEffect[Any], float], Extended] = field(default_factory=dict, repr=False)
     """Refits with one more effect, by the candidate, the effect, and the nats against it."""
     twins: dict[WeighedFit, tuple[WeighedFit, TwinSwap]] = field(default_factory=dict, repr=False)
     """Refits taken from those of twins, with the refit and the exchange of effects."""
     plain: dict[WeighedFit, WeighedFit | None] = field(default_factory=dict, repr=False)
     """Nulls as fitted under the plainest noise, where they predict otherwise."""
-    scored: dict[tuple[Fit, NoiseLaw, Bank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
+    scored: dict[tuple[Fit, NoiseLaw, TemplateBank], dict[str, FloatArray]] = field(default_factory=dict, repr=False)
     """Log Bayes factors of the templates of a bank, by label."""
 
-    def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw, bank: Bank) -> dict[str, FloatArray]:
+    def log_bayes_factors_by_label(self, found: Fit, law: NoiseLaw, bank: TemplateBank) -> dict[str, FloatArray]:
         """Return the log Bayes factors of a bank's templates about a fit, by label; one per template."""
         key = found, law, bank
         if key not in self.scored:
-            self.scored[key] = score_effects(Linearised.of(found, law), bank)
+            self.scored[key] = score_bank_entries(Linearised.of(found, law), bank)
         return self.scored[key]
 
     def likeliest_law(self, candidate: WeighedFit) -> NoiseLaw:
         """Return the noise distribution of a candidate's most probable noise model."""
-        return self.noises.best_evidence(candidate.evidence).law
+        return self.noises.best_evidence(candidate.evidence).likeliest_law
 
     def fit_and_weigh(
         self,
@@ -82,21 +82,21 @@ class Refits:
             return WeighedFit.of(found, law, beyond.evidence, 0.0)
         for _ in range(2):
             evidence = self.noises.evidence_by_noise(found)
-            best = self.noises.best_evidence(evidence).law
-            if best.alike(law):
+            best = self.noises.best_evidence(evidence).likeliest_law
+            if best.is_practically_equal(law):
                 break
             law = best
             found = self._fit_from_best_start(model, found.z[None, :], law, max_steps)
         else:
             evidence = self.noises.evidence_by_noise(found)
-        return WeighedFit.of(found, law, evidence, log_detectable(found, law, self.templates.usable))
+        return WeighedFit.of(found, law, evidence, log_probability_detectable(found, law, self.templates.usable))
 
     def fits_better_at(self, model: Model, z: FloatArray, candidate: WeighedFit) -> bool:
         """Return whether a candidate's model, its effects in any order, fits better at z (n_params,) than its fit."""
         found, law = candidate.found, candidate.law
         readings = found.predicted + found.residuals
         whitened = law(readings - model.predict(z[None, :])[0, self.templates.usable])[:, None]
-        there = float(law.minus_log_likelihood(whitened, law.scale(whitened))[0]) + 0.5 * float(z @ z)
+        there = float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0]) + 0.5 * float(z @ z)
         return there < found.objective - SAME_MODE
 
     def null_under_plain_noise(self, null: WeighedFit) -> WeighedFit | None:
@@ -107,7 +107,7 @@ class Refits:
         if self.sensor is None or not self.likeliest_law(null).has_memory:
             return None
         if null not in self.plain:
-            law = null.evidence[self.noises.certain].law
+            law = null.evidence[self.noises.certain].likeliest_law
             found = self._fit_from_best_start(null.found.model, np.stack([null.found.z, *self.sensor.starts]), law, 30)
             apart = float(np.sum(law(found.residuals - null.found.residuals) ** 2))
             alike = apart < 2 * ALIASED_NATS * found.sd**2
@@ -138,10 +138,14 @@ class Refits:
 
     def _taken_from_twin(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended | None:
         """Return an earlier refit of the parent with a twin of this effect, the effect in its place; None: no twin."""
-        own = self.templates.of(parent.found, effect)
+        own = self.templates.templates_of(parent.found, effect)
         for (held, other, less), (candidate, scores) in list(self.known.items()):
-            if held is parent and less == against and are_proportional(own, self.templates.of(held.found, other)):
-                swap = TwinSwap(other.name, self.templates.of(held.found, other), effect.name, own)
+            if (
+                held is parent
+                and less == against
+                and are_proportional(own, self.templates.templates_of(held.found, other))
+            ):
+                swap = TwinSwap(other.name, self.templates.templates_of(held.found, other), effect.name, own)
                 twin = swap.candidate_with_twin(candidate, self.templates.usable)
                 if twin is not None:
                     self.twins[twin] = candidate, swap
@@ -160,24 +164,24 @@ class Refits:
         return None if twin is None else (twin, known[1])
 
     def _refit_likely_variants(self, parent: WeighedFit, effect: NamedEffect[Any], against: float) -> Extended:
-        templates = self.templates.of(parent.found, effect)
-        own = Bank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
+        templates = self.templates.templates_of(parent.found, effect)
+        own = TemplateBank.of(templates.columns, [effect.name] * len(templates.columns), len(parent.found.residuals))
 
         def log_bayes_factors_about(problem: Linearised) -> FloatArray:
-            return score_effects(problem, own)[effect.name]
+            return score_bank_entries(problem, own)[effect.name]
 
         by_noise = {
-            noise: log_mean(log_bayes_factors_about(Linearised.of(parent.found, evidence.law)))
+            noise: log_mean_exp(log_bayes_factors_about(Linearised.of(parent.found, evidence.likeliest_law)))
             for noise, evidence in parent.leading_noises()
         }
         problem = Linearised.of(parent.found, self.likeliest_law(parent))
         scores = log_bayes_factors_about(problem)
-        weights = templates.weights(scores)
+        weights = templates.variant_probabilities(scores)
         # Under heavy-tailed noise, a few readings changed by an effect count as outliers; so start from white noise
         # too.
         plain = self._linearised_under_simplest_noise(parent, problem)
         seen = [(problem, scores), *((about, log_bayes_factors_about(about)) for about in plain)]
-        likeliest = (int(np.argmax(templates.weights(own_scores))) for _, own_scores in seen[1:])
+        likeliest = (int(np.argmax(templates.variant_probabilities(own_scores))) for _, own_scores in seen[1:])
         tried = list(dict.fromkeys([*_variants_to_refit(templates, weights), *likeliest]))
         refitted = [self._refit_variant(parent, effect, templates, k, seen) for k in tried]
         # Evidence from refits of variants replaces that from screening.
@@ -192,9 +196,9 @@ class Refits:
         # Noise with memory imitates a missing effect: what it leaves of the parent may be white about the refit, where
         # a change point is far better known. To first order: only where that leads to the variant of the best refit.
         law = self.likeliest_law(refitted[best])
-        if len(weights) > 1 and not law.alike(problem.law):
-            later = next((own_scores for about, own_scores in seen if law.alike(about.law)), None)
-            later = templates.weights(
+        if len(weights) > 1 and not law.is_practically_equal(problem.law):
+            later = next((own_scores for about, own_scores in seen if law.is_practically_equal(about.law)), None)
+            later = templates.variant_probabilities(
                 log_bayes_factors_about(Linearised.of(parent.found, law)) if later is None else later
             )
             weights = later if int(np.argmax(later)) == tried[best] else weights
@@ -204,11 +208,11 @@ class Refits:
         """Fit a few steps from each start, (n_starts, n_params), then to convergence from the best."""
         recording = self.noises.recording
         if len(starts) > 1:
-            best = min(fits(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
+            best = min(fit_each_start(model, recording, list(starts), law, max_steps=5), key=lambda f: f.objective)
             if best.settled:
-                return require_finite(best)
+                return checked_finite(best)
             starts = best.z[None, :]
-        return require_finite(fit(model, recording, starts[0], law, max_steps=max_steps))
+        return checked_finite(fit(model, recording, starts[0], law, max_steps=max_steps))
 
     def _refit_variant(
         self,
@@ -231,8 +235,8 @@ class Refits:
             # An effect without amplitude is present as a whole; to first order, its fitted fraction may differ from
             # one.
             for taken in (amount,) if effect.amplitudes else (amount, np.ones_like(amount)):
-                z = parent.found.z + about.absorbed(parent.found, columns @ taken)
-                start = np.concatenate([z, model.coordinates_of_last_effect(setting[None, :])[0]])
+                z = parent.found.z + about.absorbing_shift(parent.found, columns @ taken)
+                start = np.concatenate([z, model.z_of_last_effect(setting[None, :])[0]])
                 if all(np.abs(start - other).max() > _SAME_START for other in starts):
                     starts.append(start)
         if self.sensor is not None and len(self.sensor.starts) > 1:
@@ -242,15 +246,15 @@ class Refits:
         if seen[0][0].law.has_memory:  # to a walk a slow effect is noise: its amplitude would stay at 0
             plain = self.noises.certain
             for about, scores in seen[1:]:
-                promised = parent.evidence[plain].log_z + log_mean(scores)
+                promised = parent.evidence[plain].log_z + log_mean_exp(scores)
                 if fitted[0].evidence[plain].log_z < promised - STEERING:
                     fitted.append(self.fit_and_weigh(model, np.stack(starts), about.law, beyond=parent))
         return max(fitted, key=lambda candidate: self.noises.average_log_evidence(_log_z_by_noise(candidate)))
 
     def _linearised_under_simplest_noise(self, parent: WeighedFit, problem: Linearised) -> list[Linearised]:
         """Return a fit's linearisation under the simplest noise distribution; [] if `problem` is under the same."""
-        plain = parent.evidence[self.noises.certain].law
-        return [] if plain.alike(problem.law) else [Linearised.of(parent.found, plain)]
+        plain = parent.evidence[self.noises.certain].likeliest_law
+        return [] if plain.is_practically_equal(problem.law) else [Linearised.of(parent.found, plain)]
 
 
 def _amounts_in_residual(projected: FloatArray, residual: FloatArray) -> FloatArray:
@@ -278,7 +282,7 @@ def is_significant(candidate: WeighedFit, parent: WeighedFit) -> bool:
 def _improves_fit(found: Fit, beyond: Fit, law: NoiseLaw) -> bool:
     def minus_log_likelihood(fitted: Fit) -> float:
         whitened = law(fitted.residuals)[:, None]
-        return float(law.minus_log_likelihood(whitened, law.scale(whitened))[0])
+        return float(law.minus_log_likelihood(whitened, law.likeliest_sigma(whitened))[0])
 
     return 2 * (minus_log_likelihood(beyond) - minus_log_likelihood(found)) > 3.0
 

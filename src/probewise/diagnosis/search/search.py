@@ -12,10 +12,10 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise.diagnosis.evidence.bank import Bank
+from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
-from probewise.diagnosis.evidence.templates import TemplateMemory
-from probewise.diagnosis.noise.law import steps_within_scans
+from probewise.diagnosis.evidence.templates import TemplateCache
+from probewise.diagnosis.noise.law import rows_to_previous_usable
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.residuals.bases import bank_of_unknown_effects, bases_unlike_named
@@ -79,22 +79,22 @@ def search(
     """
     recording, effects = prepared.recording, prepared.effects
     if max_order is None:
-        max_order = 1 if len(prepared.usable) < FEW_READINGS else MAX_ORDER
+        max_order = 1 if len(prepared.usable_rows) < FEW_READINGS else MAX_ORDER
     prior = prior or prepared.apparatus.prior_odds(effects)
     on_mean, on_noise = _effects_on_mean_and_noise(prepared)
     refits = (
-        Refits(prepared.null, NoiseModels(recording, on_noise, prior), TemplateMemory(prepared.usable))
+        Refits(prepared.null, NoiseModels(recording, on_noise, prior), TemplateCache(prepared.usable_rows))
         if after is None
         else after.refits
     )
-    noises, templates, own = refits.noises, refits.templates, prepared.apparatus.own_effects(on_mean)
-    if prepared.null is not None and prepared.null.nuisance:
+    noises, templates, own = refits.noises, refits.templates, prepared.apparatus.user_effect_names(on_mean)
+    if prepared.null is not None and prepared.null.nuisance_names:
         own = frozenset(on_mean)  # about a shape that is far off without the right effect, screening is no guide
-    spent = prepared.apparatus.spent_refit_budget()
+    spent = prepared.apparatus.refit_budget_share_spent()
 
     def share_is_spent(share: float) -> bool:
         """Return whether this share of the budget of refits is spent, of what an earlier search left of it."""
-        return prepared.apparatus.refit_budget_is_spent(spent + share * max(1.0 - spent, 0.0))
+        return prepared.apparatus.is_refit_budget_spent(spent + share * max(1.0 - spent, 0.0))
 
     state = SearchState(on_mean, prior, noises, templates, refits, own, progress, share_is_spent)
     if after is None:
@@ -140,7 +140,7 @@ def search(
 
 def _effects_on_mean_and_noise(prepared: Prepared) -> tuple[dict[str, NamedEffect[Any]], dict[str, NoiseEffect]]:
     """Return the effects on the mean, and those on the noise, by name."""
-    effects, on_noise = prepared.effects, prepared.on_noise
+    effects, on_noise = prepared.effects, prepared.noise_effect_names
     on_mean = {name: effect for name, effect in effects.items() if name not in on_noise}
     return on_mean, {name: cast(NoiseEffect, effects[name]) for name in effects if name in on_noise}
 
@@ -200,11 +200,11 @@ def _unknown_effects_of(state: SearchState, prepared: Prepared, after: Searched 
 
 def _unknown_bases_and_covariates(
     state: SearchState, prepared: Prepared, named: Sequence[NamedEffect[Any]]
-) -> tuple[Bank, tuple[Covariate, ...]]:
+) -> tuple[TemplateBank, tuple[Covariate, ...]]:
     null, recording = state.null, prepared.recording
-    covariates, slope = prepared.apparatus.covariates(null.found, recording)
+    covariates, slope = prepared.apparatus.covariates_and_slope(null.found, recording)
     level = null.found.predicted
-    starts = np.flatnonzero(steps_within_scans(recording) == 0)
+    starts = np.flatnonzero(rows_to_previous_usable(recording) == 0)
     bases = bank_of_unknown_effects(covariates, level - level.min(), slope, starts)
     problem = Linearised.of(null.found, state.refits.likeliest_law(null))
-    return bases_unlike_named(bases, state.templates.bank(null.found, named), problem), tuple(covariates)
+    return bases_unlike_named(bases, state.templates.coarse_bank(null.found, named), problem), tuple(covariates)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
@@ -159,16 +159,16 @@ def posterior_of(evidences: Evidences, prior: PriorOdds, *, certain: Names, n_fo
     for (_, names), fit in evidences.fits.items():
         for noise, evidence in fit.evidence.items():
             log_z[names, noise] = float(np.logaddexp(log_z.get((names, noise), -np.inf), evidence.log_z))
-    log_p = {key: value + prior.log_mean(key[0]) for key, value in log_z.items()}
+    log_p = {key: value + prior.log_prior_on_mean(key[0]) for key, value in log_z.items()}
     for (n, names, noise), value in evidences.unknown.items():
         # A named effect remains named if a smaller unknown one is left.
         key = (names if evidences.named_outweigh_unknown(n, names, noise) else ("unknown",)), noise
-        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_unknown(names)))
+        log_p[key] = float(np.logaddexp(log_p.get(key, -np.inf), value + prior.log_prior_with_unknown(names)))
     for (names, noise), value in evidences.screened.items():
-        log_p[names, noise] = value + prior.log_mean(names)
+        log_p[names, noise] = value + prior.log_prior_on_mean(names)
     for names, noise in log_p:
         uncertain = tuple(n for n in noise if n not in certain)
-        log_p[names, noise] += -math.log(n_forms) + prior.log_noise(uncertain, alone=not names)
+        log_p[names, noise] += -math.log(n_forms) + prior.log_prior_on_noise(uncertain, alone=not names)
     total = float(logsumexp(list(log_p.values())))
     nulls = {n: fit for (n, names), fit in evidences.fits.items() if not names}
     clean_by_order = {n: float(logsumexp([e.log_z for e in fit.evidence.values()])) for n, fit in nulls.items()}
@@ -187,9 +187,9 @@ class MisfitTemplates:
     templates. `covariates` are those of the basis functions.
     """
 
-    templates: TemplateMemory
+    templates: TemplateCache
     about: Fit
-    unknown_bases: Bank
+    unknown_bases: TemplateBank
     covariates: tuple[Covariate, ...]
 
 
@@ -234,9 +234,11 @@ class Searched:
         """Return the result with prior instead of posterior probabilities, for readings without information."""
         effects = self.prepared.effects
         on_mean = [
-            name for name in effects if name not in self.prepared.on_noise and not effects_out_of_vocabulary((name,))
+            name
+            for name in effects
+            if name not in self.prepared.noise_effect_names and not effects_out_of_vocabulary((name,))
         ]
-        probabilities = self.prior.alone(on_mean, self.certain)
+        probabilities = self.prior.single_effect_priors(on_mean, self.certain)
         return replace(self, posterior=replace(self.posterior, probabilities=probabilities))
 
     def best_refit_of(self, names: Names, noise: Names) -> WeighedFit | None:
@@ -260,7 +262,7 @@ class Searched:
     def likeliest_beside_unknown(self, noise: Names) -> WeighedFit | None:
         """Return the fit beside which an unknown effect is most probable under a noise model; None: not weighed."""
         scores = {
-            (n, names): value + self.prior.log_unknown(names)
+            (n, names): value + self.prior.log_prior_with_unknown(names)
             for (n, names, own), value in self.evidences.unknown.items()
             if own == noise
         }
@@ -270,8 +272,8 @@ class Searched:
         """Return the probability of each effect that stands beside an unknown effect, given that there is one."""
         scores = {
             (names, noise): value
-            + self.prior.log_unknown(names)
-            + self.prior.log_noise(tuple(n for n in noise if n not in self.certain))
+            + self.prior.log_prior_with_unknown(names)
+            + self.prior.log_prior_on_noise(tuple(n for n in noise if n not in self.certain))
             for (order, names, noise), value in self.evidences.unknown.items()
             if not self.evidences.named_outweigh_unknown(order, names, noise)
         }
@@ -283,12 +285,12 @@ class Searched:
                 out[name] = out.get(name, 0.0) + weight / sum(weights.values())
         return out
 
-    def banks_for_test(self, found: Fit) -> list[Bank]:
+    def banks_for_test(self, found: Fit) -> list[TemplateBank]:
         """Return the two banks by which a fit is tested: of the effects that it lacks, and of unknown effects."""
         on_mean = [effect for effect in self.prepared.effects.values() if effect.stage is not Stage.NOISE]
         missing = [effect for effect in on_mean if effect.name not in found.model.names]
         return [
-            self.misfit_templates.templates.bank(self.misfit_templates.about, missing),
+            self.misfit_templates.templates.coarse_bank(self.misfit_templates.about, missing),
             self.misfit_templates.unknown_bases,
         ]
 
@@ -296,9 +298,11 @@ class Searched:
     def likeliest_order(self) -> int:
         """SSF order of the most probable explanation, named or not; the null is tested at this order."""
         by_order: dict[int, float] = {}
-        terms = [(n, fit.log_z + self.prior.log_mean(names)) for (n, names), fit in self.evidences.fits.items()]
+        terms = [
+            (n, fit.log_z + self.prior.log_prior_on_mean(names)) for (n, names), fit in self.evidences.fits.items()
+        ]
         for (n, names, _), value in self.evidences.unknown.items():
-            terms.append((n, value + self.prior.log_unknown(names)))
+            terms.append((n, value + self.prior.log_prior_with_unknown(names)))
         for n, value in terms:
             by_order[n] = float(np.logaddexp(by_order.get(n, -np.inf), value))
         return max(by_order, key=lambda n: by_order[n])

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.fitting.null import Null
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
@@ -55,7 +55,7 @@ class SearchState:
     effects: Mapping[str, NamedEffect[Any]]
     prior: PriorOdds
     noises: NoiseModels
-    templates: TemplateMemory
+    templates: TemplateCache
     refits: Refits
     tried_always: frozenset[str] = frozenset()
     progress: Progress = silent
@@ -98,13 +98,13 @@ class SearchState:
 
     def log_posterior(self, candidate: WeighedFit) -> float:
         """Return a candidate's unnormalised log posterior: its log evidence plus the log prior of its effects."""
-        return candidate.log_z + self.prior.log_mean(candidate.names)
+        return candidate.log_z + self.prior.log_prior_on_mean(candidate.names)
 
-    def template_banks(self, null: WeighedFit) -> list[Bank]:
+    def template_banks(self, null: WeighedFit) -> list[TemplateBank]:
         """Return the template banks of all effects about a null: of those in the vocabulary, and of the others."""
         named = [effect for name, effect in self.effects.items() if not effects_out_of_vocabulary((name,))]
         rest = [effect for name, effect in self.effects.items() if effects_out_of_vocabulary((name,))]
-        return [self.templates.bank(null.found, effects) for effects in (named, rest) if effects]
+        return [self.templates.coarse_bank(null.found, effects) for effects in (named, rest) if effects]
 
     def log_bayes_factors_by_effect(self, about: WeighedFit, law: NoiseLaw, null: WeighedFit) -> dict[str, FloatArray]:
         """Return the log Bayes factors of every effect's templates beside a candidate, by name, (n_templates,) each.
@@ -174,7 +174,7 @@ class SearchState:
         stiffness that hardens, and a frequency), a fit from where they were without it may stop at a poor local
         optimum, which one more effect lets it leave.
         """
-        model, stay = candidate.found.model.without(left_out)
+        model, stay = candidate.found.model.model_and_mask_without(left_out)
         start = candidate.found.z[stay]
         for held in self.candidates_of(tuple(name for name in candidate.names if name != left_out)):
             alike = held.n_gaussians == candidate.n_gaussians and set(model.effects) == set(held.found.model.effects)

@@ -18,8 +18,8 @@ import numpy as np
 from probewise import nested
 from probewise._arrays import FloatArray
 from probewise._kinds import require_rng
-from probewise.diagnosis.evidence.folded import folded
-from probewise.diagnosis.evidence.joint import JointProblem
+from probewise.diagnosis.evidence.folded import fold_problem
+from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.names import Names
@@ -135,7 +135,7 @@ def _weigh_by_nested_sampling(
     effects = tuple(sorted((*candidate.names, *noise_effects_in_vocabulary(noise))))
     weighing = Weighing(effects, candidate.n_gaussians, evidence.log_z, math.nan, math.nan)
     problem = _joint_problem(candidate, noise, searched)
-    once = folded(problem, candidate.found.z)
+    once = fold_problem(problem, candidate.found.z)
     n_live = max(n_live, nested.LIVE_PER_PARAM * problem.model.n_params)
     run = partial(
         nested.run,
@@ -165,8 +165,8 @@ def _weigh_by_nested_sampling(
     return replace(told, doubts=(*told.doubts, doubt))
 
 
-def _joint_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> JointProblem:
-    return JointProblem(candidate.found.model, searched.prepared.recording, candidate.evidence[noise])
+def _joint_problem(candidate: WeighedFit, noise: Names, searched: Searched) -> HypothesisProblem:
+    return HypothesisProblem(candidate.found.model, searched.prepared.recording, candidate.evidence[noise])
 
 
 def _least_and_most_minutes(

@@ -55,12 +55,12 @@ class TwinSwap:
         at, variant = pair
         held, effects[at] = effects[at], self.of_twin.variants[variant]
         model = replace(found.model, effects=tuple(effects))
-        amplitudes = np.array(held.amplitudes, dtype=np.int64) + found.model.coordinates_of(held.name).start
+        amplitudes = np.array(held.amplitudes, dtype=np.int64) + found.model.coordinate_slice(held.name).start
         for sign in (1.0, -1.0):
             z, slopes = found.z.copy(), found.slopes.copy()
             z[amplitudes] *= sign
             slopes[:, amplitudes] *= sign
-            predicted, own = (values[usable] for values in model.jacobian(z))
+            predicted, own = (values[usable] for values in model.predict_and_differentiate(z))
             if _has_same_predictions(predicted, own, replace(found, slopes=slopes)):
                 residuals = found.residuals + found.predicted - predicted
                 return replace(found, model=model, z=z, predicted=predicted, residuals=residuals, slopes=own)

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.evidence.bank import Bank
-from probewise.diagnosis.evidence.screening import log_mean
+from probewise.diagnosis.evidence.bank import TemplateBank
+from probewise.diagnosis.evidence.screening import log_mean_exp
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.noise.law import NoiseLaw
@@ -42,8 +42,8 @@ class UnknownEffects:
         Function of names: log of the number of combinations of as many names, over the number of single names.
     """
 
-    scores: Callable[[Fit, NoiseLaw, Bank], Mapping[str, FloatArray]]
-    bases: Bank
+    scores: Callable[[Fit, NoiseLaw, TemplateBank], Mapping[str, FloatArray]]
+    bases: TemplateBank
     covariates: tuple[Covariate, ...]
     noises: NoiseModels
     complexity_penalty: Callable[[int], float]
@@ -58,14 +58,14 @@ class UnknownEffects:
         best = -np.inf
         for candidate in candidates:
             for noise, evidence in candidate.leading_noises():
-                scores = self.scores(candidate.found, evidence.law, self.bases)
-                by_family = {family: log_mean(own) for family, own in scores.items()}
-                if evidence.law.share > 0:
-                    far_out = outlier_probabilities(candidate.found.residuals, evidence.law)
+                scores = self.scores(candidate.found, evidence.likeliest_law, self.bases)
+                by_family = {family: log_mean_exp(own) for family, own in scores.items()}
+                if evidence.likeliest_law.share > 0:
+                    far_out = outlier_probabilities(candidate.found.residuals, evidence.likeliest_law)
                     by_family |= clustering_log_bayes_factors(far_out, self.covariates)
                 if not by_family:
                     continue
-                value = evidence.log_z + log_mean(np.array(list(by_family.values())))
+                value = evidence.log_z + log_mean_exp(np.array(list(by_family.values())))
                 if not candidate.names:
                     value -= self.complexity_penalty(candidate.ssf_degrees_of_freedom)
                 self.log_z[candidate.n_gaussians, candidate.names, noise] = value

@@ -62,12 +62,12 @@ class WeighedFit:
     @property
     def whitened_sd(self) -> float:
         """Sd of a whitened reading, including rounding but not a tail."""
-        return self.found.sd * self.law.widening
+        return self.found.sd * self.law.sd_factor_of_rounding
 
     @property
     def ssf_degrees_of_freedom(self) -> int:
         """Effective degrees of freedom of its SSF, counted in Gaussians."""
-        return self.found.model.sensor.degrees_of_freedom
+        return self.found.model.sensor.effective_n_gaussians
 
     @property
     def log_z(self) -> float:

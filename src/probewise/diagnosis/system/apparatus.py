@@ -106,15 +106,15 @@ class SimulatorApparatus:
         stops = {} if self.stop is None else {self.stop.name: self.stop}
         return forms | {effect.name: effect for effect in on_noise} | stops
 
-    def proposals(self) -> dict[str, NamedEffect[Any]]:
+    def proposed_effects(self) -> dict[str, NamedEffect[Any]]:
         """Return by name the formulas to propose: short expressions of columns and states."""
         return cast(dict[str, NamedEffect[Any]], {form.name: form for form in proposals(self.about)})
 
-    def own_effects(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
+    def user_effect_names(self, effects: Mapping[str, NamedEffect[Any]]) -> frozenset[str]:
         """Return the names of those of these effects that the user's simulator file adds."""
         return frozenset(effects.keys() & self.system.simulator.extra.keys())
 
-    def spent_refit_budget(self) -> float:
+    def refit_budget_share_spent(self) -> float:
         """Return the share of the budget of calls of `simulate`, or of integration steps, that is spent.
 
         0 if `simulate` takes all samples at once.
@@ -124,9 +124,9 @@ class SimulatorApparatus:
             return self.system.tally.n_steps / STEPS_OF_A_SEARCH
         return 0.0 if caller.broadcasts else caller.n_calls / CALLS_OF_A_SEARCH
 
-    def refit_budget_is_spent(self, share: float = 1.0) -> bool:
+    def is_refit_budget_spent(self, share: float = 1.0) -> bool:
         """Return whether this share of that budget is spent; if so, record that the search was cut short."""
-        over = self.spent_refit_budget() >= share
+        over = self.refit_budget_share_spent() >= share
         tally = self.system.caller or self.system.tally
         tally.cut_short |= over
         return over
@@ -134,7 +134,7 @@ class SimulatorApparatus:
     def prior_odds(self, effects: Mapping[str, NamedEffect[Any]]) -> PriorOdds:
         """Return the prior odds of these effects, of an unknown effect, and of none."""
         return replace(
-            PriorOdds.over(effects),
+            PriorOdds.for_effects(effects),
             by_size=_BY_SIZE,
             not_white_alone=_NOT_WHITE_ALONE,
             twice=_TWICE,
@@ -145,7 +145,7 @@ class SimulatorApparatus:
         """Raise NotImplementedError: the only null is the simulator."""
         raise NotImplementedError("a simulator is its own null")
 
-    def covariates(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
+    def covariates_and_slope(self, found: Fit, recording: Recording) -> tuple[list[Covariate], FloatArray]:
         """Return the covariates that vary, and the predicted change since the previous row, (n_usable,).
 
         Covariates are time or row, level, columns, states, that change, and the run.
@@ -191,7 +191,7 @@ class SimulatorApparatus:
             return None
         return replace(pooled[name], values=without[pooled[name].rows]) if name == "level" else pooled[name]
 
-    def fine_structure(self, found: Fit, usable: IntArray) -> FloatArray:
+    def fine_structure_slopes(self, found: Fit, usable: IntArray) -> FloatArray:
         """Return no columns, (n_usable, 0): a simulator has no fine structure."""
         return np.zeros((len(usable), 0))
 
@@ -205,15 +205,15 @@ class SimulatorApparatus:
         part = np.minimum(np.arange(n) * _N_BLOCKS // max(n, 1), _N_BLOCKS - 1)
         return part, tuple(f"part {k + 1} of {_N_BLOCKS}" for k in range(_N_BLOCKS))
 
-    def commands(
+    def candidate_measurements(
         self, plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None
     ) -> list[RunCommand]:
         """List the runs that could be recorded after the table `plan`; the other arguments are not used."""
         own = self.system.simulator
         return possible_run_commands(cast(RunTable, plan), own.reading, own.controls, own.time_unit)
 
-    as_alternatives = staticmethod(as_alternatives)
-    in_sequence = staticmethod(in_sequence)
+    plan_of_alternatives = staticmethod(as_alternatives)
+    plan_in_sequence = staticmethod(in_sequence)
 
 
 def _differences_within_runs(values: FloatArray, table: RunTable) -> FloatArray:

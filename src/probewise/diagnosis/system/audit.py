@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.diagnosis.audit.detectability import LAMBDA, Expected, PlanTemplates
+from probewise.diagnosis.audit.detectability import LAMBDA, ExpectedSensor, PlanTemplates
 from probewise.diagnosis.audit.plan_audit import EffectAudit, PlanAudit, audits_and_cosines
 from probewise.diagnosis.system.apparatus import ON_NOISE, SimulatorApparatus
 from probewise.effects import NUISANCES, NamedEffect, NoisePerRun, name_of_first_copy
@@ -60,9 +60,9 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     built = cast(dict[str, NamedEffect[Any]], {**forms, **on_noise})
     reasons = _reasons_for_absence(about)
     names = dict.fromkeys([*forms, *(name for name in reasons if name not in forms), *on_noise])
-    expected = Expected(cast(Any, system), z, (float(predicted.min()), float(predicted.max())), sd)
+    expected = ExpectedSensor(cast(Any, system), z, (float(predicted.min()), float(predicted.max())), sd)
     stride = -(-len(own) // _MOST_ROWS)
-    laid = PlanTemplates.of_built(expected, cast(Plan, own), built, most=_SETTINGS)
+    laid = PlanTemplates.of_scaled_effects(expected, cast(Plan, own), built, most=_SETTINGS)
     laid = replace(laid, slopes=laid.slopes[::stride], columns=laid.columns[::stride])
     found, cosines = audits_and_cosines(laid, cast(Any, names), simulator.unit)
     effects = tuple(_with_rows_needed(effect, reasons) for effect in found)

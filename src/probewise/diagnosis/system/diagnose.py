@@ -11,8 +11,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import require_progress, require_rng
 from probewise.diagnosis.engine import Thorough, diagnose_prepared
-from probewise.diagnosis.fitting.fit import Fit, Model, fit, fits
-from probewise.diagnosis.noise.law import NoiseLaw, white_of
+from probewise.diagnosis.fitting.fit import Fit, Model, fit, fit_each_start
+from probewise.diagnosis.noise.law import NoiseLaw, white_noise_of_recording
 from probewise.diagnosis.noise.models import rough_sd
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.system.apparatus import CALLS_OF_A_SEARCH, STEPS_OF_A_SEARCH, SimulatorApparatus
@@ -268,7 +268,7 @@ def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float
     the fit and from successive readings.
     """
     table = cast(RunTable, recording.plan)
-    law = white_of(recording)
+    law = white_noise_of_recording(recording)
     found = _fit_from_best_starts(system, recording, law)
     sd = _noise_sd_of(system.simulator, table, recording, found)
     for _ in range(4):
@@ -285,12 +285,14 @@ def _fit_from_best_starts(system: System, recording: Recording, law: NoiseLaw) -
     """Fit a few steps from every start, then to convergence from the best and from `_starts_from_partial_runs`."""
     model = Model(system, (), recording.plan)
     tried = sorted(
-        fits(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_objective_or_infinity
+        fit_each_start(model, recording, list(system.starts), law, max_steps=_STEPS_TRIED), key=_objective_or_infinity
     )[:_BEST_STARTS]
     longer = _starts_from_partial_runs(model, recording)
     if not longer and all(found.settled for found in tried):
         return tried[0]
-    return min(fits(model, recording, [*(found.z for found in tried), *longer], law), key=_objective_or_infinity)
+    return min(
+        fit_each_start(model, recording, [*(found.z for found in tried), *longer], law), key=_objective_or_infinity
+    )
 
 
 def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatArray]:
@@ -302,7 +304,7 @@ def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatA
     first quarter of a run there are few.
     """
     system, table = cast(System, model.sensor), cast(RunTable, recording.plan)
-    if not (system.in_bulk and table.has_varying_time):
+    if not (system.predicts_in_bulk and table.has_varying_time):
         return []
     since = time_since_start_of_run(table)
     starts = list(system.starts)
@@ -311,7 +313,10 @@ def _starts_from_partial_runs(model: Model, recording: Recording) -> list[FloatA
         part = recording.with_readings(np.where(begun, recording.readings, np.nan))
         if part.usable.sum() < system.least_readings:
             return []
-        found = sorted(fits(model, part, starts, white_of(part), max_steps=_STEPS_TRIED), key=_objective_or_infinity)
+        found = sorted(
+            fit_each_start(model, part, starts, white_noise_of_recording(part), max_steps=_STEPS_TRIED),
+            key=_objective_or_infinity,
+        )
         starts = [each.z for each in found[:_BEST_STARTS]]
     return starts
 

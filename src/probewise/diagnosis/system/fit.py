@@ -14,9 +14,9 @@ from probewise import nested
 from probewise._arrays import FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_kind, require_progress, require_rng
-from probewise.diagnosis.evidence.joint import JointProblem
+from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
 from probewise.diagnosis.evidence.laplace import NoiseEvidence
-from probewise.diagnosis.evidence.templates import TemplateMemory
+from probewise.diagnosis.evidence.templates import TemplateCache
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
@@ -137,9 +137,11 @@ def fit_simulator(
     require_rng(rng)
     require_progress(progress)
     prepared = prepare_system(simulator, table, source=source, notes=notes, progress=progress, with_effects=False)
-    if prepared.too_little:
+    if prepared.has_too_little_data:
         found = (
-            f"{len(prepared.usable)} usable readings" if len(prepared.usable) < prepared.least_readings else "all equal"
+            f"{len(prepared.usable_rows)} usable readings"
+            if len(prepared.usable_rows) < prepared.least_readings
+            else "all equal"
         )
         raise ParameterError("readings", found, f"{prepared.least_readings} or more, which are not all equal")
     null, noise = _weighed_null(prepared)
@@ -161,8 +163,8 @@ def fit_simulator(
 
 def _weighed_null(prepared: Prepared) -> tuple[WeighedFit, NoiseEvidence]:
     """Fit the simulator without effects under white noise; return the fit and its evidence."""
-    prior = PriorOdds.over({})
-    noises, templates = NoiseModels(prepared.recording, {}, prior), TemplateMemory(prepared.usable)
+    prior = PriorOdds.for_effects({})
+    noises, templates = NoiseModels(prepared.recording, {}, prior), TemplateCache(prepared.usable_rows)
     state = SearchState({}, prior, noises, templates, Refits(prepared.null, noises, templates), frozenset())
     fit_nulls(state, prepared, max_order=1)
     return state.null, state.null.evidence[()]
@@ -200,7 +202,7 @@ def _nested_samples_and_evidence(
     With a law, which must be integrated, nested sampling starts from a prior near the given samples, which takes far
     fewer calls.
     """
-    problem: nested.Samplable = JointProblem(null.found.model, prepared.recording, noise)
+    problem: nested.Samplable = HypothesisProblem(null.found.model, prepared.recording, noise)
     system = cast(SimulatorApparatus, prepared.apparatus).system
     n_live = max(_N_LIVE, nested.LIVE_PER_PARAM * system.n_params)
     method = "nested sampling"
@@ -217,9 +219,9 @@ def _nested_samples_and_evidence(
     if found.warnings:
         return samples, replace(otherwise, reason=f"nested sampling: {found.warnings[0]}")
     z = np.clip(found.samples(N_SAMPLES, rng=rng), -FARTHEST, FARTHEST)
-    law, usable = noise.law, prepared.recording.usable
+    law, usable = noise.likeliest_law, prepared.recording.usable
     residuals = prepared.recording.readings[usable] - null.found.model.predict(z)[:, usable]
-    sigma = law.scale(law(residuals.T))
+    sigma = law.likeliest_sigma(law(residuals.T))
     noise_sd = sigma * np.sqrt(law.n_points / rng.chisquare(law.n_points, N_SAMPLES))
     theta = cast(Any, null.found.model.sensor).theta(z)
     evidence = Evidence(found.log_z + null.log_prior_factor, found.log_z_error, method)

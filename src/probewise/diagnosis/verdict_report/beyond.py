@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise.diagnosis.judgement.judged import Judged
-from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.diagnosis.residuals.locate import ALARM, significant_places
 from probewise.diagnosis.search.searched import Searched
@@ -48,7 +48,7 @@ class Formula:
     heldout_log_density_per_reading: float
 
 
-def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.random.Generator) -> Remainder | None:
+def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: np.random.Generator) -> Remainder | None:
     """Return the misfit that remains after the repair; None if nothing is named, or no misfit is significant."""
     p_value, names = best.improvement.p_value_after, best.fit.names
     if judged.verdict not in ("named", "cannot_tell") or not names or p_value >= ALARM:
@@ -59,7 +59,7 @@ def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.rand
     more = 0.0 if value is None else max(value - log_z, 0.0)
     named = max(log_z - searched.evidences.fits[own, ()].evidence[best.noise].log_z, 0.0)
     prepared, covariates = searched.prepared, searched.misfit_templates.covariates
-    draws = best.problem.draws(_N_DRAWS, rng=rng)
+    draws = best.problem.draw_null_residuals(_N_DRAWS, rng=rng)
     found = significant_places(
         best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws
     )
@@ -70,7 +70,7 @@ def remainder_of(searched: Searched, judged: Judged, best: Best, *, rng: np.rand
     return Remainder(p_value, share, where, sentence)
 
 
-def formula_of(searched: Searched, judged: Judged, best: Best, samples: ModelSamples) -> Formula | None:
+def formula_of(searched: Searched, judged: Judged, best: BestRepair, samples: ModelSamples) -> Formula | None:
     """Return the formula in the repair of an unknown effect; None if there is none."""
     if judged.verdict != "unknown":
         return None

@@ -13,8 +13,8 @@ from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.fitting.fit import fit
 from probewise.diagnosis.judgement.judged import Hypothesis
 from probewise.diagnosis.names import Names
-from probewise.diagnosis.noise.law import noise_statistics, steps_within_scans
-from probewise.diagnosis.repair.best import Best
+from probewise.diagnosis.noise.law import noise_statistics, rows_to_previous_usable
+from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
@@ -63,7 +63,7 @@ class NoiseFound:
 def effects_found(
     searched: Searched,
     hypotheses: tuple[Hypothesis, ...],
-    best: Best,
+    best: BestRepair,
     samples: ModelSamples,
     *,
     rng: np.random.Generator,
@@ -138,10 +138,10 @@ def _samples_of_insignificant(
     """
     null, misfit_templates = searched.null, searched.misfit_templates
     best = max(null.evidence.values(), key=lambda e: e.log_z)
-    problem = Linearised.of(null.found, best.law)
-    templates = misfit_templates.templates.of(misfit_templates.about, effect.with_fewer_variants())
+    problem = Linearised.of(null.found, best.likeliest_law)
+    templates = misfit_templates.templates.templates_of(misfit_templates.about, effect.with_fewer_variants())
     middle = len(templates.columns) // 2
-    effect = templates.variant(middle)
+    effect = templates.variant_of_entry(middle)
     values = effect.prior.from_unit_cube(rng.random((N_SAMPLES, len(effect.prior.names))))
     if not effect.amplitudes:
         return effect, values, 0.0
@@ -165,37 +165,37 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
     Of an effect on the noise it is the size of an effect on the mean with equal evidence; of rounding, or of a noise
     effect that also changes the mean, the norm of the change, in noise sds.
     """
-    law = holder.evidence[noise].law
+    law = holder.evidence[noise].likeliest_law
     found, prepared = holder.found, searched.prepared
     effect = prepared.effects[name]
-    if name in prepared.on_noise and cast(NoiseEffect, effect).changes_the_mean:
+    if name in prepared.noise_effect_names and cast(NoiseEffect, effect).changes_the_mean:
         everywhere = found.model.predict(found.z[None, :])[0]
         return float(np.linalg.norm(cast(NoiseEffect, effect).change_of_readings(everywhere))) / found.sd
     if name in searched.certain:
-        step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of(name)]
+        step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.column_slice(name)]
         return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
-    if name in prepared.on_noise:
+    if name in prepared.noise_effect_names:
         # For noise effects: the size of an effect on the mean with equal evidence.
         without = [e.log_z for names, e in holder.evidence.items() if set(names) <= set(noise) - {name}]
         gain = holder.evidence[noise].log_z - max(without)
         return math.sqrt(2 * max(gain, 0.0))
-    model, stay = found.model.without(name)
-    noise_free = prepared.recording.with_readings(prepared.spread(found.predicted)).without_declared_range()
+    model, stay = found.model.model_and_mask_without(name)
+    noise_free = prepared.recording.with_readings(prepared.expand_to_all_rows(found.predicted)).without_declared_range()
     # With the noise sd as floor, the refit balances readings and priors as the real one did.
-    sigma = float(law.scale(law(found.residuals)[:, None])[0])
-    refit = fit(model, noise_free, found.z[stay], law.at_least(sigma), max_steps=12, tolerance=0.02)
+    sigma = float(law.likeliest_sigma(law(found.residuals)[:, None])[0])
+    refit = fit(model, noise_free, found.z[stay], law.with_least_sigma(sigma), max_steps=12, tolerance=0.02)
     return float(np.linalg.norm(law(refit.residuals))) / sigma * math.sqrt(law.information)
 
 
-def noise_found(searched: Searched, best: Best, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
+def noise_found(searched: Searched, best: BestRepair, samples: ModelSamples, *, rng: np.random.Generator) -> NoiseFound:
     """Describe the noise of the repaired model, and test its residuals for what the noise model lacks.
 
     That is autocorrelation, heavy tails, or a spread that depends on the level.
     """
     prepared, after = searched.prepared, best.problem
-    steps = steps_within_scans(prepared.recording)
+    steps = rows_to_previous_usable(prepared.recording)
     own = after.residual[: after.n_points, None]
-    null = after.draws(_N_DRAWS, rng=rng)[: after.n_points]
+    null = after.draw_null_residuals(_N_DRAWS, rng=rng)[: after.n_points]
     joined = noise_statistics(np.concatenate([own, null], axis=1), steps, best.fit.found.predicted)
     center, spread = joined[:, 1:].mean(axis=1), joined[:, 1:].std(axis=1)
     worst = np.max(np.abs(joined - center[:, None]) / np.maximum(spread, 1e-12)[:, None], axis=0)

@@ -181,7 +181,7 @@ def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float
 def _most_trial_waves(about: ReferenceFit) -> int:
     if about.system.caller is None:
         return most_trial_waves_of_law(len(about.table))
-    return _MOST_WAVES if about.system.in_bulk else _MOST_WAVES_CALLED
+    return _MOST_WAVES if about.system.predicts_in_bulk else _MOST_WAVES_CALLED
 
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:

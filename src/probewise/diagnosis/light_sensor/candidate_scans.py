@@ -1,6 +1,6 @@
-"""Possible next scans: repeat, reverse, respeed, rotate, relight, raise, or another target.
+"""Possible next scans over the targets in place: repeat, reverse, respeed, rotate, relight, raise.
 
-The first three need only the arm, the next three the recording's `controls`, the last a person.
+The first three need only the arm, the others the recording's `controls`. Other targets are in `target_swaps`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.diagnosis.light_sensor.scheduling import Scan, start_after
+from probewise.diagnosis.light_sensor.scheduling import Scan, earliest_start_s
 from probewise.diagnosis.scheduling import MOST_READINGS
 from probewise.recordings.plan import Plan
 from probewise.sensor import COMMANDED
@@ -62,8 +62,8 @@ def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray
     return out
 
 
-def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
-    """List the scans that could follow a plan, each pose of a scan once.
+def candidate_scans(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | None = None) -> list[Scan]:
+    """List the scans that could follow a plan, each timed to start after it.
 
     Parameters
     ----------
@@ -76,39 +76,41 @@ def commands(plan: Plan, *, strides: Sequence[int] = (1,), level: FloatArray | N
     """
     controls = plan.instrumentation.controls
     height_mm = plan.instrumentation.height_mm
-    gap_s, start_s = reading_s(plan), start_after(plan)
+    gap_s, start_s = median_reading_interval_s(plan), earliest_start_s(plan)
     out: list[Scan] = []
-    for scan in distinct_scans(plan):
+    for scan in rows_of_distinct_scans(plan):
         name = plan.scan_names[int(plan.scan[scan[0]])]
         degrees = math.degrees(float(plan.orientation_rad[scan[0]]))
         for part in excerpts(scan, strides=strides, level=None if level is None else level[scan]):
             rows, every, label = part.rows, part.words, f"{name}{part.suffix}"
-            once = rescheduled(plan, rows, start_s, gap_s, label)
+            once = rows_as_new_scan(plan, rows, start_s, gap_s, label)
             both = np.concatenate([rows[: MOST_READINGS // 2 * 2 : 2], rows[: MOST_READINGS // 2 * 2 : 2][::-1]])
             out += [
-                Scan("repeat", f"take scan {name} again{every}", _with_scan_name(once, "again")),
+                Scan("repeat", f"take scan {name} again{every}", _with_name_suffix(once, "again")),
                 Scan(
                     "reverse",
                     f"take scan {name} backwards{every}",
-                    rescheduled(plan, rows[::-1], start_s, gap_s, f"{label}_reversed"),
+                    rows_as_new_scan(plan, rows[::-1], start_s, gap_s, f"{label}_reversed"),
                 ),
                 Scan(
                     "respeed",
                     f"scan {name} forth and back {_faster_scan_words(part)}",
-                    rescheduled(plan, both, start_s, gap_s, f"{label}_both"),
+                    rows_as_new_scan(plan, both, start_s, gap_s, f"{label}_both"),
                 ),
             ]
             if "orientation_deg" in controls:
                 turned = replace(once, orientation_rad=once.orientation_rad + math.radians(_TURN_DEG))
                 words = f"take scan {name} with the sensor turned to {degrees + _TURN_DEG:.0f} degrees{every}"
-                out.append(Scan("rotate", words, _with_scan_name(turned, "turned")))
+                out.append(Scan("rotate", words, _with_name_suffix(turned, "turned")))
             if "led" in controls:
-                dark = _commanded(once, "led", 0.0)
-                out.append(Scan("relight", f"take scan {name} with the LED off{every}", _with_scan_name(dark, "dark")))
+                dark = _with_commanded_value(once, "led", 0.0)
+                out.append(
+                    Scan("relight", f"take scan {name} with the LED off{every}", _with_name_suffix(dark, "dark"))
+                )
             if "height_mm" in controls and height_mm is not None:
-                high = _commanded(once, "height_mm", _RAISE * height_mm)
+                high = _with_commanded_value(once, "height_mm", _RAISE * height_mm)
                 words = f"take scan {name} with the sensor at {_RAISE * height_mm:.4g} mm{every}"
-                out.append(Scan("raise", words, _with_scan_name(high, "raised")))
+                out.append(Scan("raise", words, _with_name_suffix(high, "raised")))
     return out
 
 
@@ -121,7 +123,7 @@ def rows_that_need_no_hand(plan: Plan) -> IntArray:
     return np.flatnonzero(same_sheet & (as_mounted | ("orientation_deg" in plan.instrumentation.controls)))
 
 
-def rescheduled(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
+def rows_as_new_scan(plan: Plan, rows: IntArray, start_s: float, gap_s: float, name: str) -> Plan:
     """Return rows of a plan as one new scan, in order, from `start_s` on, with their commanded values."""
     taken = plan.take(rows)
     controls = plan.instrumentation.controls
@@ -141,15 +143,15 @@ def _faster_scan_words(part: Excerpt) -> str:
     return f"at {2 * part.stride} times the speed (every {2 * part.stride}th reading)"
 
 
-def _with_scan_name(plan: Plan, how: str) -> Plan:
+def _with_name_suffix(plan: Plan, how: str) -> Plan:
     return replace(plan, scan_names=(f"{plan.scan_names[0]}_{how}",))
 
 
-def _commanded(plan: Plan, name: str, value: float) -> Plan:
+def _with_commanded_value(plan: Plan, name: str, value: float) -> Plan:
     return replace(plan, covariates={**plan.covariates, name: np.full(len(plan), value)})
 
 
-def distinct_scans(plan: Plan) -> list[IntArray]:
+def rows_of_distinct_scans(plan: Plan) -> list[IntArray]:
     """Return the rows of the first few moving scans; a scan that repeats or reverses an earlier one is left out.
 
     Scans with few rows are left out too.
@@ -164,7 +166,7 @@ def distinct_scans(plan: Plan) -> list[IntArray]:
     return list(seen.values())[:_MOST_SCANS]
 
 
-def reading_s(plan: Plan) -> float:
+def median_reading_interval_s(plan: Plan) -> float:
     """Return the median time between readings within scans, in seconds; 1 s if unknown."""
     gaps = np.diff(plan.time_s)[np.diff(plan.scan) == 0]
     gaps = gaps[gaps > 0]

@@ -40,11 +40,11 @@ class StandardNormal:
         return np.asarray(ndtri(u))
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
-        """Map standard-normal coordinates to the unit cube."""
+        """Map standard-normal coordinates to the unit cube, (n_samples, n_params) both ways."""
         return np.asarray(ndtr(theta))
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
-        """Log density, (n_samples,)."""
+        """Return the log density, (n_samples,)."""
         return np.asarray(-0.5 * np.sum(theta**2 + math.log(2 * math.pi), axis=1))
 
     def enter(self, theta: FloatArray) -> FloatArray:
@@ -57,7 +57,7 @@ class StandardNormal:
 
 
 @dataclass(frozen=True, eq=False)
-class JointProblem:
+class HypothesisProblem:
     """A model in its coordinates with a recording; noise sd and noise nodes are marginalised.
 
     Parameters
@@ -82,31 +82,35 @@ class JointProblem:
         usable = self.recording.usable
         predicted = self.model.predict(np.clip(theta, -FARTHEST, FARTHEST))[:, usable]
         residuals = (self.recording.readings[usable] - predicted).T
-        nodes, kept = self.noise.nodes, self._n_nodes_kept
+        nodes, kept = self.noise.nodes, self._kept_nodes
         laws, log_share = [nodes.laws[node] for node in kept], -math.log(float(self.noise.weights[kept].sum()))
         terms = [
-            log_weight + log_likelihood_of_whitened(law, law(residuals))
+            log_weight + log_likelihood_of_whitened_residuals(law, law(residuals))
             for log_weight, law in zip(nodes.log_weights[kept], laws, strict=True)
         ]
         out = np.asarray(logsumexp(terms, axis=0)) + log_share
         return np.where(np.isfinite(out), out, -np.inf)
 
     @cached_property
-    def _n_nodes_kept(self) -> list[int]:
-        """Fewest noise nodes that hold the given share of the evidence."""
+    def _kept_nodes(self) -> list[int]:
+        """Indices of the fewest noise nodes that hold 99.9 % of the evidence."""
         order = np.argsort(-self.noise.weights)
         n_kept = int(np.searchsorted(np.cumsum(self.noise.weights[order]), _HELD)) + 1
         kept: list[int] = order[:n_kept].tolist()
         return kept
 
 
-def log_likelihood_of_whitened(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
-    """Log likelihood of whitened residuals (n_points, n_samples) under one noise distribution: (n_samples,).
+def log_likelihood_of_whitened_residuals(law: NoiseLaw, whitened: FloatArray) -> FloatArray:
+    """Return the log likelihood of whitened residuals (n_points, n_samples) under one noise distribution: (n_samples,).
 
     Log sigma, with a flat prior, is integrated out by Laplace's method about its peak.
     """
     n_points = law.n_points
-    sigma = law.scale(whitened)
-    curvature = law.density.scale_curvature(whitened, sigma, n_points) if not law.density.is_normal else 2.0 * n_points
+    sigma = law.likeliest_sigma(whitened)
+    curvature = (
+        law.whitened_density.log_sigma_curvature(whitened, sigma, n_points)
+        if not law.whitened_density.is_normal
+        else 2.0 * n_points
+    )
     peak = -law.minus_log_likelihood(whitened, sigma) - 0.5 * n_points * math.log(2 * math.pi)
-    return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.log_det() + law.log_extra)
+    return np.asarray(peak + 0.5 * np.log(2 * math.pi / curvature) - law.half_log_det() + law.log_extra)

@@ -18,7 +18,7 @@ _RUIN = -1.0  # nats per held-out reading below which named effects are withdraw
 
 
 @dataclass(frozen=True, eq=False)
-class Best:
+class BestRepair:
     """The best fit: the repaired model, or the null if nothing was found, with noise, linearisation and gain.
 
     `out_of_vocabulary` is its combination with a formula if the verdict is `unknown`, otherwise ().
@@ -40,9 +40,9 @@ class Best:
         *,
         out_of_vocabulary: Names = (),
         rng: np.random.Generator,
-    ) -> Best:
-        """Measure the gain of a fit over the null."""
-        after = Linearised.of(fit.found, fit.evidence[noise].law)
+    ) -> BestRepair:
+        """Build it from a fit, and measure its gain over the null."""
+        after = Linearised.of(fit.found, fit.evidence[noise].likeliest_law)
         gain = improvement_of(searched, test, fit, noise, after, rng=rng)
         return cls(fit, noise, after, gain, out_of_vocabulary)
 
@@ -52,9 +52,9 @@ def predicts_far_worse(gain: Improvement) -> bool:
     return gain.heldout_log_density_per_reading < _RUIN
 
 
-def best_repair(
+def judged_and_best_repair(
     searched: Searched, test: GlobalTest, judged: Judged, *, rng: np.random.Generator
-) -> tuple[Judged, Best]:
+) -> tuple[Judged, BestRepair]:
     """Choose the fit that belongs to a verdict; the null if nothing was found.
 
     Returns
@@ -65,15 +65,15 @@ def best_repair(
     if judged.verdict == "unknown":
         leading = searched.leading_out_of_vocabulary()
         fit = (searched.best_refit_of(leading, noise) if leading else searched.likeliest_beside_unknown(noise)) or null
-        return judged, Best.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
-    on_noise = searched.prepared.on_noise
+        return judged, BestRepair.of(searched, test, fit, noise, out_of_vocabulary=leading, rng=rng)
+    on_noise = searched.prepared.noise_effect_names
     if judged.verdict in ("named", "noise", "clean"):
         stated = tuple(name for name in judged.combination if name in on_noise)
         noise = searched.posterior.likeliest_noise(stated)
     on_mean = tuple(name for name in judged.combination if name not in on_noise)
-    best = Best.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
+    best = BestRepair.of(searched, test, searched.best_refit_of(on_mean, noise) or null, noise, rng=rng)
     if judged.verdict == "named" and predicts_far_worse(
         best.improvement
     ):  # a fit that fails on held-out readings is no repair
-        return judged.withdraw(), Best.of(searched, test, null, noise, rng=rng)
+        return judged.withdraw(), BestRepair.of(searched, test, null, noise, rng=rng)
     return judged, best

@@ -11,8 +11,8 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise._kinds import require_like
 from probewise.calibration import FittedSensor
-from probewise.diagnosis.fitting.coordinates import CalibratedSensor, SensorCoordinates, theta_to_natural
-from probewise.diagnosis.fitting.free_form import FreeForm, free_form_to_natural
+from probewise.diagnosis.fitting.coordinates import CalibratedSensor, GaussianMixtureSensor, theta_to_natural
+from probewise.diagnosis.fitting.free_form import FreeFormSensor, free_form_to_natural
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor import is_free_form
@@ -47,7 +47,11 @@ def sensor_from_posterior(names: Sequence[str], mean: FloatArray, cov: FloatArra
     natural_cov = slope @ cov @ slope.T
     floor = 1e-8 * np.maximum(np.diag(natural_cov), 1e-8)
     factor = np.linalg.cholesky(natural_cov + np.diag(floor))
-    return FreeForm(center, factor) if free else SensorCoordinates(n_gaussians, center, factor, exchangeable=False)
+    return (
+        FreeFormSensor(center, factor)
+        if free
+        else GaussianMixtureSensor(n_gaussians, center, factor, exchangeable=False)
+    )
 
 
 class SensorPrior(Protocol):
@@ -81,7 +85,7 @@ def require_same_unit(sensor: SensorPrior, plan: Plan) -> None:
         raise ParameterError("sensor", f"one that reads in {own!r}", f"one in {unit!r}, as the recording")
 
 
-def sensor_of(sensor: SensorPrior) -> CalibratedSensor:
+def sensor_from_samples(sensor: SensorPrior) -> CalibratedSensor:
     """Build a prior from an earlier sensor's posterior samples; see `sensor_from_posterior`.
 
     If the samples average several hypotheses, only the most probable is used: a normal prior holds one hypothesis.

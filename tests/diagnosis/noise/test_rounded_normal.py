@@ -12,9 +12,9 @@ from scipy.stats import norm
 
 from probewise.diagnosis import diagnose
 from probewise.diagnosis.light_sensor.sensor import LightSensor
-from probewise.diagnosis.noise.flat import Flat
-from probewise.diagnosis.noise.law import NoiseLaw, forms
-from probewise.diagnosis.noise.models import NoiseModel, least_sd, rough_sd
+from probewise.diagnosis.noise.law import NoiseLaw, stacked_density
+from probewise.diagnosis.noise.models import NoiseModel, least_sd_given_rounding, rough_sd
+from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.prior_odds import PriorOdds
 from probewise.diagnosis.search.noises import NoiseModels
@@ -27,7 +27,7 @@ from probewise.world.spots import Blob, gaussian_spot
 from probewise.world.world import World
 
 STEP, SIGMA = 4.0, 0.7
-LAW = Flat(0.5 * STEP / SIGMA, SIGMA)
+LAW = RoundedNormal(0.5 * STEP / SIGMA, SIGMA)
 
 
 def rounded(noise_sd: float, seed: int, *concealed: hidden.Concealed) -> Recording:
@@ -47,7 +47,7 @@ def noises(recording: Recording) -> NoiseModels:
     extent = Extent.of(recording)
     built = {name: kind.for_extent(extent) for name, kind in VOCABULARY.items() if kind.stage is Stage.NOISE}
     effects = {name: effect for name, effect in built.items() if effect is not None}
-    return NoiseModels(recording, effects, PriorOdds.over(effects))
+    return NoiseModels(recording, effects, PriorOdds.for_effects(effects))
 
 
 def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
@@ -67,8 +67,8 @@ def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
 def test_pseudo_observations_say_as_much_as_the_density_does(half):
     rng = np.random.default_rng(3)
     z = rng.normal(size=400_000) + half * rng.uniform(-1, 1, 400_000)
-    flat, one = Flat(half, 1.0), np.ones(1)
-    plain, moved = (flat.as_normal((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    flat, one = RoundedNormal(half, 1.0), np.ones(1)
+    plain, moved = (flat.normal_pseudo_observations((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.03)
     assert np.var(plain) == pytest.approx(1 / float(flat.information), rel=0.02)
 
@@ -82,8 +82,8 @@ def test_pseudo_observations_say_as_much_as_the_density_does(half):
 
 
 def test_inside_the_flat_top_a_residual_says_nothing():
-    inside = LAW.as_normal(np.array([[0.0], [0.3]]), np.array([SIGMA]))
-    outside = LAW.as_normal(np.array([[STEP]]), np.array([SIGMA]))
+    inside = LAW.normal_pseudo_observations(np.array([[0.0], [0.3]]), np.array([SIGMA]))
+    outside = LAW.normal_pseudo_observations(np.array([[STEP]]), np.array([SIGMA]))
     assert np.abs(inside).max() < 0.01 * outside[0, 0]
 
 
@@ -91,19 +91,19 @@ def test_laws_of_one_kind_are_taken_together():
     one = np.ones(5)
     laws = [NoiseLaw(one, 0 * one, one > 1, flat=flat, sigma=1 / flat) for flat in (1.0, 3.0)]
     z = np.linspace(-2, 2, 5)[:, None]
-    together, sigma = forms(laws), np.array([1.0, 1 / 3])
-    apart = np.concatenate([law.minus_log_likelihood(z, law.scale(z)) for law in laws])
+    together, sigma = stacked_density(laws), np.array([1.0, 1 / 3])
+    apart = np.concatenate([law.minus_log_likelihood(z, law.likeliest_sigma(z)) for law in laws])
     np.testing.assert_allclose(together.minus_log_likelihood(z, sigma, 5), apart)
-    np.testing.assert_allclose(together.scale(z, 5), sigma)
+    np.testing.assert_allclose(together.likeliest_sigma(z, 5), sigma)
 
 
 def test_no_pseudo_observation_is_farther_than_what_was_read():
     law = NoiseLaw(np.ones(5), np.zeros(5), np.zeros(5, dtype=np.bool_), flat=3.0, sigma=0.5)
     z = np.array([[0.0], [0.4], [1.4], [2.5], [-9.0]])
-    pseudo = law.pseudo_observations(z, np.array([0.5]))
+    pseudo = law.bounded_pseudo_observations(z, np.array([0.5]))
     assert (np.abs(pseudo) <= np.abs(z)).all()
     np.testing.assert_array_equal(pseudo[3:], z[3:])
-    drawn = law.draws(20_000, rng=np.random.default_rng(0))
+    drawn = law.draw_pseudo_observations(20_000, rng=np.random.default_rng(0))
     assert 0.8 < drawn.std() < 1.0  # of unit sd but for what is cut
 
 
@@ -114,7 +114,7 @@ def test_rounding_that_hides_the_noise_is_in_its_law_declared_or_not(noise_sd, c
     found = noises(as_declared(recording) if declared else recording)
     assert found.certain == (() if declared else ("quantisation",))
     for names, model in found.models.items():
-        laws = model.laws(recording.readings).laws
+        laws = model.nodes_for_predictions(recording.readings).laws
         assert all(bool(law.flat) == (coarse and names == found.certain) for law in laws)
 
 
@@ -131,7 +131,7 @@ def test_the_noise_of_rounded_readings_is_told_without_a_model(noise_sd):
 
 def test_no_normal_law_sums_to_more_than_one_over_a_lattice():
     """As narrow as it may be, about any mean, to a fifth of a percent."""
-    sd = least_sd(rounded(0.4, 1))
+    sd = least_sd_given_rounding(rounded(0.4, 1))
     cells = STEP * np.arange(-9, 10)
     sums = STEP * norm.pdf(cells, np.linspace(0, STEP / 2, 9)[:, None], sd).sum(axis=1)
     np.testing.assert_allclose(sums, 1.0, atol=2e-3)
@@ -145,8 +145,8 @@ def test_no_reading_is_known_better_from_those_before_it_than_a_lattice_allows(n
     recording = rounded(0.4, 1)
     model = NoiseModel((noises(recording).effects[noise],), recording, least_sd=0.6 * STEP)
     small = 0.01 * np.random.default_rng(4).standard_normal((int(recording.usable.sum()), 1))
-    for law in model.laws(recording.readings[recording.usable]).laws:
-        conditional = law.scale(law(small)) * law.sd * np.sqrt(1 - law.carry**2)
+    for law in model.nodes_for_predictions(recording.readings[recording.usable]).laws:
+        conditional = law.likeliest_sigma(law(small)) * law.sd * np.sqrt(1 - law.carry**2)
         assert conditional.min() == pytest.approx(0.6 * STEP)
 
 
@@ -162,9 +162,9 @@ def test_the_noise_beside_rounding_is_integrated_out(noise_sd):
     recording = Recording(
         plan, STEP * np.round((mean + noise_sd * rng.standard_normal(len(plan))) / STEP)
     ).without_declared_range()
-    nodes = NoiseModel((), recording, rounding=STEP).laws(mean)
+    nodes = NoiseModel((), recording, rounding=STEP).nodes_for_predictions(mean)
     off = (recording.readings - mean)[:, None]
-    each = np.array([-law.minus_log_likelihood(off, law.scale(off))[0] for law in nodes.laws])
+    each = np.array([-law.minus_log_likelihood(off, law.likeliest_sigma(off))[0] for law in nodes.laws])
 
     log_sigma = np.linspace(np.log(STEP / 30), np.log(30 * STEP), 4001)
     near = -np.abs(off)  # where a difference of cumulatives is exact

@@ -20,7 +20,7 @@ _LOG_ROOT_2_PI = 0.5 * math.log(2 * math.pi)
 
 
 @dataclass(frozen=True, eq=False)
-class Flat:
+class RoundedNormal:
     """Normal noise of known sd `sigma` plus a uniform part of half width `half` sigma; scalars, or k of both (k,).
 
     The methods are those of `Tail`, with residuals (n_points, k) or (n_points, 1); their `sigma` is this one.
@@ -34,9 +34,9 @@ class Flat:
     @cached_property
     def information(self) -> FloatArray:
         """Fisher information about the mean, in units of 1 / sigma^2, (k,) or a number."""
-        return np.asarray(np.vectorize(_information, otypes=[np.float64])(self.half))
+        return np.asarray(np.vectorize(_fisher_information, otypes=[np.float64])(self.half))
 
-    def scale(
+    def likeliest_sigma(
         self, whitened: FloatArray, n_points: int, *, floor: float = 0.0, start: FloatArray | None = None
     ) -> FloatArray:
         """Return the known sigma, (k,)."""
@@ -50,11 +50,11 @@ class Flat:
         of_kept = density.sum(axis=0) - (len(whitened) - n_points) * at_zero
         return np.asarray(n_points * np.log(sigma) - of_kept)
 
-    def as_normal(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Convert residuals to equally informative normal pseudo-observations, as `Tail.as_normal` does."""
+    def normal_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Convert residuals to equally informative normal pseudo-observations, as `Tail` does."""
         return np.asarray(sigma * self._score(whitened / sigma) / self.information)
 
-    def scale_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
+    def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:
         """Return the curvature for which the integral over log sigma is 1, (k,), since sigma is known."""
         return np.full(sigma.shape, 2 * math.pi)
 
@@ -70,8 +70,8 @@ class Flat:
 
 
 @lru_cache(maxsize=64)
-def _information(half: float) -> float:
-    one = Flat(half, 1.0)
+def _fisher_information(half: float) -> float:
+    one = RoundedNormal(half, 1.0)
     x = np.linspace(-half - 8, half + 8, 8001)[:, None]
     density = np.exp(one._log_density(x))
     return float(np.sum(one._score(x) ** 2 * density) * (x[1, 0] - x[0, 0]))

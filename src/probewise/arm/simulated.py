@@ -69,7 +69,9 @@ class SimulatedArm:
         if not require_number("height_mm", height_mm) > 0:
             raise ParameterError("height_mm", height_mm, "greater than 0")
         if reach is not None:
-            require_like("reach", reach, ("rest_mm", "contains", "orientation_rad"), "a Reach, or the Geometry of an arm")
+            require_like(
+                "reach", reach, ("rest_mm", "contains", "orientation_rad"), "a Reach, or the Geometry of an arm"
+            )
         self._light, self._scale, self._height_mm = light, scale, height_mm
         self.reach: Workspace = Reach() if reach is None else reach
         self.speed = Speed() if speed is None else speed

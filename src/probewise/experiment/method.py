@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.experiment.posterior import Posterior, updated, with_rivals_sampled_again
+from probewise.experiment.posterior import FromScratch, Posterior, updated, with_rivals_sampled_again
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.kernels import KernelMove
@@ -87,9 +86,13 @@ class SequentialMonteCarlo:
             posterior, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng)
         )
 
-    def _solver_from_scratch(self, rng: np.random.Generator) -> Callable[[SensorProblem], NestedResult]:
-        """Return the function that solves a problem by nested sampling."""
-        return lambda problem: nested_sampling_from_scratch(problem, self.n_live, rng)
+    def _solver_from_scratch(self, rng: np.random.Generator) -> FromScratch:
+        """Return the function that solves a problem by nested sampling, with half the live points if it is quick."""
+
+        def solve(problem: SensorProblem, *, quick: bool = False) -> NestedResult:
+            return nested_sampling_from_scratch(problem, self.n_live // 2 if quick else self.n_live, rng)
+
+        return solve
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator

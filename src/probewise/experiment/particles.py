@@ -83,7 +83,10 @@ class Particles:
     refitted
         Whether the samples were found by fits to all readings or from scratch, and have followed those since with ease.
     log_z_limit
-        Upper limit of the log evidence by fits that came nowhere near the best kind; infinite if there were none.
+        Upper limit of the log evidence of a kind that came nowhere near the best one, by fits or by a search from
+        scratch; infinite for others.
+    limit_is_searched
+        Whether a search from scratch gave that limit. Fits alone may all have missed the best one.
     """
 
     weighted: Weighted
@@ -94,6 +97,7 @@ class Particles:
     hurried: bool = False
     refitted: bool = False
     log_z_limit: float = math.inf
+    limit_is_searched: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -231,6 +235,7 @@ def update(
         hurried,
         previous.refitted and with_ease,
         previous.log_z_limit,
+        previous.limit_is_searched,
     )
 
 

@@ -9,14 +9,16 @@ readings, by nested sampling of that kind.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray
-from probewise.errors import NotConvergedError
+from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.experiment.evidence import BridgedEvidence, bridged_evidence, importance_sampled_about_points
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import (
@@ -37,7 +39,14 @@ from probewise.nested.importance import Weighted
 from probewise.nested.result import NestedResult
 from probewise.recordings.plan import Recording
 
-FromScratch = Callable[[SensorProblem], NestedResult]
+
+class FromScratch(Protocol):
+    """Solves a kind's whole problem by nested sampling; with fewer live points if `quick`."""
+
+    def __call__(self, problem: SensorProblem, *, quick: bool = False) -> NestedResult:
+        """Return the result; raise NotConvergedError if no hypothesis could have given the readings."""
+        ...
+
 
 _IMPROBABLE = 1e-3  # probability below which a kind is carried by fewer samples
 _FEWER = 3  # times
@@ -45,7 +54,7 @@ _SUSPECTED = ((0.2, 2), (0.02, 4), (0.0, 6))  # probability from which on a riva
 _MOST_OFF = 0.02  # by which a kind's probability may be wrong
 _DOUBTED_OFF = 0.06  # the same in a run that doubts its sensor, where no decision hangs on less
 _OFF_AT_THE_END = 0.5  # the same where samples have just been taken anew
-_HAS_A_SAY = 0.02  # probability of a kind in doubt that is solved from scratch; others are fitted anew
+_HAS_A_SAY = 0.02  # probability of a kind in doubt that is solved from scratch; before a run ends, of every kind
 _CARRIED = 0.25  # nats by which a carried evidence may be wrong that genealogies do not tell
 _STRAINED = 6.0  # nats, where samples could not follow
 _TOLD_APART = 1.5  # nats between an evidence carried and one taken anew, from which on the samples are in doubt
@@ -58,6 +67,8 @@ _FEWEST = 4.0  # effective draws below which a sample replaces none
 _LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
 _WELL_FOUND = 100.0  # effective draws from which on samples need not be taken anew until a reading strains them
 _RULED_OUT = 10.0  # nats by which fits and a kind's own samples may miss its evidence, where both are behind
+_REPRODUCED = 5  # of the starts, which must lead to fits as good as the best: otherwise better ones may be missed
+_SEARCHED_PER_READING = 1  # kinds that are searched from scratch after a reading; before a run ends, all that need it
 _LOST = 0.01  # probability of a kind that must not be missed
 
 WARY = 12.0
@@ -184,7 +195,7 @@ def updated(
     particles = _update_every_kind(previous, problems, STEADY if doubted else THOROUGH, rng)
     now = replace(previous, particles=tuple(particles))
     if doubted:
-        particles = _sample_rivals_again(now, problems, n_particles, rng)
+        particles = _sample_rivals_again(now, problems, n_particles, rng, from_scratch)
         now = replace(previous, particles=tuple(particles))
         particles = [
             _with_bridged_evidence(p, problem, rng) if p.hurried and odds > now.log_odds.max() - _HOPELESS else p
@@ -233,26 +244,40 @@ def with_rivals_sampled_again(
     are hopelessly improbable.
     """
     problems = [kind.problem(recording) for kind in posterior.kinds]
-    now = replace(posterior, particles=tuple(_sample_rivals_again(posterior, problems, n_particles, rng, each=True)))
+    now = replace(
+        posterior, particles=tuple(_sample_rivals_again(posterior, problems, n_particles, rng, from_scratch, each=True))
+    )
     return _reestimated_where_doubtful(
         now, problems, min(n_particles, _MOST_DRAWS), from_scratch, rng, most_off=_OFF_AT_THE_END
     )
 
 
 def _sample_rivals_again(
-    now: Posterior, problems: list[SensorProblem], n_particles: int, rng: np.random.Generator, *, each: bool = False
+    now: Posterior,
+    problems: list[SensorProblem],
+    n_particles: int,
+    rng: np.random.Generator,
+    from_scratch: FromScratch,
+    *,
+    each: bool = False,
 ) -> list[Particles]:
-    """Sample rivals anew from samples of other kinds, where their own may have lost the truth.
+    """Sample rivals anew, where their own samples may have lost the truth.
 
     Return the particles of every kind.
 
     That can happen after a reading that few of them predict. And a rival whose effect can be negligible cannot be much
     less likely than the plain model: if it seems to be, its samples are in the wrong place. With `each`, every rival is
-    sampled anew, except those whose samples were found in this way and have followed the readings since. A rival whose
-    fits all came out far below the best kind is fitted again when the readings since could have made up the difference.
+    sampled anew, except those that do not matter and whose samples were found in this way and have followed the
+    readings since. Fits that start at samples of other kinds come first. Where few of them lead to the best fit, others
+    may be missed: the kind is searched from scratch, one kind after a reading in turn, and with `each` all of them and
+    those that matter. A rival that came out far below the best kind is sampled again when the readings since could have
+    made up the difference.
     """
     particles, log_odds = list(now.particles), now.log_odds
-    for k, (kind, problem) in enumerate(zip(now.kinds, problems, strict=True)):
+    probability = now.with_warier_odds.probability
+    n_kinds, n_searches = len(now.kinds), len(now.kinds) if each else _SEARCHED_PER_READING
+    for k in np.roll(np.arange(n_kinds), -(len(problems[0].recording) % n_kinds)).tolist():
+        kind, problem = now.kinds[k], problems[k]
         if not kind.left_out:
             continue
         alike = [j for j, other in enumerate(now.kinds) if other.shape == kind.shape and j != k]
@@ -260,17 +285,25 @@ def _sample_rivals_again(
         own = particles[k]
         beyond = own.log_z < particles[plain].log_z - _NESTED
         hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
-        wanted = (each and not own.refitted) or beyond or own.strained or own.hurried
-        if not wanted or own.log_z_limit < hopeless:
+        matters = each and probability[k] > _HAS_A_SAY
+        wanted = matters or (each and not own.refitted) or beyond or own.strained or own.hurried
+        if not wanted or (own.log_z_limit < hopeless and (own.limit_is_searched or not each)):
             continue
         best = max(alike, key=lambda j: log_odds[j])
         donors = [now.particles[j].weighted for j in {plain, best} if now.particles[j].log_z > -math.inf]
         donors += [own.weighted] if own.log_z > hopeless else []
         n = max(len(own.ancestor), _n_samples_of_kind(kind, 0.0, n_particles))
         anew = _sample_near_other_kinds(kind, problem, own.weighted, donors, n, hopeless, rng)
+        few = _LEAST_FOUND if kind.effect is not None else _WELL_FOUND
+        is_searched = n_searches > 0 and (matters or not anew.is_reproduced or (each and anew.n_eff < few))
+        if is_searched:
+            n_searches -= 1
+            anew = _search_from_scratch(problem, own.weighted, n, hopeless, rng, from_scratch)
         found = anew.samples
         if anew.highest_log_z < hopeless:
-            particles[k] = replace(own, log_z_limit=max(anew.highest_log_z, own.log_z) + _RULED_OUT)
+            limit = max(anew.highest_log_z, own.log_z) + _RULED_OUT
+            if anew.is_reproduced:
+                particles[k] = replace(own, log_z_limit=limit, limit_is_searched=is_searched)
             continue
         if found is None or found.n_eff < _FEWEST:
             particles[k] = replace(own, strained=own.strained or own.hurried)
@@ -281,16 +314,38 @@ def _sample_rivals_again(
         fresh = _independent_start_with_evidence(
             fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=min(2 * n, _DRAWS))
         )
-        particles[k] = replace(fresh, refitted=found.n_eff >= _WELL_FOUND, strained=found.n_eff < _LEAST_FOUND)
+        if is_searched and not own.strained and fresh.log_z < own.log_z - _CARRIED:
+            continue
+        particles[k] = replace(
+            fresh,
+            refitted=anew.is_reproduced and found.n_eff >= _WELL_FOUND,
+            strained=found.n_eff < _LEAST_FOUND,
+        )
     return particles
 
 
 @dataclass(frozen=True, eq=False)
-class _SamplesNearOtherKinds:
-    """Samples of a kind, None if none was found, and the largest log evidence by fits, infinite without fits."""
+class _SamplesAnew:
+    """Samples of a kind taken anew.
+
+    Attributes
+    ----------
+    samples
+        None if none was found.
+    highest_log_z
+        The largest log evidence by fits or by a search from scratch; infinite without either.
+    is_reproduced
+        Whether several starts led to the best fit, or a search from scratch to the samples.
+    """
 
     samples: Weighted | None
     highest_log_z: float = math.inf
+    is_reproduced: bool = True
+
+    @property
+    def n_eff(self) -> float:
+        """Effective number of the samples; 0 without any."""
+        return 0.0 if self.samples is None else self.samples.n_eff
 
 
 def _sample_near_other_kinds(
@@ -301,7 +356,7 @@ def _sample_near_other_kinds(
     n: int,
     hopeless: float,
     rng: np.random.Generator,
-) -> _SamplesNearOtherKinds:
+) -> _SamplesAnew:
     """Sample a kind's posterior from samples of other kinds: by refits or, for a noise model, from these directly.
 
     No samples are drawn if the largest log evidence by fits is below `hopeless`.
@@ -309,26 +364,71 @@ def _sample_near_other_kinds(
     noise = declared_noise(kind.likelihood)
     if kind.effect is not None:
         if noise is None:
-            return _SamplesNearOtherKinds(None)
+            return _SamplesAnew(None)
         sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
         found = fit_kind(kind, problem, donors, noise_sd=sd, rng=rng)
+        is_reproduced = found.n_as_good_as_best >= _REPRODUCED
         if found.highest_log_z < hopeless:
-            return _SamplesNearOtherKinds(None, found.highest_log_z)
+            return _SamplesAnew(None, found.highest_log_z, is_reproduced)
         with_own = own.log_z > hopeless
-        return _SamplesNearOtherKinds(
+        return _SamplesAnew(
             sampled_about_fits(found, kind, problem, own, n_draws=2 * n, with_own=with_own, rng=rng),
             found.highest_log_z,
+            is_reproduced,
         )
     n_own = len(kind.prior.names)
     points = [donor.samples(n // 2, rng=rng)[:, :n_own] for donor in donors]
     if own.log_z > hopeless:
         points.append(own.samples(n // 2, rng=rng))
+    return _SamplesAnew(_importance_sampled_if_possible(np.concatenate(points), problem, n, rng))
+
+
+def _search_from_scratch(
+    problem: SensorProblem,
+    own: Weighted,
+    n: int,
+    hopeless: float,
+    rng: np.random.Generator,
+    from_scratch: FromScratch,
+) -> _SamplesAnew:
+    """Sample a kind's posterior by a quick run of nested sampling."""
     try:
-        return _SamplesNearOtherKinds(
-            importance_sampled_about_points(np.concatenate(points), problem, rng=rng, n_draws=n)
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtfulResultWarning)  # its samples are only where draws are made
+            run = from_scratch(problem, quick=True)
     except NotConvergedError:
-        return _SamplesNearOtherKinds(None)
+        return _SamplesAnew(None, -math.inf)
+    return _SamplesAnew(_samples_from_run(run, own, problem, n, rng, with_own=own.log_z > hopeless), run.log_z)
+
+
+def _samples_from_run(
+    run: NestedResult, own: Weighted, problem: SensorProblem, n: int, rng: np.random.Generator, *, with_own: bool
+) -> Weighted:
+    """Return samples of a kind from a run of nested sampling, and from the kind's own samples if `with_own`.
+
+    Importance sampling about both weighs them. Where modes are too many or too bent for it, few draws would hold all of
+    the weight: then the run's samples are returned as they are, with its evidence.
+    """
+    points = run.samples(n, rng=rng)
+    about = np.concatenate([points, own.samples(n // 2, rng=rng)]) if with_own else points
+    drawn = _importance_sampled_if_possible(about, problem, 2 * n, rng)
+    if drawn is None or drawn.n_eff < _WELL_FOUND:
+        even = np.full(n, -math.log(n))
+        likelihood = problem.log_likelihood(points)
+        drawn = Weighted(
+            problem.prior.names, points, likelihood, even, run.log_z, run.log_z_error, float(n), n, -math.inf
+        )
+    return replace(drawn, n_calls=own.n_calls + run.n_calls + drawn.n_calls)
+
+
+def _importance_sampled_if_possible(
+    points: FloatArray, problem: SensorProblem, n_draws: int, rng: np.random.Generator
+) -> Weighted | None:
+    """Sample by importance sampling about points; None if no draw could have given the readings."""
+    try:
+        return importance_sampled_about_points(points, problem, rng=rng, n_draws=n_draws)
+    except NotConvergedError:
+        return None
 
 
 def _n_samples_of_kind(kind: HypothesisKind, probability: float, n_particles: int) -> int:
@@ -401,13 +501,8 @@ def _reestimate_kind(
         run = from_scratch(problem)
     except NotConvergedError:  # no hypothesis of this kind could have given the readings
         return replace(particles, weighted=replace(had, log_z=-math.inf, log_z_error=math.inf), strained=False)
-    points = run.samples(n // 2, rng=rng)
-    if particles.log_z > -math.inf:
-        points = np.concatenate([points, had.samples(n // 2, rng=rng)])
-    drawn = importance_sampled_about_points(points, problem, rng=rng, n_draws=2 * n)
-    fresh = particles_from_posterior(
-        replace(drawn, n_calls=had.n_calls + run.n_calls + drawn.n_calls), n, problem, rng=rng
-    )
+    drawn = _samples_from_run(run, had, problem, n, rng, with_own=particles.log_z > -math.inf)
+    fresh = particles_from_posterior(drawn, n, problem, rng=rng)
     fresh = _independent_start_with_evidence(fresh, bridged_evidence(fresh.weighted, problem, rng=rng, n_draws=n))
     return replace(fresh, weighted=replace(fresh.weighted, run=run), refitted=True)
 
@@ -427,4 +522,9 @@ def _independent_start_with_evidence(particles: Particles, found: BridgedEvidenc
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
     start = Particles(weighted, np.arange(len(had.theta)), found.error**2)
-    return replace(start, refitted=particles.refitted, log_z_limit=particles.log_z_limit)
+    return replace(
+        start,
+        refitted=particles.refitted,
+        log_z_limit=particles.log_z_limit,
+        limit_is_searched=particles.limit_is_searched,
+    )

@@ -32,6 +32,7 @@ _HELD = 1e12  # stiffness of a parameter that is held, in inverse squares of its
 _NUDGE = 1e-3  # of a parameter's scale: the finite difference
 _KEPT = 45  # fits that carry a Gaussian
 _WORSE = 8.0  # nats behind the best fit, from which on a fit carries none
+_AS_GOOD = 0.5  # nats behind the best fit, up to which a fit is as good
 _WIDER = 1.4  # factor on the width of these Gaussians
 _IN_GAP = 0.4  # of the gap between two readings: sd of a change point within it
 _JITTER = 1e-9
@@ -65,6 +66,11 @@ class Fits:
         return (
             order[self.score[order] > self.score[order[0]] - _WORSE] if math.isfinite(self.score.max()) else order[:0]
         )
+
+    @property
+    def n_as_good_as_best(self) -> int:
+        """Number of fits that are about as good as the best: the starts that led there, or to another as good."""
+        return int(np.count_nonzero(self.score > self.score.max() - _AS_GOOD))
 
     @cached_property
     def log_z_by_fit(self) -> FloatArray:

@@ -20,7 +20,7 @@ from probewise.diagnosis.evidence.laplace import (
     block_log_bayes_factors,
     mix_scales,
 )
-from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
+from probewise.diagnosis.evidence.templates import EffectTemplates, templates_of_effect
 from probewise.diagnosis.fitting.coordinates import (
     default_sensor,
     effect_coordinates,
@@ -135,9 +135,9 @@ def test_templates_are_the_same_however_many_are_predicted_at_once(monkeypatch, 
     usable = np.arange(len(plan))
     found = Fit(model, z, model.predict(z[None, :])[0], np.zeros(len(plan)), np.zeros((len(plan), 7)), 1.0, 0.0)
     effect = VOCABULARY[name].for_extent(EXTENT).with_fewer_variants()
-    whole = effect_templates(found, effect, usable)
+    whole = templates_of_effect(found, effect, usable)
     monkeypatch.setattr("probewise.diagnosis.evidence.templates._AT_ONCE", 5 * len(plan))
-    few = effect_templates(found, effect, usable, most=7)
+    few = templates_of_effect(found, effect, usable, most=7)
     assert (len(few.columns), len(few.choice)) == (7, 7)
     at = np.linspace(0, len(whole.columns) - 1, 7).round().astype(int)
     for k, own in enumerate(at):
@@ -154,7 +154,7 @@ def test_what_changes_nothing_but_the_last_digit_is_no_template():
     predicted = model.predict(z[None, :])[0] * (1 + 1e-13)
     usable = np.flatnonzero(np.arange(len(plan)) % 5)
     found = Fit(model, z, predicted[usable], np.zeros(len(usable)), np.zeros((len(usable), len(z))), 1.0, 0.0)
-    templates = effect_templates(found, VOCABULARY["position_scale"].for_extent(EXTENT), usable)
+    templates = templates_of_effect(found, VOCABULARY["position_scale"].for_extent(EXTENT), usable)
     for columns in templates.columns:
         assert np.abs(columns[:, 0]).max() > 0.01
         assert not columns[:, 1].any()
@@ -171,7 +171,7 @@ def test_templates_of_a_variant_are_what_its_scans_change():
     found = Fit(model, z, predicted[usable], np.zeros(len(usable)), np.zeros((len(usable), 7)), 1.0, 0.0)
     for name in ("scan_misplacement", "height_offset", "ambient_step", "lag", "edge_shadow"):
         effect = VOCABULARY[name].for_extent(EXTENT)
-        templates = effect_templates(found, effect, usable)
+        templates = templates_of_effect(found, effect, usable)
         assert len(templates.columns) == len(templates.settings) == len(templates.choice)
         for at in range(0, len(templates.choice), 9):
             richer = model.with_effect(templates.variant_of_entry(at))

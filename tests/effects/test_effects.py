@@ -38,12 +38,12 @@ from probewise.effects import (
     ScanMisplacement,
     StickSlip,
 )
-from probewise.effects.patches import straight_scan_lines
+from probewise.effects.patches import distinct_scan_lines
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseLevel, Poses, Stage
+from probewise.sensor import Chain, FixedLevels, FixedMixture, Poses, ReadingNoise, Stage
 
 PLAN = with_jittered_times(two_way_plan(), rng=np.random.default_rng(0))
 EXTENT = Extent(10.0, 60.0, PLAN)
@@ -135,13 +135,13 @@ def test_a_prior_maps_the_unit_cube_to_its_own_density(name):
 
 def test_lines_are_found_whichever_way_they_were_scanned():
     """The two-way plan goes along X, forth and back, and once along Y; a turned plan along its own line."""
-    along_x, along_y = straight_scan_lines(PLAN)
+    along_x, along_y = distinct_scan_lines(PLAN)
     assert (along_x.angle_rad, along_x.offset_mm, along_x.low_mm, along_x.high_mm) == (0.0, 0.0, -50.0, 50.0)
     assert along_y.angle_rad == pytest.approx(np.pi / 2)
     assert (along_y.offset_mm, along_y.low_mm, along_y.high_mm) == pytest.approx((5.0, -60.0, 60.0))
     line = paper_plan().take(np.arange(101))
     c, s = np.cos(0.4), np.sin(0.4)
-    (found,) = straight_scan_lines(replace(line, x_mm=c * line.x_mm - s * 7, y_mm=s * line.x_mm + c * 7))
+    (found,) = distinct_scan_lines(replace(line, x_mm=c * line.x_mm - s * 7, y_mm=s * line.x_mm + c * 7))
     assert (found.angle_rad, found.offset_mm, found.length_mm) == pytest.approx((0.4, 7.0, 100.0))
     x, y = found.place(np.array([3.0]), np.array([-2.0]))
     np.testing.assert_allclose(found.coordinates(x, y), [[3.0], [-2.0]], atol=1e-12)
@@ -413,7 +413,7 @@ def test_nonlinearity_keeps_black_and_white():
 
 
 def test_correlated_noise_sets_the_memory_and_not_the_sd():
-    level = NoiseLevel(sd=np.full((1, 1), 0.6), rho=np.zeros((1, 1)))
+    level = ReadingNoise(sd=np.full((1, 1), 0.6), rho=np.zeros((1, 1)))
     out = CorrelatedNoise().apply(level, np.array([[0.3]]), there_and_back())
     assert out.rho[0, 0] == 0.3
     assert out.sd[0, 0] == 0.6

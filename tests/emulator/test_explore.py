@@ -145,5 +145,5 @@ def test_from_python_too_a_fitted_arm_counts_its_own_error() -> None:
     run = probewise.explore(
         SENSOR, arm=lego, trust=1.0, max_readings=1, rng=np.random.default_rng(SEED), progress=False
     )
-    assert run.arm is not None
+    assert run.arm_error is not None
     assert run.stop_reason.endswith("the arm's own error included")

@@ -64,19 +64,19 @@ def test_the_shape_moves_with_the_arm_as_an_inference_anew_says(found, name):
     ]
     moved = np.abs(ends[0] - ends[1]) / (2 * share)
 
-    np.testing.assert_allclose(claimed.arm.sd, moved, atol=0.02 + 0.05 * moved.max())
+    np.testing.assert_allclose(claimed.arm_error.sd, moved, atol=0.02 + 0.05 * moved.max())
 
 
 def test_a_base_that_stands_elsewhere_moves_the_shape_and_does_not_stretch_it(found):
     claimed = run_with_arm_error(found, only("base x", 3.0), levels=LEVELS, rng=np.random.default_rng(1))
-    np.testing.assert_allclose(claimed.arm.sd, [3.0, 0.0, 0.0], atol=0.1)
-    np.testing.assert_allclose(claimed.sd, np.hypot(found.last.sd, claimed.arm.sd))
+    np.testing.assert_allclose(claimed.arm_error.sd, [3.0, 0.0, 0.0], atol=0.1)
+    np.testing.assert_allclose(claimed.sd, np.hypot(found.last.sd, claimed.arm_error.sd))
 
 
 def test_a_height_that_the_calibration_shared_moves_nothing(found):
     """A shoulder that is higher by one amount everywhere dims the sensor as much when it is calibrated."""
     claimed = run_with_arm_error(found, only("shoulder height", 2.0), levels=LEVELS, rng=np.random.default_rng(1))
-    np.testing.assert_allclose(claimed.arm.sd, 0.0, atol=1e-6)
+    np.testing.assert_allclose(claimed.arm_error.sd, 0.0, atol=1e-6)
 
 
 def test_samples_files_and_words_are_as_wide_as_readings_and_arm_together(found):
@@ -87,7 +87,7 @@ def test_samples_files_and_words_are_as_wide_as_readings_and_arm_together(found)
     of_file = {p["name"]: p for p in json.loads(result_json(claimed))["shape"]["parameters"]}
     for k, parameter in enumerate(found_shape(claimed).parameters):
         assert parameter.sd == of_file[parameter.name]["sd"] == pytest.approx(claimed.sd[k])
-        assert parameter.arm_sd == of_file[parameter.name]["arm_sd"] == pytest.approx(claimed.arm.sd[k])
+        assert parameter.arm_sd == of_file[parameter.name]["arm_sd"] == pytest.approx(claimed.arm_error.sd[k])
         low, high = parameter.interval95
         assert high - low == pytest.approx(2 * 1.96 * claimed.sd[k], rel=0.1)
     rows = np.array([[float(cell) for cell in line.split(",")] for line in samples_csv(claimed).splitlines()[1:]])
@@ -113,10 +113,11 @@ def test_light_that_falls_less_with_the_height_moves_the_shape_less(found):
     none = dataclasses.replace(arm, light_per_mm=0.0)
     same = dataclasses.replace(arm, light_per_mm=2 / ARM.read_height_mm * (WHITE - DARK) / WHITE)
     claimed = [
-        run_with_arm_error(found, each, levels=LEVELS, rng=np.random.default_rng(1)).arm.sd for each in (same, none)
+        run_with_arm_error(found, each, levels=LEVELS, rng=np.random.default_rng(1)).arm_error.sd
+        for each in (same, none)
     ]
-    np.testing.assert_allclose(claimed[0], square.arm.sd)
-    assert (claimed[1] < square.arm.sd).all()
+    np.testing.assert_allclose(claimed[0], square.arm_error.sd)
+    assert (claimed[1] < square.arm_error.sd).all()
 
 
 @pytest.fixture(scope="module")
@@ -136,9 +137,9 @@ def test_a_run_reads_on_until_the_lengths_are_known_arm_included(claimed_by):
     alone, included = claimed_by(None), claimed_by(0.95)
     assert len(included.readings) > len(alone.readings)
     assert alone.readings == included.readings[: len(alone.readings)]  # until then the arm plays no part
-    np.testing.assert_allclose(included.arm.sd, [0.95, 0.0, 0.0], atol=0.08)
-    assert np.hypot(included.last.sd, included.arm.sd).max() < 1.0
-    assert np.hypot(included.steps[-2].sd, included.steps[-2].arm.sd).max() >= 1.0
+    np.testing.assert_allclose(included.arm_error.sd, [0.95, 0.0, 0.0], atol=0.08)
+    assert np.hypot(included.last.sd, included.arm_error.sd).max() < 1.0
+    assert np.hypot(included.steps[-2].sd, included.steps[-2].arm_error.sd).max() >= 1.0
     assert included.stop_reason == "every length is known to better than 1 mm, the arm's own error included"
     assert included.reached
 
@@ -155,8 +156,8 @@ def test_a_run_whose_arm_alone_leaves_too_much_says_so_and_reads_no_further(clai
 def test_a_run_that_ends_too_early_claims_the_arms_part_too(small_for_all):
     experiment = small_for_all.experiment(fitted_arm=FittedArm(only("base x", 3.0), LEVELS))
     early = run(small_for_all.arm(), experiment, rng=np.random.default_rng(4), max_readings=2)
-    assert early.arm is not None
-    assert early.steps[0].arm is None
+    assert early.arm_error is not None
+    assert early.steps[0].arm_error is None
     assert early.stop_reason.endswith("the arm's own error included")
 
 
@@ -208,7 +209,7 @@ def test_two_hundred_fitted_arms_miss_the_circle_by_what_is_claimed(found):
         seen = ndtr((TRUE[2] - np.hypot(*(stands[:-1, :2] - TRUE[:2]).T)) / 8.0)
         values = DARK + 50.0 * (14.0 / height_mm) ** 2 * seen + rng.standard_normal(len(told))
         theta, sd = circle_by(told, values)
-        arm_sd = run_with_arm_error(found, fitted, levels=LEVELS, rng=rng).arm.sd
+        arm_sd = run_with_arm_error(found, fitted, levels=LEVELS, rng=rng).arm_error.sd
         with_arm.append((theta - TRUE) / np.hypot(sd, arm_sd))
         without.append((theta - TRUE) / sd)
     held = np.mean(np.abs(with_arm) < 1.96, axis=0)

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import ParameterError
-from probewise.experiment.evidence import bridged_evidence, importance_sampled_about_points
+from probewise.experiment.evidence import bridged_evidence, posterior_sampled_about_points
 from probewise.experiment.kernels import LocalKernels
 from probewise.experiment.particles import (
     Particles,
@@ -186,7 +186,7 @@ def test_what_is_redrawn_has_its_shares_from_the_readings_not_from_where_it_bega
     points = posterior.samples(2000, rng=rng(1))
     left = points[:, 0] < mean[0]
     uneven = np.concatenate([points[left], points[~left][: left.sum() // 9]])
-    found = importance_sampled_about_points(uneven, problem, rng=rng(2), n_draws=8000)
+    found = posterior_sampled_about_points(uneven, problem, rng=rng(2), n_draws=8000)
     assert found.mean()[0] == pytest.approx(mean[0], abs=0.15 * sd[0])
     assert found.log_z == pytest.approx(log_z, abs=5 * found.log_z_error + 0.05)
 

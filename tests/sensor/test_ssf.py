@@ -13,8 +13,8 @@ from probewise.sensor import (
     FreeMixture,
     SSFField,
     footprint_of,
-    mean_mixture,
     mean_ssf_field,
+    merged_mean_mixture,
     mixture_names,
     mixture_of_field,
     total_variation,
@@ -145,10 +145,10 @@ def test_sampled_mixtures_are_summarised_by_the_law_of_total_covariance():
     weights = rng.random(20)
     footprint = footprint_of(theta, 2)
     field = mean_ssf_field(footprint, u_mm=grid(60), v_mm=grid(60), weights=weights)
-    mixture = mean_mixture(footprint, weights=weights)
+    mixture = merged_mean_mixture(footprint, weights=weights)
     assert mixture.mean_mm == pytest.approx(field.mean_mm, abs=1e-6)
     assert mixture.cov_mm2 == pytest.approx(field.cov_mm2, abs=1e-4)
-    assert total_variation(mean_mixture(footprint, weights=weights, n_gaussians=3), field) < total_variation(
+    assert total_variation(merged_mean_mixture(footprint, weights=weights, n_gaussians=3), field) < total_variation(
         mixture, field
     )
 

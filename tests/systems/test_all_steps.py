@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probewise.systems import Law, RunTable
-from probewise.systems.all_steps import TrajectoryCache, integrate_near, steps_of
+from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_of
 from probewise.systems.motion import Limit, Motion, RowsInRuns, integrate_states
 
 
@@ -57,7 +57,9 @@ class _Case:
 
     def near(self, theta):
         steps = steps_of(self.table, 0.02)
-        return integrate_near(self.problem(theta), steps, self.memory, effects="effects", theta=theta, n_own=3)
+        return integrate_from_known_trajectories(
+            self.problem(theta), steps, self.memory, effects="effects", theta=theta, n_own=3
+        )
 
     def stepped(self, theta):
         motion, own, columns = self.problem(theta)(np.arange(len(theta)))

@@ -146,9 +146,8 @@ class OwnInstrument:
                 raise ParameterError("what reachable returned", held.dtype.name, "True or False for each place")
             return held.astype(np.bool_)
 
-    def contains(self, places_mm: FloatArray) -> BoolArray:
-        """Return which places, (n_places, 2), are reachable, as `reachable` does: shape (n_places,)."""
-        return self.reachable(places_mm)
+    contains = reachable
+    """Its name in `ReachablePlaces`."""
 
     holds = contains
     """The old name of `contains`."""

@@ -358,7 +358,10 @@ def _smc_with_all_gaussians_bright(
 
 
 def _with_bridged_evidence(made: SMCResult, log_z: FloatArray, added: FloatArray, taken: FloatArray) -> SMCResult:
-    """Replace the evidence by that of a bridge if enough samples are effective; add a doubt if the two disagree."""
+    """Return a complete run with the evidence of a bridge, if enough samples are effective; else the run unchanged.
+
+    If the two evidences disagree, a run of few temperatures gets a doubt.
+    """
     if made.temperatures[-1] < 1.0:
         return made
     ratio, share = bridge_log_z_ratio(added, taken)

@@ -35,7 +35,7 @@ from probewise.sensor import (
     Stage,
     footprint_of,
     is_free_form,
-    mean_mixture,
+    merged_mean_mixture,
     mixture_names,
     mixture_of_field,
 )
@@ -190,7 +190,7 @@ class FittedSensor(NamedSamples):
         if self.is_free_form:
             return mixture_of_field(self.field, n_gaussians=_FOR_A_FREE_FORM)
         n = self.n_gaussians
-        return mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
+        return merged_mean_mixture(footprint_of(self.samples[:, : 6 * n], n), n_gaussians=n)
 
     def with_leading_effects(self) -> FittedSensor:
         """Return the sensor with the most probable combination of effects, where a diagnosis left several possible.

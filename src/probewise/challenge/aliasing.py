@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise.challenge.null_refit import NullRefit
 from probewise.diagnosis.evidence.laplace import Linearised, OrthonormalBlocks
-from probewise.diagnosis.evidence.templates import EffectTemplates, effect_templates
+from probewise.diagnosis.evidence.templates import EffectTemplates, templates_of_effect
 from probewise.diagnosis.fitting.fit import Fit, fit
 from probewise.diagnosis.noise.law import white_noise
 from probewise.effects import VOCABULARY, Extent, NamedEffect
@@ -108,7 +108,7 @@ def _templates_and_explained_squares(
     problem: Linearised, found: Fit, effect: NamedEffect[Any], usable: IntArray
 ) -> tuple[EffectTemplates, FloatArray]:
     """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
-    templates = effect_templates(found, effect, usable)
+    templates = templates_of_effect(found, effect, usable)
     blocks = OrthonormalBlocks.of(problem, templates.columns, [effect.name] * len(templates.columns))
     return templates, np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
 

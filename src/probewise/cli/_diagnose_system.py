@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from probewise.cli._common import print_result
-from probewise.cli._output import StagingDirectory, checked_output_directory, staged_output
+from probewise.cli._output import StagedFiles, checked_output_directory, staged_output
 from probewise.cli._simulator import read_joined_table, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def diagnose_simulator(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagingDirectory) -> None:
+def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagedFiles) -> None:
     """Write diagnosis.json, the calibrated and the repaired simulator, the next rows to take and the figures."""
     from probewise.diagnosis import calibrated_of, diagnosis_json, repaired_of
     from probewise.systems import run_table_csv, write_fitted_system

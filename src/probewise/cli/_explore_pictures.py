@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise import experiment as posing
 from probewise.cli._explore_inputs import Inputs
-from probewise.cli._output import StagingDirectory
+from probewise.cli._output import StagedFiles
 from probewise.cli._stopping import raise_if_stopped
 from probewise.recordings import write_bytes_atomically, write_text_atomically
 from probewise.report import exploration as report
@@ -69,7 +69,7 @@ class Pictures:
         return report.robot_views_png(titled, readings, levels=inputs.levels, truth_mm=self.truth_mm)
 
     def write_results(
-        self, stage: StagingDirectory, result: Exploration, *, seed: int, known: Mapping[str, float] | None
+        self, stage: StagedFiles, result: Exploration, *, seed: int, known: Mapping[str, float] | None
     ) -> None:
         """Write the report, the animation, the result, its samples, and the sensor as the run has learnt it."""
         beside: dict[str, list[Step]] | None = {self.inputs.other_model: self.shadows} if self.shadows else None

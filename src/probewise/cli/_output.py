@@ -25,8 +25,10 @@ _FOLDER, _COMMIT = ".writing", "commit.json"
 _PATIENCE_S = 600.0  # timeout for another command that is writing its results
 
 
-class StagingDirectory:
-    """An empty directory to write results into, and the input files that were renamed to make way for them.
+class StagedFiles:
+    """Files written into an empty directory, and the input files that were renamed to make way for them.
+
+    `staged_output` makes the directory and moves the files.
 
     Attributes
     ----------
@@ -97,9 +99,7 @@ def checked_output_file(path: Path, *inputs: Path) -> Path:
 
 
 @contextlib.contextmanager
-def staged_output(
-    out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()
-) -> Iterator[StagingDirectory]:
+def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[StagedFiles]:
     """Yield an empty directory; move its files into `out` only if the block succeeds.
 
     An error or a signal before that leaves `out` as it was.
@@ -130,7 +130,7 @@ def staged_output(
         try:
             _finish_interrupted_commit(out)
             folder.mkdir()
-            stage = StagingDirectory(folder)
+            stage = StagedFiles(folder)
             yield stage
             raise_if_stopped()
             with defer_signals():

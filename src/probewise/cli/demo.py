@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from probewise.cli._common import Verb, add_out_directory, add_seed_and_quiet, print_result
-from probewise.cli._output import StagingDirectory, checked_output_directory, staged_output
+from probewise.cli._output import StagedFiles, checked_output_directory, staged_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -107,7 +107,7 @@ def _run_demo(arguments: argparse.Namespace, progress: Progress) -> tuple[str, .
         stage.write_figures(drawn)
         (stage / "diagnosis").mkdir()
         *_, rng = diagnose_verb.generators_of_diagnosis(seed)
-        diagnose_verb.write_results(diagnosis, witnesses, StagingDirectory(stage / "diagnosis"), rng=rng)
+        diagnose_verb.write_results(diagnosis, witnesses, StagedFiles(stage / "diagnosis"), rng=rng)
         stage.write("diagnosis/report.html", diagnosis_page)
         page = report.page_html(
             calibration,

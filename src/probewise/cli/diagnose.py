@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from probewise.cli._common import Verb, add_out_directory, add_path, add_seed_and_quiet, parse_path, print_result
 from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
-from probewise.cli._output import StagingDirectory, checked_output_directory, staged_output
+from probewise.cli._output import StagedFiles, checked_output_directory, staged_output
 from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
 
@@ -142,7 +142,7 @@ def _files_not_to_replace(arguments: argparse.Namespace, out: Path) -> list[Path
 
 
 def write_results(
-    diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagingDirectory, *, rng: np.random.Generator
+    diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagedFiles, *, rng: np.random.Generator
 ) -> None:
     """Write diagnosis.json, both sensor models, the next plan and the figures, but not the report."""
     from probewise.calibration import write_sensor

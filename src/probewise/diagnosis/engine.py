@@ -23,7 +23,7 @@ from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import Prepared, prepare
 from probewise.diagnosis.repair.best_repair import BestRepair, judged_and_best_repair
 from probewise.diagnosis.repair.correction import improvement_and_correction
-from probewise.diagnosis.repair.ensemble import DrawnModels, draw_models
+from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples, draw_models
 from probewise.diagnosis.repair.places import locate_effects_and_residuals
 from probewise.diagnosis.repair.repair import repair_of
 from probewise.diagnosis.residuals.locate import Place
@@ -153,7 +153,7 @@ def _facts_for_reason(
     test: GlobalTest,
     best: BestRepair,
     *,
-    drawn: DrawnModels,
+    drawn: NullBestAndRepairedSamples,
     found: Sequence[EffectFound],
     where: Sequence[Place],
     asked: NextMeasurement | None,

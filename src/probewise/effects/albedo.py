@@ -16,7 +16,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
-from probewise.effects.patches import PatchEffect, gaussian_bump, straight_scan_lines
+from probewise.effects.patches import PatchEffect, distinct_scan_lines, gaussian_bump
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.scene.albedo import Region
@@ -75,7 +75,7 @@ class AlbedoPatch(PatchEffect[SceneView]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Search along the straight scans; None where there are none."""
-        lines = straight_scan_lines(extent.plan)
+        lines = distinct_scan_lines(extent.plan)
         return cls(line=lines[0], lines=lines) if lines else None
 
     def apply(self, value: SceneView, theta: FloatArray, plan: Plan) -> SceneView:

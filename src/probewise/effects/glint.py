@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
-from probewise.effects.patches import PatchEffect, gaussian_bump, straight_scan_lines
+from probewise.effects.patches import PatchEffect, distinct_scan_lines, gaussian_bump
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -32,7 +32,7 @@ class Glint(PatchEffect[FloatArray]):
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
         """Set the typical height to 2 % of the readings' range; search along straight scans, None without any."""
-        lines = straight_scan_lines(extent.plan)
+        lines = distinct_scan_lines(extent.plan)
         return cls(0.02 * extent.span, lines[0], lines, unit=extent.reading_unit) if lines else None
 
     def apply(self, value: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:

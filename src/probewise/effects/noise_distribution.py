@@ -7,8 +7,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
+from probewise._renamed import renamed_arguments
 from probewise.effects.density import log_cell_density, log_gaussian_density
-from probewise.sensor.stages import NoiseLevel
+from probewise.sensor.stages import ReadingNoise
 
 _NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
 
@@ -22,42 +23,44 @@ class FittedReadings:
     run: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
 
-def log_density(level: NoiseLevel, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+@renamed_arguments(level="noise")
+def log_density(noise: ReadingNoise, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return the natural log of the density of each reading alone, (n_samples, n_points), per unit of the reading.
 
     Parameters
     ----------
-    level
+    noise
         The noise.
     readings
         Measured readings, (n_points,).
     predicted
         Noise-free readings, (n_samples, n_points).
     """
-    level = _with_walk_variance(level)
-    of_kept = _log_density_rounded(readings, predicted, level.sd, level.step)
+    noise = _with_walk_variance(noise)
+    of_kept = _log_density_rounded(readings, predicted, noise.sd, noise.step)
     with np.errstate(divide="ignore"):  # a share of 0 has the log -inf
-        if np.any(level.wide_share):
-            wide = _log_density_rounded(readings, predicted, level.sd * level.wide_times, level.step)
-            of_kept = np.logaddexp(np.log1p(-level.wide_share) + of_kept, np.log(level.wide_share) + wide)
-        if np.any(level.lost_share):
-            lost = _log_density_rounded(readings, level.lost_value, level.sd * _NARROW, level.step)
-            of_kept = np.logaddexp(np.log1p(-level.lost_share) + of_kept, np.log(level.lost_share) + lost)
+        if np.any(noise.wide_share):
+            wide = _log_density_rounded(readings, predicted, noise.sd * noise.wide_times, noise.step)
+            of_kept = np.logaddexp(np.log1p(-noise.wide_share) + of_kept, np.log(noise.wide_share) + wide)
+        if np.any(noise.lost_share):
+            lost = _log_density_rounded(readings, noise.lost_value, noise.sd * _NARROW, noise.step)
+            of_kept = np.logaddexp(np.log1p(-noise.lost_share) + of_kept, np.log(noise.lost_share) + lost)
     return of_kept
 
 
-def variance(level: NoiseLevel) -> FloatArray:
+@renamed_arguments(level="noise")
+def variance(noise: ReadingNoise) -> FloatArray:
     """Return the variance of a reading that is not lost, with outliers, random walk and rounding; it broadcasts."""
-    level = _with_walk_variance(level)
-    wide = 1 + level.wide_share * (level.wide_times**2 - 1)
-    return np.asarray(level.sd**2 * wide + level.step**2 / 12)
+    noise = _with_walk_variance(noise)
+    wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
+    return np.asarray(noise.sd**2 * wide + noise.step**2 / 12)
 
 
-def _with_walk_variance(level: NoiseLevel) -> NoiseLevel:
+def _with_walk_variance(noise: ReadingNoise) -> ReadingNoise:
     """Return the noise with the random walk's marginal variance at each row included in its sd."""
-    if not np.any(level.walk):
-        return level
-    return replace(level, sd=level.sd * np.sqrt(1 + level.walk**2 * level.walked), walk=np.zeros((1, 1)))
+    if not np.any(noise.walk):
+        return noise
+    return replace(noise, sd=noise.sd * np.sqrt(1 + noise.walk**2 * noise.walked), walk=np.zeros((1, 1)))
 
 
 def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray, step: FloatArray) -> FloatArray:
@@ -69,12 +72,15 @@ def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray,
     return in_cell if np.all(step) else np.where(step > 0, in_cell, log_gaussian_density(readings, mean, sd))
 
 
-def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator) -> FloatArray:
+@renamed_arguments(level="noise")
+def draw_readings(
+    noise: ReadingNoise, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator
+) -> FloatArray:
     """Draw readings, (n_samples, n_points): AR(1) noise, outliers, random walk, lost readings, then rounding.
 
     Parameters
     ----------
-    level
+    noise
         The noise.
     predicted
         Noise-free readings, (n_samples, n_points).
@@ -83,15 +89,15 @@ def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, r
     rng
         Source of randomness.
     """
-    noise = rng.standard_normal(predicted.shape)
-    fresh = np.sqrt(1 - level.rho[:, 0] ** 2)
+    errors = rng.standard_normal(predicted.shape)
+    fresh = np.sqrt(1 - noise.rho[:, 0] ** 2)
     for k in range(1, len(scan)):
         if scan[k] == scan[k - 1]:
-            noise[:, k] = level.rho[:, 0] * noise[:, k - 1] + fresh * noise[:, k]
-    noise = noise * np.where(rng.random(predicted.shape) < level.wide_share, level.wide_times, 1.0)
-    readings = predicted + level.sd * noise
-    if np.any(level.walk):
-        readings = readings + level.sd * level.walk * np.cumsum(rng.standard_normal(predicted.shape), axis=1)
-    readings = np.where(rng.random(predicted.shape) < level.lost_share, level.lost_value, readings)
-    step = np.where(level.step > 0, level.step, 1.0)
-    return np.where(level.step > 0, step * np.round(readings / step), readings)
+            errors[:, k] = noise.rho[:, 0] * errors[:, k - 1] + fresh * errors[:, k]
+    errors = errors * np.where(rng.random(predicted.shape) < noise.wide_share, noise.wide_times, 1.0)
+    readings = predicted + noise.sd * errors
+    if np.any(noise.walk):
+        readings = readings + noise.sd * noise.walk * np.cumsum(rng.standard_normal(predicted.shape), axis=1)
+    readings = np.where(rng.random(predicted.shape) < noise.lost_share, noise.lost_value, readings)
+    step = np.where(noise.step > 0, noise.step, 1.0)
+    return np.where(noise.step > 0, step * np.round(readings / step), readings)

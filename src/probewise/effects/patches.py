@@ -62,7 +62,7 @@ ALONG_X = ScanLine(0.0, 0.0, -50.0, 50.0)
 """The X axis, 50 mm to either side."""
 
 
-def straight_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
+def distinct_scan_lines(plan: Plan) -> tuple[ScanLine, ...]:
     """Return the distinct lines of the straight scans of eight places or more."""
     found: dict[tuple[float, float], ScanLine] = {}
     for rows in plan.rows_by_scan():

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
+from probewise._renamed import renamed_arguments
 from probewise.effects.noise_distribution import log_density, variance
-from probewise.sensor.stages import NoiseLevel
+from probewise.sensor.stages import ReadingNoise
 
 
 @dataclass(eq=False)
@@ -37,7 +38,8 @@ class PredictiveMixture:
         self._total, self._squares, self._of_noise = np.zeros(n_points), np.zeros(n_points), np.zeros(n_points)
         self._log_sum = np.full(int(self.scored.sum()), -np.inf)
 
-    def add(self, mean: FloatArray, level: NoiseLevel, between: FloatArray | None = None) -> None:
+    @renamed_arguments(level="noise")
+    def add(self, mean: FloatArray, noise: ReadingNoise, between: FloatArray | None = None) -> None:
         """Add noise-free predictions, (n_samples, n_points), and the noise about them.
 
         `between` (n_points,) is an additional smoothing sd of the density, for samples whose predictions lie farther
@@ -48,13 +50,13 @@ class PredictiveMixture:
         self.n_samples += len(mean)
         self._total += (mean - self._center).sum(axis=0)
         self._squares += ((mean - self._center) ** 2).sum(axis=0)
-        self._of_noise += np.broadcast_to(variance(level), mean.shape).sum(axis=0)
+        self._of_noise += np.broadcast_to(variance(noise), mean.shape).sum(axis=0)
         if self.step is not None:  # `variance` above leaves it out: the pooled sd includes a declared rounding
-            level = replace(level, step=np.full((1, 1), self.step))
+            noise = replace(noise, step=np.full((1, 1), self.step))
         if between is not None:
-            level = replace(level, sd=np.hypot(np.broadcast_to(level.sd, mean.shape), between))
+            noise = replace(noise, sd=np.hypot(np.broadcast_to(noise.sd, mean.shape), between))
         if self._log_sum.size:
-            log_p = log_density(_noise_of_rows(level, self.scored), self.readings[self.scored], mean[:, self.scored])
+            log_p = log_density(_noise_of_rows(noise, self.scored), self.readings[self.scored], mean[:, self.scored])
             self._log_sum = np.logaddexp(self._log_sum, np.logaddexp.reduce(log_p, axis=0))
 
     def mean_sd_and_log_density(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -71,8 +73,8 @@ class PredictiveMixture:
         return base + shift, np.sqrt(spread + self._of_noise / n), scores
 
 
-def _noise_of_rows(level: NoiseLevel, rows: BoolArray) -> NoiseLevel:
+def _noise_of_rows(noise: ReadingNoise, rows: BoolArray) -> ReadingNoise:
     """Return the noise of some rows, given by their mask (n_points,)."""
-    if level.sd.shape[-1] == 1:
-        return level
-    return replace(level, sd=level.sd[:, rows])
+    if noise.sd.shape[-1] == 1:
+        return noise
+    return replace(noise, sd=noise.sd[:, rows])

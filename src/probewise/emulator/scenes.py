@@ -21,7 +21,7 @@ FORMS = (
 
 
 def parse_scene(text: str) -> Surface:
-    """Parse a scene in one of its forms.
+    """Parse a scene from a text in one of the `FORMS`, such as `circle:524,300,100`.
 
     Raises
     ------

@@ -79,7 +79,7 @@ def run_with_arm_error(
         likely_shape=last.likely_shape,
         rng=rng,
     )
-    return replace(run, steps=(*run.steps[:-1], replace(last, arm=found)))
+    return replace(run, steps=(*run.steps[:-1], replace(last, arm_error=found)))
 
 
 def arm_error_in_posterior(

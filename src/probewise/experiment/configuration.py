@@ -158,7 +158,7 @@ class Experiment:
         require_likelihood(self.likelihood)
         require_number("noise_sd", self.noise_sd)
         require_callable("utility", self.utility, "a utility of probewise.inquiry, such as InformationGain()")
-        self._require_stopping_rule()
+        self._require_thresholds_in_range()
         self._require_counts()
         self._require_heights()
         if self.model.names != self.prior.names:
@@ -173,7 +173,7 @@ class Experiment:
             rivals_of(self.model, self.likelihood, (self.grid.width_mm, self.grid.height_mm))
         _ = self.readout, self.designs  # their constructors check the values
 
-    def _require_stopping_rule(self) -> None:
+    def _require_thresholds_in_range(self) -> None:
         """Raise ParameterError unless target sd and probability of the stopping rule, trust and doubt are in range."""
         if not 0 < self.stop_sd_mm < math.inf:
             raise ParameterError("stop_sd_mm", self.stop_sd_mm, "finite, greater than 0")

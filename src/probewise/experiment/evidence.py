@@ -85,7 +85,7 @@ def bridged_evidence(
     return BridgedEvidence(log_z, error, n_draws)
 
 
-def importance_sampled_about_points(
+def posterior_sampled_about_points(
     points: FloatArray, problem: SensorProblem, *, rng: np.random.Generator, n_draws: int
 ) -> Weighted:
     """Sample the posterior by importance sampling from kernels about points.

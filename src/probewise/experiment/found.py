@@ -61,7 +61,7 @@ def found_shape(run: Exploration) -> FoundShape:
             float(last.mean[k]),
             float(run.sd[k]),
             (float(low[k]), float(high[k])),
-            None if run.arm is None else float(run.arm.sd[k]),
+            None if run.arm_error is None else float(run.arm_error.sd[k]),
         )
         for k in np.flatnonzero(np.isfinite(last.mean)).tolist()
         if last.names[k] != "shape"

@@ -192,7 +192,7 @@ def step(
         stop_reason=reason,
         notes=notes,
         pace=Pace.from_readings(readings),
-        arm=arm,
+        arm_error=arm,
     )
     return ExplorationState(readings, carried, pose, tuple(planned)), info
 

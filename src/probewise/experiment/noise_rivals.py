@@ -22,7 +22,7 @@ from probewise.effects import (
 )
 from probewise.effects.density import log_gaussian_density
 from probewise.priors import LogUniform
-from probewise.sensor import NoiseLevel
+from probewise.sensor import ReadingNoise
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
@@ -250,8 +250,8 @@ def _log_density_per_reading(
     """Return the log density of each reading, or log probability of its cell, (n_samples, n_points)."""
     if not step:
         return log_gaussian_density(readings, predicted, sd)
-    level = NoiseLevel(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
-    return np.asarray(log_density(level, readings, predicted) + math.log(step))
+    noise = ReadingNoise(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
+    return np.asarray(log_density(noise, readings, predicted) + math.log(step))
 
 
 def _quick_log_density_per_reading(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:

@@ -19,7 +19,7 @@ from scipy.special import expit, logsumexp
 
 from probewise._arrays import FloatArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
-from probewise.experiment.evidence import BridgedEvidence, bridged_evidence, importance_sampled_about_points
+from probewise.experiment.evidence import BridgedEvidence, bridged_evidence, posterior_sampled_about_points
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import (
     BRIEF,
@@ -426,7 +426,7 @@ def _importance_sampled_if_possible(
 ) -> Weighted | None:
     """Sample by importance sampling about points; None if no draw could have given the readings."""
     try:
-        return importance_sampled_about_points(points, problem, rng=rng, n_draws=n_draws)
+        return posterior_sampled_about_points(points, problem, rng=rng, n_draws=n_draws)
     except NotConvergedError:
         return None
 

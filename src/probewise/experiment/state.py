@@ -79,7 +79,7 @@ class Step(ShowsItself):
         Whether the reading comes from a journal.
     pace
         Pace of the run so far.
-    arm
+    arm_error
         What the arm's own error adds to the sds; None far from the end of a run, or where that error is not known.
     """
 
@@ -103,7 +103,12 @@ class Step(ShowsItself):
     notes: tuple[str, ...]
     replayed: bool = False
     pace: Pace = field(default_factory=Pace)
-    arm: ArmError | None = None
+    arm_error: ArmError | None = None
+
+    @property
+    def arm(self) -> ArmError | None:
+        """The old name of `arm_error`."""
+        return self.arm_error
 
     @property
     def log_z(self) -> float:
@@ -188,9 +193,12 @@ class Exploration(ShowsItself):
     hidden: HiddenShape | None = None
 
     @property
-    def arm(self) -> ArmError | None:
-        """The arm's own error after the last reading, if it is known."""
-        return self.last.arm
+    def arm_error(self) -> ArmError | None:
+        """What the arm's own error adds to the sds after the last reading, if it is known."""
+        return self.last.arm_error
+
+    arm = arm_error
+    """The old name of `arm_error`."""
 
     @property
     def last(self) -> Step:
@@ -206,22 +214,22 @@ class Exploration(ShowsItself):
     def posterior(self) -> Weighted:
         """The weighted posterior after the last reading, with the arm's own error if that is known."""
         found = self.last.posterior
-        if self.arm is None:
+        if self.arm_error is None:
             return found
         theta = found.theta.copy()
-        theta[:, self.experiment.shape_columns] += self.arm.shifts
+        theta[:, self.experiment.shape_columns] += self.arm_error.shifts
         return replace(found, theta=theta)
 
     @property
     def sd(self) -> FloatArray:
         """Posterior sds of the shape's parameters, (n_params,), with the arm's own error if that is known."""
-        return self.last.sd if self.arm is None else np.hypot(self.last.sd, self.arm.sd)
+        return self.last.sd if self.arm_error is None else np.hypot(self.last.sd, self.arm_error.sd)
 
     @property
     def stop_reason(self) -> str:
         """Why the run ended; and what the arm's own error leaves, where that is known and the run did not count it."""
         reason = self.last.stop_reason or "the caller ended it"
-        if self.arm is None or self.experiment.fitted_arm is not None:
+        if self.arm_error is None or self.experiment.fitted_arm is not None:
             return reason
         widest = largest_sd_mm(self.last.names, self.sd)
         return f"{reason}; with the arm's own error the widest is known to {widest:.1f} mm"
@@ -277,10 +285,10 @@ class Exploration(ShowsItself):
             for name, mean, sd in zip(last.names, last.mean, self.sd, strict=True)
             if np.isfinite(mean)
         ]
-        if self.arm is not None:
+        if self.arm_error is not None:
             own = ", ".join(
                 f"{name} {sd:.{1 + _n_decimals(name)}f}"
-                for name, mean, sd in zip(last.names, last.mean, self.arm.sd, strict=True)
+                for name, mean, sd in zip(last.names, last.mean, self.arm_error.sd, strict=True)
                 if np.isfinite(mean) and name != "shape"
             )
             lines.append(f"arm          of these sds its own error makes up {own}: the same for all readings")

@@ -228,7 +228,7 @@ def forecast_of(model: SensorModel, *, highest: float | None = None) -> Forecast
     `highest` is the largest height of the sensor over that of its calibration; None: always the calibrated height.
     """
     if cards_of(model):
-        return _forecast_over_cards(model, highest)
+        return _forecast_of_model_with_cards(model, highest)
     table = DiscTable.of(model) if highest is None else None
     if table is not None:
         return DiscForecast(table if table.margin_mm else model, table)
@@ -243,7 +243,7 @@ def _tabulated_chain(model: Chain) -> TabulatedChain | None:
     return None if table is None else TabulatedChain.of(model, table)
 
 
-def _forecast_over_cards(model: SensorModel, highest: float | None) -> Forecast:
+def _forecast_of_model_with_cards(model: SensorModel, highest: float | None) -> Forecast:
     """Return the forecast of a model with known cards: by tables, if possible, for the shape alone."""
     if not isinstance(model, Chain) or model.effects or highest is not None:
         return DirectForecast(model)

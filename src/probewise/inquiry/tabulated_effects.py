@@ -54,4 +54,6 @@ class TabulatedChain:
         seen = (level - table.dark) / (table.bright - table.dark)
         if self.cards is not None:
             seen = mean_albedo_with_cards(seen, self.cards.cards, self.cards.footprint_share_by_card(poses, plan))
-        return self.chain.readings_of_view(View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan)
+        return self.chain.readings_from_simulated_view(
+            View(np.asarray(seen), poses, self.chain.scene.regions(disc)), theta, plan
+        )

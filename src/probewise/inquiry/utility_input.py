@@ -132,5 +132,5 @@ def _entropy_of_readings(mass: FloatArray, chance: FloatArray) -> FloatArray:
 
 
 def _entropy_of_noise(mass: FloatArray, chance: FloatArray) -> FloatArray:
-    """Return the mean entropy in bits of a reading given its level, for weights of levels (n, n_levels): (n,)."""
+    """Return the mean entropy in bits of a reading given its level, for unnormalised weights (n, n_levels): (n,)."""
     return np.asarray(mass @ entropy_bits(chance).astype(np.float64) / mass.sum(axis=1))

@@ -73,7 +73,10 @@ class _Genealogy:
         self._chance = np.concatenate([[0.0], np.cumsum(2.0 * (self._left[self._births + 1] / n_alive) ** 2)])
 
     def relative_variance_from_windows(self, ends: IntArray, lag: int) -> float:
-        """Estimate the ratio of variances from windows of `lag` rounds, of which `ends` are the last rows."""
+        """Estimate the variance of log Z over that of independent draws, from windows of `lag` rounds.
+
+        `ends` are the last rows of all rounds, in order.
+        """
         starts = np.unique(np.linspace(0, len(ends) - 1 - lag, _MOST_WINDOWS).astype(int))
         windows = [self._excess_and_shrinkage_variance(ends[i], ends[i + lag]) for i in starts]
         excess, own = np.array(windows).sum(axis=0)

@@ -57,5 +57,5 @@ class HoppingMove:
         now.put(rows[won], tried, won)
 
     def adapted(self, tally: Tally) -> HoppingMove:
-        """Adapt the chains; see `SliceMove`."""
+        """Return the move with its chains adapted; see `SliceMove`."""
         return HoppingMove(self.chains.adapted(tally), self.modes)

@@ -145,7 +145,7 @@ class KernelMove:
         return ends, tally
 
     def adapted(self, tally: Tally) -> KernelMove:
-        """Adapt the number of proposals towards `moves` accepted ones."""
+        """Return the move with its number of proposals adapted towards `moves` accepted ones."""
         share = max(tally.n_accepted, 1) / max(tally.n_evaluated, 1)
         wanted = min(self.moves / share, 2.0 * self.n_proposals, 2.0 * self.patience)
         return replace(self, n_proposals=max(8, math.ceil(wanted)))

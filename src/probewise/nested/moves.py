@@ -294,7 +294,7 @@ class SliceMove:
     longer = with_twice_the_steps  # its earlier name
 
     def adapted(self, tally: Tally) -> SliceMove:
-        """Adapt the bracket width towards `target` candidates per step."""
+        """Return the move with its bracket width adapted towards `target` candidates per step."""
         excess = math.log(max(tally.n_tried, 1) / max(tally.n_accepted, 1) / self.target)
         return replace(self, width=min(max(self.width * math.exp(-0.5 * excess), 0.05), 20.0))
 

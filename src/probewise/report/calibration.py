@@ -128,7 +128,7 @@ def sections(
                 table(
                     ("parameter", "unit", "prior", "why"),
                     (
-                        (p.parameter, _unit_in_words(p.unit), typeset(p.distribution), typeset(p.reason))
+                        (p.parameter, _printed_unit(p.unit), typeset(p.distribution), typeset(p.reason))
                         for p in sensor.priors
                     ),
                 ),
@@ -174,7 +174,7 @@ def parameter_table(sensor: FittedSensor) -> Markup:
     return table(
         ("parameter", "unit", "median", "95 % interval"),
         (
-            (n, _unit_in_words(sensor.unit_of_parameter(n)), *value_and_interval(median[n], *ends[n]))
+            (n, _printed_unit(sensor.unit_of_parameter(n)), *value_and_interval(median[n], *ends[n]))
             for n in sensor.names
         ),
         caption="Posterior of the model's parameters. The covariance of Gaussian n is half the inverse of "
@@ -187,7 +187,7 @@ def ssf_table(sensor: FittedSensor) -> Markup:
     return table(
         ("SSF", "unit", "median", "95 % interval"),
         (
-            (without_unit(q.name), _unit_in_words(q.unit), *value_and_interval(q.median, *q.interval95))
+            (without_unit(q.name), _printed_unit(q.unit), *value_and_interval(q.median, *q.interval95))
             for q in sensor.ssf_quantities()
         ),
         caption="Posterior of the SSF's centre (u along x', v along y'), of its sds along its long and its short axis, "
@@ -195,7 +195,8 @@ def ssf_table(sensor: FittedSensor) -> Markup:
     )
 
 
-def _unit_in_words(unit: str) -> str:
+def _printed_unit(unit: str) -> str:
+    """Return a unit as the report prints it: with superscripts, and nothing for "1"."""
     return {"mm^-2": "mm⁻²", "1": ""}.get(unit, unit_name(unit))
 
 

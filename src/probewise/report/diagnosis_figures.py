@@ -179,7 +179,7 @@ def rows_of_scan_changed_most(plan: Plan | RunTable, change: FloatArray) -> IntA
 
 
 def _all_residuals_svg(diagnosis: Diagnosis) -> bytes:
-    """Draw all residuals against time and predicted reading, before and after the repair."""
+    """Draw all residuals against time and predicted reading: before the repair, and after it if it changes them."""
     plan = diagnosis.recording.plan
     unit = plan.instrumentation.unit
     models = [(BEFORE, diagnosis.repair.before.residuals), (AFTER, diagnosis.repair.after.residuals)]

@@ -179,7 +179,7 @@ def shape_table(run: Exploration, truth: Mapping[str, float] | None = None) -> M
     """Build the table of the shape's parameters with their sds, and the truth where known."""
     found, true = found_shape(run), truth or {}
     short = {name.removeprefix(f"{found.name}."): value for name, value in true.items()}
-    arm = ("of it the arm's",) if run.arm is not None else ()
+    arm = ("of it the arm's",) if run.arm_error is not None else ()
     header = ("parameter", "unit", "mean", "sd", *arm, "95 % interval", *(("truth",) if truth else ()))
     return table(
         header,

@@ -170,7 +170,7 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
             places = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)
             turns = tuple(dict.fromkeys(plan.orientation_rad[rows].tolist()))
         else:
-            places = np.concatenate([places, _places_to_show(pattern)])
+            places = np.concatenate([places, _extreme_points_of_pattern(pattern)])
         low = np.floor((places.min(axis=0) - AROUND_MM) / _ROUND_MM) * _ROUND_MM
         high = np.ceil((places.max(axis=0) + AROUND_MM) / _ROUND_MM) * _ROUND_MM
         lines = (where_white_in_words(pattern),)
@@ -312,7 +312,7 @@ def _n_pages_along(length_mm: float, room_mm: float) -> int:
     return 1 if length_mm <= room_mm else math.ceil(length_mm / (room_mm - OVERLAP_MM))
 
 
-def _places_to_show(pattern: Pattern) -> FloatArray:
+def _extreme_points_of_pattern(pattern: Pattern) -> FloatArray:
     """Return places of a pattern that its sheet must show when there is no plan, (n, 2)."""
     match pattern:
         case Disc((x, y), radius):

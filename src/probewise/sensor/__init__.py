@@ -17,8 +17,8 @@ from probewise.sensor.ssf import (
     SSFField,
     SSFModel,
     footprint_of,
-    mean_mixture,
     mean_ssf_field,
+    merged_mean_mixture,
     mixture_names,
     mixture_of_field,
     total_variation,
@@ -27,8 +27,8 @@ from probewise.sensor.stages import (
     AnyEffect,
     Effect,
     Footprint,
-    NoiseLevel,
     Poses,
+    ReadingNoise,
     SceneView,
     SensorModel,
     Stage,
@@ -52,8 +52,8 @@ __all__ = [
     "FreeMixture",
     "Levels",
     "NaiveSensor",
-    "NoiseLevel",
     "Poses",
+    "ReadingNoise",
     "SSFField",
     "SSFModel",
     "SceneView",
@@ -67,8 +67,8 @@ __all__ = [
     "is_free_form",
     "mean_albedo_by_pixels",
     "mean_albedo_under_gaussians",
-    "mean_mixture",
     "mean_ssf_field",
+    "merged_mean_mixture",
     "mixture_names",
     "mixture_of_field",
     "raised",
@@ -89,3 +89,9 @@ free_form = free_form_parameters
 
 FieldSSF = DiscreteSSF
 """The old name of `DiscreteSSF`."""
+
+NoiseLevel = ReadingNoise
+"""The old name of `ReadingNoise`."""
+
+mean_mixture = merged_mean_mixture
+"""The old name of `merged_mean_mixture`."""

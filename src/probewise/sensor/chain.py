@@ -28,8 +28,8 @@ from probewise.sensor.ssf import DiscreteSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
     Footprint,
-    NoiseLevel,
     Poses,
+    ReadingNoise,
     SceneView,
     Stage,
     View,
@@ -175,7 +175,7 @@ class Chain:
             return np.concatenate([self.predict(block, plan) for block in blocks])
         view = self.simulated_view(theta, plan)
         plain = not self.effects and not has_commanded_height_or_led(plan)
-        return self._plain_readings(view.seen, theta) if plain else self.readings_of_view(view, theta, plan)
+        return self._plain_readings(view.seen, theta) if plain else self.readings_from_simulated_view(view, theta, plan)
 
     def _hypotheses_at_once(self, theta: FloatArray, plan: Plan) -> int:
         """Return how many hypotheses to predict at once; memory limits it where footprints differ between readings."""
@@ -183,8 +183,8 @@ class Chain:
             return len(theta)
         return max(_MOST_NUMBERS // max(len(plan) * (len(self.ssf.names) // 6), 1), 1)
 
-    def readings_of_view(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Compute readings from a view, (n_samples, n_points): the stages of `predict` from SEEN on.
+    def readings_from_simulated_view(self, view: View, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Compute readings from a result of `simulated_view`, (n_samples, n_points): the stages from SEEN on.
 
         `view` may hold one hypothesis where those of theta differ only in these stages.
         """
@@ -231,7 +231,7 @@ class Chain:
             seen = geometries.response(alone, footprint, n_nodes=self.n_nodes)
         return View(seen, layout.poses, layout.regions, footprint.brightness)
 
-    look, read, seen = simulated_view, readings_of_view, white_fraction  # their earlier names
+    look, read, seen = simulated_view, readings_from_simulated_view, white_fraction  # their earlier names
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
         """Return the sensor's true poses under each hypothesis: the chain up to stage POSE."""
@@ -282,15 +282,17 @@ class Chain:
         """Layout of the last plan, by that plan, where no parameter changes it; otherwise empty."""
         return {}
 
-    def noise_level(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseLevel:
+    def noise_of_readings(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> ReadingNoise:
         """Return the noise of each reading: `sd`, broadcasting to (n_samples, n_points), and the effects on it."""
         require_columns(theta, self.names)
-        start = NoiseLevel(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
+        start = ReadingNoise(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
             return start
         start = replace(start, seen=self.white_fraction(theta, plan))
-        level: NoiseLevel = self._stage_applier(theta, plan)(Stage.NOISE, start)
-        return level
+        noise: ReadingNoise = self._stage_applier(theta, plan)(Stage.NOISE, start)
+        return noise
+
+    noise_level = noise_of_readings  # its earlier name
 
     def _stage_applier(self, theta: FloatArray, plan: Plan) -> Callable[[Stage, Any], Any]:
         """Return a function that applies the effects of one stage to that stage's value."""
@@ -355,7 +357,7 @@ class Layout:
         )
 
     @cached_property
-    def unbatched_rows_and_regions(self) -> list[tuple[IntArray, Region]]:
+    def rows_and_regions_outside_batches(self) -> list[tuple[IntArray, Region]]:
         """Rows of readings over the regions not in `straight_batches`, and the region, split by orientation."""
         taken = (
             np.concatenate([part.rows for part in self.straight_batches])
@@ -392,7 +394,7 @@ def response(layout: Layout, footprint: Footprint, *, n_nodes: int = ACCURATE_NO
     poses = layout.poses
     for part in layout.straight_batches:
         part.write_response(footprint, out)
-    for rows, region in layout.unbatched_rows_and_regions:
+    for rows, region in layout.rows_and_regions_outside_batches:
         if isinstance(region, UniformRegion):  # whatever the footprint
             level = region.level[:, None]
             for g in range(footprint.weight.shape[2]):

@@ -298,8 +298,10 @@ def _reached_slice(centres: FloatArray, mean: float, sd: float) -> slice:
     return slice(*np.searchsorted(centres, [mean - _REACH * sd, mean + _REACH * sd]))
 
 
-def mean_mixture(footprint: Footprint, *, weights: FloatArray | None = None, n_gaussians: int = 1) -> FixedMixture:
-    """Summarise sampled mixtures, arrays (n_samples, 1, n), by one mixture of `n_gaussians`.
+def merged_mean_mixture(
+    footprint: Footprint, *, weights: FloatArray | None = None, n_gaussians: int = 1
+) -> FixedMixture:
+    """Merge the mean of sampled mixtures, arrays (n_samples, 1, n), into one mixture of `n_gaussians`.
 
     The mean over the samples is a large mixture; its components are merged by the law of
     total covariance, so mean and covariance of the mean field are exact.

@@ -45,7 +45,7 @@ _WORTH_A_STEP = 350  # steps of one sample in one run, evaluated together, at th
 # evaluations of all steps suffice, and far from them, where a dozen are needed.
 _FEW_NEAR, _FEW_FAR = 300, 40
 
-Problem = Callable[[IntArray], tuple[Motion, Mapping[str, FloatArray], Mapping[str, NDArray[Any]]]]
+LawAndInputs = Callable[[IntArray], tuple[Motion, Mapping[str, FloatArray], Mapping[str, NDArray[Any]]]]
 """Function of the numbers of some samples: their law with its effects, their parameters, and the columns."""
 
 
@@ -178,14 +178,23 @@ class SolvedSteps:
         ]
 
 
-def integrate_near(
-    problem: Problem, steps: Steps, memory: TrajectoryCache, *, effects: Hashable, theta: FloatArray, n_own: int
+def integrate_from_known_trajectories(
+    law_and_inputs: LawAndInputs,
+    steps: Steps,
+    memory: TrajectoryCache,
+    *,
+    effects: Hashable,
+    theta: FloatArray,
+    n_own: int,
 ) -> tuple[dict[str, FloatArray], int]:
-    """Integrate samples, theta (n_samples, n_params); a few samples near known trajectories take all steps at once.
+    """Integrate samples, theta (n_samples, n_params), and return their states and what that cost.
+
+    A few samples are solved for all steps at once, from the known trajectories nearest to them; the others, and those
+    for which that does not converge, step by step.
 
     Parameters
     ----------
-    problem, steps
+    law_and_inputs, steps
         The law of some samples, and the steps.
     memory
         Trajectories integrated before; more are added.
@@ -200,21 +209,21 @@ def integrate_near(
     """
     n_samples, n_steps = len(theta), len(steps.gap_of_step)
     if n_samples * steps.n_runs > _FEW_NEAR or memory.useless:
-        motion, parameters, columns = problem(np.arange(n_samples))
+        motion, parameters, columns = law_and_inputs(np.arange(n_samples))
         return integrate_states(motion, steps.places, parameters, columns, max_step=steps.max_step), n_steps
     states, left, cost = None, np.arange(n_samples), 0
     known, nearest = memory.nearest_known(steps, effects, theta, n_own)
     if known:
         try:
             with np.errstate(all="ignore"):
-                solved = solve_all_steps(problem, steps, known, nearest)
+                solved = solve_all_steps(law_and_inputs, steps, known, nearest)
             states, left = solved.states, np.flatnonzero(~solved.done)
             cost = -(-solved.n_evaluated // _WORTH_A_STEP)
             memory.keep(steps, effects, solved.new_trajectories(theta))
         except Exception:  # rates that take no more columns than there are runs
             memory.useless = True
     if left.size:
-        motion, parameters, columns = problem(left)
+        motion, parameters, columns = law_and_inputs(left)
         every = states_by_step(motion, steps.places, parameters, columns, steps.schedule)
         there = np.stack([[*s.values()] for s in every], axis=2)
         if states is None:
@@ -229,15 +238,17 @@ def integrate_near(
             [KnownTrajectory(theta[left[k]], there[:, k]) for k in np.flatnonzero(finite)[:_MOST_NEW].tolist()],
         )
     assert states is not None
-    return dict(zip(problem(np.arange(1))[0].law.states, steps.states_at_rows(states), strict=True)), cost
+    return dict(zip(law_and_inputs(np.arange(1))[0].law.states, steps.states_at_rows(states), strict=True)), cost
 
 
-def solve_all_steps(problem: Problem, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray) -> SolvedSteps:
+def solve_all_steps(
+    law_and_inputs: LawAndInputs, steps: Steps, known: Sequence[KnownTrajectory], nearest: IntArray
+) -> SolvedSteps:
     """Solve for the states at the end of every step, each sample from the known trajectory nearest to it.
 
     Parameters
     ----------
-    problem
+    law_and_inputs
         The law of some samples.
     steps
         The steps.
@@ -245,7 +256,7 @@ def solve_all_steps(problem: Problem, steps: Steps, known: Sequence[KnownTraject
         Trajectories, and for each sample the number of the one to begin from, (n_samples,).
     """
     guess = np.stack([each.states for each in known], axis=1)[:, nearest]
-    search = _NewtonState(problem, steps, guess.copy())
+    search = _NewtonState(law_and_inputs, steps, guess.copy())
     _iterate_with_shared_jacobians(search, known, nearest)
     # A chord that led away is no better a start than the trajectory that it began from.
     astray = search.active_mask & ~(search.rate < 1)
@@ -297,7 +308,7 @@ def _iterate_with_own_jacobians(search: _NewtonState) -> dict[int, FloatArray]:
 class _NewtonState:
     """The state of the Newton iteration: the states of all samples, and the convergence of each."""
 
-    problem: Problem
+    law_and_inputs: LawAndInputs
     steps: Steps
     states: FloatArray
     n_evaluated: int = 0
@@ -308,7 +319,7 @@ class _NewtonState:
         self.change, self.rate = np.full(n_samples, np.inf), np.zeros(n_samples)
         self.done, self.possible = np.zeros(n_samples, dtype=np.bool_), np.ones(n_samples, dtype=np.bool_)
         self._chosen = np.zeros(0, dtype=np.int64)
-        motion, parameters, _ = self.problem(np.arange(n_samples))
+        motion, parameters, _ = self.law_and_inputs(np.arange(n_samples))
         start = motion.correct_step_end({}, initial_states(motion.law, self.steps.places, parameters, n_samples))
         self.states[:, :, 0] = np.stack(list(start.values()))
 
@@ -320,7 +331,7 @@ class _NewtonState:
     def states_at_ends(self, samples: IntArray, states: FloatArray) -> FloatArray:
         """Return the states to which each step leads from those at its beginning, (n_states, n, n_steps, n_runs)."""
         if not np.array_equal(samples, self._chosen):
-            self._chosen, self._end = samples, _stepping_function(self.problem, self.steps, samples)
+            self._chosen, self._end = samples, _stepping_function(self.law_and_inputs, self.steps, samples)
         self.n_evaluated += states[0, :, 1:].size
         return self._end(states[:, :, :-1])
 
@@ -352,9 +363,11 @@ class _NewtonState:
         self.change[samples], self.rate[samples] = change, rate
 
 
-def _stepping_function(problem: Problem, steps: Steps, samples: IntArray) -> Callable[[FloatArray], FloatArray]:
+def _stepping_function(
+    law_and_inputs: LawAndInputs, steps: Steps, samples: IntArray
+) -> Callable[[FloatArray], FloatArray]:
     """Return the function that maps the states at the beginning of each step to those at its end."""
-    motion, parameters, columns = problem(samples)
+    motion, parameters, columns = law_and_inputs(samples)
     n_states = len(motion.law.states)
     first = {state: np.zeros((len(samples), steps.n_runs)) for state in motion.law.states}
     between = LawInputs.of(motion, steps.places, parameters, columns, first).interpolator_of_steps(steps.gap_of_step)

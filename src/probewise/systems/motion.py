@@ -381,7 +381,10 @@ class LawInputs:
         columns: Mapping[str, NDArray[Any]],
         start: Mapping[str, FloatArray],
     ) -> LawInputs:
-        """Arrange parameters, and the columns that the law reads at `start`, (n_points,) or (n_samples, n_points)."""
+        """Arrange parameters and columns, (n_points,) or (n_samples, n_points) each, by positions in the runs.
+
+        Columns that the law does not read are left out; it is evaluated once, at the states `start`, to find them.
+        """
         rows, law, time = places.row_at_place, motion.law, places.table.time
         constant: dict[str, Any] = {}
         moving: dict[str, FloatArray] = {}

@@ -72,9 +72,10 @@ class StepSchedule:
 
     @classmethod
     def from_fourth_order(cls, n_steps: IntArray) -> StepSchedule:
-        """Take these numbers of fourth-order steps, (n_gaps,), or a third as many, rounded up, of eighth order.
+        """Return a schedule of these numbers of fourth-order steps, (n_gaps,), or a third as many of eighth order.
 
-        Eighth order is taken where it costs at most 1.5 times as many evaluations, as in gaps that need several steps.
+        The third is rounded up in each gap. All gaps have the same order: the eighth if it costs at most 1.5 times as
+        many evaluations in all, as where most gaps need several steps.
         """
         fewer = np.asarray(-(-n_steps // N_LONGER), dtype=np.int64)
         if N_LONGER * fewer.sum() <= _DEARER * n_steps.sum():

@@ -17,7 +17,7 @@ from probewise.errors import ParameterError, ProbewiseError
 from probewise.priors import Marginal, Product
 from probewise.sensor import AnyEffect, Stage
 from probewise.sensor.stages import effects_with_columns, parameter_names_of_effects
-from probewise.systems.all_steps import TrajectoryCache, integrate_near, steps_of
+from probewise.systems.all_steps import TrajectoryCache, integrate_from_known_trajectories, steps_of
 from probewise.systems.calls import Caller, IntegrationTally
 from probewise.systems.mistakes import user_function_error
 from probewise.systems.motion import Motion, RowsInRuns, integrate_readings, readings_of_states
@@ -311,7 +311,7 @@ class SystemChain:
 
     def predict(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Return noise-free readings: theta (n_samples, n_params) -> (n_samples, n_points)."""
-        return self.readings_of_view(self.simulated_view(theta, plan), theta, plan)
+        return self.readings_from_simulated_view(self.simulated_view(theta, plan), theta, plan)
 
     def simulated_view(self, theta: FloatArray, plan: Any) -> FloatArray:
         """Simulate readings without the effects on readings, with all others: (n_samples, n_points)."""
@@ -336,7 +336,9 @@ class SystemChain:
         system, law = self.system, self.system.simulator.law
         assert law is not None
 
-        def problem_of_samples(samples: IntArray) -> tuple[Motion, dict[str, FloatArray], dict[str, NDArray[Any]]]:
+        def law_and_inputs_of_samples(
+            samples: IntArray,
+        ) -> tuple[Motion, dict[str, FloatArray], dict[str, NDArray[Any]]]:
             def of_samples(values: Any) -> Any:
                 return values[samples] if np.ndim(values) == 2 and len(values) > 1 else values
 
@@ -347,8 +349,8 @@ class SystemChain:
             )
 
         try:
-            states, cost = integrate_near(
-                problem_of_samples,
+            states, cost = integrate_from_known_trajectories(
+                law_and_inputs_of_samples,
                 steps_of(plan, system.max_step),
                 system.trajectories,
                 effects=(system.runs, self.effects),
@@ -378,14 +380,14 @@ class SystemChain:
         ]
         return np.concatenate(each)
 
-    def readings_of_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
-        """Apply the effects on the readings, in the order of their stages."""
+    def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Any) -> FloatArray:
+        """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
         for effect, columns in self._columns_of_effects:
             if Stage.SEEN <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)
         return view
 
-    look, read = simulated_view, readings_of_view  # their earlier names
+    look, read = simulated_view, readings_from_simulated_view  # their earlier names
 
     def _apply_stage(self, stage: Stage, value: Any, theta: FloatArray, plan: Any) -> Any:
         for effect, columns in self._columns_of_effects:

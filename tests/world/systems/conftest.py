@@ -6,7 +6,7 @@ import pytest
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.forms.true_system import TrueSystem
 from probewise.world.systems.kind import Law, Prior, SystemKind
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 from probewise.world.systems.vocabulary import forms_of
 
 T = np.array([0.0, 0.7, 1.0, 1.9, 2.4, 3.5, 4.0])
@@ -28,7 +28,7 @@ def small(*, k=0.5, x0=2.0, linear=False, n_runs=3, u=None):
     )
     u = np.zeros(len(T)) if u is None else np.asarray(u, dtype=float)
     warm = np.linspace(-1.0, 1.0, len(T) * n_runs)
-    rows = SystemRows(
+    rows = SystemTable(
         {"t_s": np.concatenate([T + 10 * r for r in range(n_runs)]), "u": np.tile(u, n_runs), "warm": warm},
         np.repeat(np.arange(n_runs), len(T)),
         "t_s",

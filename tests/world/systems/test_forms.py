@@ -7,13 +7,13 @@ import pytest
 
 from probewise.world.systems.forms.inputs import behind_gear_play
 from probewise.world.systems.forms.readings import delayed, direction_of_change
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 
 def _rows(t, run=None, **columns):
     t = np.asarray(t, dtype=float)
     run = np.zeros(len(t), dtype=int) if run is None else np.asarray(run)
-    return SystemRows({"t_s": t, **columns}, run, "t_s", int(run.max()) + 1)
+    return SystemTable({"t_s": t, **columns}, run, "t_s", int(run.max()) + 1)
 
 
 @pytest.mark.parametrize(

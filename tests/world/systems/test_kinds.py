@@ -17,9 +17,9 @@ def _case(kind, said='noise = {"sd": 0.5}', seed=5):
     drawn = draw_system(kind, rng=rng)
     noise_free = drawn.simulate_all_rows([])
     noise = noise_of_size(
-        "white", 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_rows, kind.sd, rng=rng
+        "white", 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_table, kind.sd, rng=rng
     )
-    labels = tuple(f"r{k}" for k in range(drawn.rows.n_runs))
+    labels = tuple(f"r{k}" for k in range(drawn.table.n_runs))
     return SystemCase(1, 0, Stratum("clean"), drawn, (), noise, said, labels, noise_free, np.round(noise_free, 9))
 
 
@@ -64,5 +64,5 @@ def test_there_are_both_ways_in_with_and_without_time_and_runs():
 
 def test_what_is_kept_back_is_two_runs_and_the_last_goes_further():
     drawn = draw_system(FLOW, rng=np.random.default_rng(2))
-    flow = drawn.rows.columns["flow_lpm"]
-    assert flow[drawn.rows.run == drawn.rows.n_runs - 1].max() > 1.2 * flow[drawn.diagnosed_row_numbers].max()
+    flow = drawn.table.columns["flow_lpm"]
+    assert flow[drawn.table.run == drawn.table.n_runs - 1].max() > 1.2 * flow[drawn.diagnosed_row_numbers].max()

@@ -11,23 +11,23 @@ CLEAN = DRAWN.fit_without_effects.readings
 
 
 def _noise(name, wanted=12.0, seed=0):
-    return noise_of_size(name, wanted, CLEAN, DRAWN.diagnosed_rows, 0.03, rng=np.random.default_rng(seed))
+    return noise_of_size(name, wanted, CLEAN, DRAWN.diagnosed_table, 0.03, rng=np.random.default_rng(seed))
 
 
 @pytest.mark.parametrize("name", OTHER_NOISE)
 def test_every_kind_of_noise_is_drawn_about_the_readings(name):
-    y = _noise(name).draw(CLEAN, DRAWN.diagnosed_rows, np.random.default_rng(1))
+    y = _noise(name).draw(CLEAN, DRAWN.diagnosed_table, np.random.default_rng(1))
     assert y.shape == CLEAN.shape
     assert np.median(np.abs(y - CLEAN)) < 10 * 0.03
 
 
 def test_correlated_noise_gains_what_its_pairs_tell():
     noise = _noise("correlated_noise")
-    pairs = len(CLEAN) - len(DRAWN.diagnosed_rows.rows_by_run)
+    pairs = len(CLEAN) - len(DRAWN.diagnosed_table.rows_by_run)
     assert -pairs * np.log(1 - noise.parameters["rho"] ** 2) == pytest.approx(144.0)
     rng = np.random.default_rng(2)
-    own = [noise.draw(CLEAN, DRAWN.diagnosed_rows, rng) - CLEAN for _ in range(60)]
-    rows = DRAWN.diagnosed_rows.rows_by_run[0]
+    own = [noise.draw(CLEAN, DRAWN.diagnosed_table, rng) - CLEAN for _ in range(60)]
+    rows = DRAWN.diagnosed_table.rows_by_run[0]
     found = np.mean([np.corrcoef(e[rows[:-1]], e[rows[1:]])[0, 1] for e in own])
     assert found == pytest.approx(noise.parameters["rho"], abs=0.06)
 
@@ -41,7 +41,7 @@ def test_signal_dependent_noise_gains_its_mean_log_likelihood():
     rng = np.random.default_rng(3)
     gains = []
     for _ in range(400):
-        e = noise.draw(CLEAN, DRAWN.diagnosed_rows, rng) - CLEAN
+        e = noise.draw(CLEAN, DRAWN.diagnosed_table, rng) - CLEAN
         gains.append(np.sum(-np.log(sd / flat) - 0.5 * (e / sd) ** 2 + 0.5 * (e / flat) ** 2))
     assert np.mean(gains) == pytest.approx(72.0, rel=0.05)
 
@@ -49,7 +49,7 @@ def test_signal_dependent_noise_gains_its_mean_log_likelihood():
 def test_a_walk_goes_on_from_run_to_run():
     noise = _noise("random_walk")
     q = noise.parameters["sd_per_row"]
-    own = [noise.draw(CLEAN, DRAWN.diagnosed_rows, np.random.default_rng(k))[-1] - CLEAN[-1] for k in range(200)]
+    own = [noise.draw(CLEAN, DRAWN.diagnosed_table, np.random.default_rng(k))[-1] - CLEAN[-1] for k in range(200)]
     assert np.std(own) == pytest.approx(np.sqrt(len(CLEAN) * q**2 + 0.03**2), rel=0.15)
 
 

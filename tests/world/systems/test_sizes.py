@@ -28,7 +28,7 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
     drawn = _drawn("orifice flow meter")
     effect = _draw_effect_of_size(_form(drawn, name), wanted, drawn, np.random.default_rng(1))
     with_effect = drawn.simulate_diagnosed_rows([effect.form_with_parameters])
-    q = drawn.diagnosed_rows.columns["flow_lpm"]
+    q = drawn.diagnosed_table.columns["flow_lpm"]
     basis = np.stack([np.ones_like(q), q**2], axis=1)
     left = with_effect - basis @ np.linalg.lstsq(basis, with_effect, rcond=None)[0]
     assert np.linalg.norm(left) / drawn.kind.sd == pytest.approx(wanted, rel=0.01)
@@ -38,7 +38,7 @@ def test_what_a_linear_model_leaves_is_as_large_as_asked(name, wanted):
 def test_what_a_bent_model_leaves_is_as_large_as_asked():
     drawn = _drawn("photodiode against distance")
     effect = _draw_effect_of_size(_form(drawn, "sensitivity:board_c"), 12.0, drawn, np.random.default_rng(1))
-    d, y = drawn.diagnosed_rows.columns["dist_mm"], drawn.simulate_diagnosed_rows([effect.form_with_parameters])
+    d, y = drawn.diagnosed_table.columns["dist_mm"], drawn.simulate_diagnosed_rows([effect.form_with_parameters])
 
     def law(d, dark, power, behind):
         return dark + 1e5 * power / (d + behind) ** 2

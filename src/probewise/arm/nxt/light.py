@@ -72,7 +72,7 @@ class LightSensor:
     clock
         Clock used for waiting.
     valid_s
-        Seconds after a change during which the brick may mark its readings as invalid.
+        Seconds for which a read repeats a reading that the brick marks as invalid, three times at least.
     """
 
     def __init__(self, link: Link, port: int, *, clock: Clock = time, valid_s: float = 1.0) -> None:

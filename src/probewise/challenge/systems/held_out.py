@@ -40,7 +40,7 @@ def log_densities_of_runs(
     fitting, *drawing = rng.spawn(3)
     readings = later.covariates[case.drawn.kind.reading]
     sd = case.drawn.kind.sd
-    rows = np.flatnonzero(case.drawn.rows.run >= case.drawn.rows.n_runs - 2)
+    rows = np.flatnonzero(case.drawn.table.run >= case.drawn.table.n_runs - 2)
     about = cast(SimulatorApparatus, diagnosis.apparatus).about
     scores = {
         "null": _log_mean_density(*predict_runs(diagnosis.null, about, later, rng=drawing[0]), readings),
@@ -58,8 +58,8 @@ def log_densities_of_runs(
             scores["right"] = _log_mean_density(right, np.full(len(right), sd), readings)
         except NotConvergedError:
             pass  # no fit was possible, so the case does not count for the share
-    run = case.drawn.rows.run[rows]
-    names = {case.drawn.rows.n_runs - 2: "inside", case.drawn.rows.n_runs - 1: "beyond"}
+    run = case.drawn.table.run[rows]
+    names = {case.drawn.table.n_runs - 2: "inside", case.drawn.table.n_runs - 1: "beyond"}
     return {
         name: {model: float(own[run == k].sum()) for model, own in scores.items() if np.isfinite(own[run == k]).all()}
         for k, name in names.items()

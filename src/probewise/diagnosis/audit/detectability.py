@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise.diagnosis.evidence.laplace import orthonormalise_groups
-from probewise.diagnosis.evidence.templates import effect_templates
+from probewise.diagnosis.evidence.templates import templates_of_effect
 from probewise.diagnosis.fitting.fit import Fit, Model
 from probewise.diagnosis.fitting.null import Null
 from probewise.effects import Extent, NamedEffect
@@ -95,7 +95,7 @@ class PlanTemplates:
         for at, effect in enumerate(built.values()):
             if effect.stage is Stage.NOISE:
                 continue
-            templates = effect_templates(found, effect, np.arange(len(plan)), most=most)
+            templates = templates_of_effect(found, effect, np.arange(len(plan)), most=most)
             columns += templates.columns
             settings += templates.settings
             owner += [at] * len(templates.columns)

@@ -34,7 +34,7 @@ from probewise.diagnosis.fitting.sensor_prior import SensorPrior, require_sensor
 from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
-from probewise.diagnosis.verdict_report.words import unit_in_words
+from probewise.diagnosis.verdict_report.words import with_unit_of_reading
 from probewise.effects import VOCABULARY, Extent, NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
@@ -393,7 +393,7 @@ def _audit_of(
         return EffectAudit(effect.name, "invisible", share, reason=reason)
     alike = sorted(((other, cosine) for other, cosine in like.items() if cosine >= ALIAS), key=lambda pair: -pair[1])
     smallest = tuple(
-        DetectableSize(effect.prior.names[k], unit_in_words(effect.units[k], unit), amount)
+        DetectableSize(effect.prior.names[k], with_unit_of_reading(effect.units[k], unit), amount)
         for k, amount in zip(effect.amplitudes, amounts, strict=True)
     )
     return EffectAudit(effect.name, "aliased" if alike else "fine", share, tuple(alike), smallest)

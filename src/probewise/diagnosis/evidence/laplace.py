@@ -50,7 +50,7 @@ class NoiseEvidence:
 
         These are raised by a constant, so that the evidence of the returned nodes alone is that of all.
         """
-        own = self.nodes.settings[:, self.noise.column_slice(name)]
+        own = self.nodes.settings[:, self.noise.columns_of_effect(name)]
         settings, node_of = np.unique(own, axis=0, return_inverse=True)
         node_of = node_of.ravel()
         weights = np.bincount(node_of, self.weights)

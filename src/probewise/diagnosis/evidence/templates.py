@@ -69,14 +69,17 @@ class TemplateCache:
         """Return the templates of one effect about one fit."""
         key = found, effect
         if key not in self.known:
-            self.known[key] = effect_templates(found, effect, self.usable)
+            self.known[key] = templates_of_effect(found, effect, self.usable)
         return self.known[key]
 
 
-def effect_templates(
+def templates_of_effect(
     found: Fit, effect: NamedEffect[Any], usable: IntArray, *, most: int | None = None
 ) -> EffectTemplates:
-    """Predict the change of the readings by each bank entry of all variants, or by `most` evenly spread entries."""
+    """Predict the change of the readings by each bank entry of all variants of an effect, or by `most` of them.
+
+    Those are evenly spread.
+    """
     variants = effect.variants()
     banks = [variant.bank() for variant in variants]
     choice = np.repeat(np.arange(len(variants)), [len(bank) for bank in banks])
@@ -124,7 +127,11 @@ def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, u
         each = {name: np.repeat(values, n, axis=0) for name, values in own.items()}
         each[effect.name] = bank.reshape(n_rows, -1)[rows]
         theta = model.joined_theta(np.repeat(sensor, n, axis=0), each)
-        read = model.chain.predict(theta, there) if seen is None else model.chain.readings_of_view(seen, theta, there)
+        read = (
+            model.chain.predict(theta, there)
+            if seen is None
+            else model.chain.readings_from_simulated_view(seen, theta, there)
+        )
         change[rows, inside] = read - before[inside]
     columns = change[:, usable].T
     columns[:, ~(np.abs(columns).max(axis=0) < _RUNS_AWAY * (1 + np.abs(before).max()))] = 0.0  # NaN too

@@ -39,7 +39,7 @@ class Predictor(Protocol):
         """
         ...
 
-    def readings_of_view(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
+    def readings_from_simulated_view(self, view: Any, theta: FloatArray, plan: Plan) -> FloatArray:
         """Apply the effects from `Stage.SEEN` on to a result of `simulated_view`: readings (n_samples, n_points)."""
         ...
 

@@ -110,7 +110,7 @@ class _OwnChain:
 
     def predict(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Return noise-free readings, theta (n_samples, n_params) -> (n_samples, n_points)."""
-        return self.readings_of_view(self.simulated_view(theta, plan), theta, plan)
+        return self.readings_from_simulated_view(self.simulated_view(theta, plan), theta, plan)
 
     def simulated_view(self, theta: FloatArray, plan: Plan) -> FloatArray:
         """Simulate the readings before any effect on them, with the effects on the parameters: (n_samples, n_points).
@@ -129,8 +129,8 @@ class _OwnChain:
             raise ShapeError(f"simulate gives {readings.shape}; allowed: {(len(theta), len(plan))}, samples x readings")
         return readings
 
-    def readings_of_view(self, view: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
-        """Apply the effects on the readings, in the order of their stages."""
+    def readings_from_simulated_view(self, view: FloatArray, theta: FloatArray, plan: Plan) -> FloatArray:
+        """Return a result of `simulated_view` with the effects on readings applied, (n_samples, n_points)."""
         for effect, columns in self._effects_and_columns:
             if Stage.OFFSET <= effect.stage <= Stage.SATURATION:
                 view = effect.apply(view, theta[:, columns], plan)

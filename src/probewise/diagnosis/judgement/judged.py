@@ -201,10 +201,12 @@ def verdict_from_probabilities(
 ) -> tuple[Verdict, Names]:
     """Return the verdict by probabilities and aliases alone, and the combination it names.
 
-    A class of aliases is the set of combinations that differ only by swapping aliased effects; if it has half the
-    probability and none of its members has, the verdict is `cannot_tell`. The same holds if clean leads with less than
-    half, or if the leader is aliased with a credible rival (`aliased_with`): then the prior, not the data, would
-    decide.
+    Clean or unknown is the verdict if it has half the probability. Otherwise the most probable combination of effects
+    is named, even with less than half (`noise` if all its effects are on the noise), with three exceptions, which are
+    `cannot_tell`. With half or more: a credible rival is aliased with it (`aliased_with`), so that the prior, not the
+    data, would decide. With less: it has half together with the combinations that differ from it by one effect swapped
+    for its alias (`aliases`), or clean or unknown is more probable; this last case names no combination, nor does a
+    search without any.
     """
     probability = {h.effects: h.probability for h in hypotheses}
     if probability.get(("unknown",), 0.0) >= 0.5:

@@ -68,10 +68,10 @@ def varying_covariates(plan: Plan, usable: IntArray, level: FloatArray, slope: F
         out.append(Covariate("orientation", degrees, everything, groups=True))
     if len(np.unique(scan)) > 1:
         out.append(Covariate("scan", scan.astype(np.float64), everything, groups=True))
-    return out + _place_covariates(plan, usable)
+    return out + _places_along_scans(plan, usable)
 
 
-def _place_covariates(plan: Plan, usable: IntArray) -> list[Covariate]:
+def _places_along_scans(plan: Plan, usable: IntArray) -> list[Covariate]:
     """List the places along all scans in the longer direction, and along each long scan."""
     x_mm, y_mm, scan = plan.x_mm[usable], plan.y_mm[usable], plan.scan[usable]
     by_scan = [np.flatnonzero(scan == k) for k in range(len(plan.scan_names))]

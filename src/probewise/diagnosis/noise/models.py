@@ -15,7 +15,7 @@ from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
-from probewise.sensor.stages import NoiseLevel, effects_with_columns
+from probewise.sensor.stages import ReadingNoise, effects_with_columns
 
 _FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
 _MANY = 12  # nodes of one effect above which they are thinned before combination with another's
@@ -65,7 +65,7 @@ class NoiseModel:
         """Names of its effects; () for white noise."""
         return tuple(effect.name for effect in self.effects)
 
-    def column_slice(self, name: str) -> slice:
+    def columns_of_effect(self, name: str) -> slice:
         """Return the columns of one effect's settings."""
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
@@ -93,9 +93,9 @@ class NoiseModel:
                 [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
             )
             log_weights = (log_weights[:, None] + log_each).ravel()
-        level = self._noise_levels_at_nodes(settings, seen)
+        noise = self._noise_at_nodes(settings, seen)
         far = np.abs(residuals) > _FAR * sd
-        laws = tuple(self._law_at_node(level, k, far) for k in range(len(settings)))
+        laws = tuple(self._law_at_node(noise, k, far) for k in range(len(settings)))
         if self.rounding:
             # Sigma is integrated out numerically over its logarithm, as elsewhere in closed form.
             (law,) = laws
@@ -112,7 +112,7 @@ class NoiseModel:
             return self.likely[effect.name]
         return effect.weighed_nodes(residuals, rows)
 
-    def _noise_levels_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseLevel:
+    def _noise_at_nodes(self, settings: FloatArray, seen: FloatArray) -> ReadingNoise:
         """Return the noise at all nodes at once: relative sds and correlations with every noise effect applied.
 
         `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) are the predictions.
@@ -120,28 +120,28 @@ class NoiseModel:
         plan, usable = self.recording.plan, self.recording.usable
         everywhere = np.zeros((1, len(plan)))
         everywhere[0, usable] = seen
-        level = NoiseLevel(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
+        noise = ReadingNoise(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
         for effect, own in effects_with_columns(self.effects):
-            level = effect.apply(level, settings[:, own], plan)
-        return level
+            noise = effect.apply(noise, settings[:, own], plan)
+        return noise
 
-    def _law_at_node(self, level: NoiseLevel, node: int, far: BoolArray) -> NoiseLaw:
+    def _law_at_node(self, noise: ReadingNoise, node: int, far: BoolArray) -> NoiseLaw:
         def value_at_node(values: FloatArray) -> float:
             return float(values[min(node, len(values) - 1), 0])
 
-        sd = level.sd[min(node, len(level.sd) - 1)]
+        sd = noise.sd[min(node, len(noise.sd) - 1)]
         sd = np.broadcast_to(sd, (len(self.recording),))[self.recording.usable]
-        lost_share = value_at_node(level.lost_share)
-        value = value_at_node(level.lost_value)
+        lost_share = value_at_node(noise.lost_share)
+        value = value_at_node(noise.lost_value)
         lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * (1 + abs(value))) & (lost_share > 0)
         carry = np.where(
             self._rows_to_previous_in_scan > 0,
-            value_at_node(level.rho) ** np.maximum(self._rows_to_previous_in_scan, 1),
+            value_at_node(noise.rho) ** np.maximum(self._rows_to_previous_in_scan, 1),
             0.0,
         )
         carry[lost] = 0.0
         carry[1:][lost[:-1]] = 0.0
-        walk = value_at_node(level.walk) ** 2 * self._rows_to_previous_in_table if np.any(level.walk) else np.zeros(0)
+        walk = value_at_node(noise.walk) ** 2 * self._rows_to_previous_in_table if np.any(noise.walk) else np.zeros(0)
         log_extra = 0.0
         if lost_share > 0:
             n_lost, cells = (
@@ -156,8 +156,8 @@ class NoiseModel:
             sd,
             carry,
             lost,
-            value_at_node(level.wide_share),
-            value_at_node(level.wide_times),
+            value_at_node(noise.wide_share),
+            value_at_node(noise.wide_times),
             log_extra,
             least=self.least_sd,
             walk=walk,

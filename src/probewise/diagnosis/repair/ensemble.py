@@ -102,12 +102,12 @@ class HypothesisSamples:
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnModels:
-    """Posterior samples: of the null, of the best hypothesis, and of the repaired `model`, an average of hypotheses."""
+class NullBestAndRepairedSamples:
+    """Posterior samples: of the null, of the best hypothesis, and of the repaired model, an average of hypotheses."""
 
     null: ModelSamples
     best: ModelSamples
-    model: ModelSamples
+    repaired: ModelSamples
 
 
 def draw_models(
@@ -118,7 +118,7 @@ def draw_models(
     *,
     rng: np.random.Generator,
     progress: Progress = silent,
-) -> DrawnModels:
+) -> NullBestAndRepairedSamples:
     """Draw from the posterior of the repaired model, averaged over hypotheses that the verdict leaves open.
 
     The best hypothesis alone would be overconfident if the effect is unknown, or if it leads by little.
@@ -134,7 +134,7 @@ def draw_models(
         model = cached.averaged_over_hypotheses(fit, cached.compatible_probabilities(fit))
     elif not (judged.too_little or judged.withdrawn):
         model = _average_of_named_and_null(cached, searched, test, best.noise)
-    return DrawnModels(samples if fit is null else cached.averaged_over_orders(null), samples, model)
+    return NullBestAndRepairedSamples(samples if fit is null else cached.averaged_over_orders(null), samples, model)
 
 
 def _average_of_named_and_null(

@@ -14,7 +14,7 @@ from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.best_repair import BestRepair
-from probewise.diagnosis.repair.ensemble import DrawnModels
+from probewise.diagnosis.repair.ensemble import NullBestAndRepairedSamples
 from probewise.diagnosis.repair.improvement import Improvement
 from probewise.diagnosis.repair.samples import ModelSamples
 from probewise.effects import NamedEffect
@@ -91,7 +91,9 @@ class Repair:
     """The old name of `unstated_effects`."""
 
 
-def repair_of(prepared: Prepared, test: GlobalTest, best: BestRepair, drawn: DrawnModels, change: FloatArray) -> Repair:
+def repair_of(
+    prepared: Prepared, test: GlobalTest, best: BestRepair, drawn: NullBestAndRepairedSamples, change: FloatArray
+) -> Repair:
     """Build the repair: samples, gain, and predictions of every row, including rows not used in the diagnosis.
 
     Parameters
@@ -112,7 +114,7 @@ def repair_of(prepared: Prepared, test: GlobalTest, best: BestRepair, drawn: Dra
         by_rows[prepared.usable_rows] = change
         before = Predicted(_predictions_of_all_rows(null), prepared.expand_to_all_rows(null.residuals))
         after = Predicted(_predictions_of_all_rows(fit) + by_rows, prepared.expand_to_all_rows(fit.residuals - change))
-    return Repair(drawn.null, drawn.model, best.improvement, before, after, by_rows=bool(np.any(change)))
+    return Repair(drawn.null, drawn.repaired, best.improvement, before, after, by_rows=bool(np.any(change)))
 
 
 def _predictions_of_all_rows(found: Fit) -> FloatArray:

@@ -239,7 +239,7 @@ def _draws_about_nodes(
 
     `nodes` (n_samples,) are indices of nodes; parameters that are the same in all nodes stay as they are.
     """
-    settings = noise.nodes.settings[:, noise.noise.column_slice(effect.name)]
+    settings = noise.nodes.settings[:, noise.noise.columns_of_effect(effect.name)]
     own = effect.draws_about(settings[nodes], rng=rng)
     if own is not None:
         return own

@@ -1,8 +1,10 @@
 """Basis functions over every covariate, for unknown effects: changes of the readings that no named effect describes.
 
 A mismatch that depends smoothly on a covariate adds to the readings, multiplies the signal, or displaces the sensor. So
-there are smooth functions of the covariate: alone, times the signal, and times the slope of the readings along the
-motion. Other bases are steps (change points), windows, one value per scan or angle, and memories of earlier readings.
+there are smooth functions of covariates: alone, times the signal, and times the slope of the readings along the
+motion; over time and place all three, over another covariate those that make sense. Other bases are steps (change
+points) over time and place, windows, one value per scan or angle, memories of earlier readings, and transients at the
+ends of scans.
 """
 
 from __future__ import annotations

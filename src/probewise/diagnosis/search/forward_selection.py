@@ -182,10 +182,11 @@ def _pairs_of_repeatable_effects(state: SearchState, null: WeighedFit) -> list[N
 
 
 def _proposals_under_plain_noise(state: SearchState, null: WeighedFit) -> list[Proposal]:
-    """Propose the effects that lead about the null refitted under the simplest noise; none if that fit is the same.
+    """Propose the effects that lead about the given null, refitted under the simplest noise.
 
     Where noise with memory (a random walk, a correlation) leads, it absorbs a missing effect, and the effect may be
-    undetectable about the null that was fitted under it.
+    undetectable about the null that was fitted under it. None are proposed elsewhere, nor if the refit predicts the
+    same.
     """
     plain = state.refits.null_under_plain_noise(null)
     if plain is None:

@@ -43,7 +43,7 @@ class WeighedFit:
         return self.log_share + self.log_detectable
 
     def with_evidence(self, plain: Mapping[Names, NoiseEvidence]) -> WeighedFit:
-        """Return it with other evidences: `plain` is that of its parameters alone, by noise model."""
+        """Return it with new evidence, by noise model: `plain`, that of its parameters alone, plus its prior factor."""
         return replace(self, evidence=plain).shifted(self.log_prior_factor)
 
     def with_factor_and_weights(self, log_share: float, weights: Mapping[str, FloatArray]) -> WeighedFit:

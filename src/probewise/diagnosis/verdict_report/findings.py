@@ -18,7 +18,7 @@ from probewise.diagnosis.repair.best_repair import BestRepair
 from probewise.diagnosis.repair.samples import N_SAMPLES, ModelSamples, sample_model
 from probewise.diagnosis.search.searched import Searched
 from probewise.diagnosis.search.weighed_fit import WeighedFit, effects_out_of_vocabulary, noise_effects_in_vocabulary
-from probewise.diagnosis.verdict_report.words import unit_in_words
+from probewise.diagnosis.verdict_report.words import with_unit_of_reading
 from probewise.effects import NamedEffect, NoiseEffect
 from probewise.recordings.plan import Plan
 
@@ -172,7 +172,7 @@ def _lambda_of(searched: Searched, holder: WeighedFit, name: str, noise: Names) 
         everywhere = found.model.predict(found.z[None, :])[0]
         return float(np.linalg.norm(cast(NoiseEffect, effect).change_of_readings(everywhere))) / found.sd
     if name in searched.certain:
-        step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.column_slice(name)]
+        step = holder.evidence[noise].nodes.settings[0, holder.evidence[noise].noise.columns_of_effect(name)]
         return float(step[0]) / math.sqrt(12) / found.sd * math.sqrt(len(found.residuals))
     if name in prepared.noise_effect_names:
         # For noise effects: the size of an effect on the mean with equal evidence.
@@ -214,7 +214,7 @@ def parameters_found(effect: NamedEffect[Any], values: FloatArray, unit: str) ->
     """
     fixed = getattr(effect, "fixed", ())
     return tuple(
-        _parameter_found(name, unit_in_words(own, unit), values[:, k])
+        _parameter_found(name, with_unit_of_reading(own, unit), values[:, k])
         for k, (name, own) in enumerate(zip(effect.prior.names, effect.units, strict=True))
         if name not in fixed
     )

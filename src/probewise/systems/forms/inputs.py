@@ -14,14 +14,14 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Act, Form, Say, mean_with_sd
-from probewise.systems.forms.modulations import most_trial_waves_of_law, trial_wave_numbers
+from probewise.systems.forms.modulations import max_n_trial_frequencies, trial_frequencies
 from probewise.systems.forms.readings import delayed_values, values_at_earlier_times
 from probewise.systems.table import RunTable
 
 _N_SIZES = 9
 _NUDGE = 1e-4  # of a column's spread: the step that tests whether it drives the readings
-_MOST_WAVES = 600
-_MOST_WAVES_CALLED = 96  # where each is two calls of a person's function
+_MOST_FREQUENCIES = 600
+_MOST_FREQUENCIES_CALLED = 96  # where each is two calls of a person's function
 _ROWS_OF_A_WAVE = 4  # least distinct values per period on average: with fewer, some wave fits any readings
 _NEAR_ZERO = 0.1  # of a column's range: largest dead zone
 _FORTH_AND_BACK = 0.02  # least share of rows that move in each direction
@@ -178,10 +178,10 @@ def _clipped_column_form(about: ReferenceFit, name: str, low: float, high: float
         )
 
 
-def _most_trial_waves(about: ReferenceFit) -> int:
+def _max_n_trial_frequencies(about: ReferenceFit) -> int:
     if about.system.caller is None:
-        return most_trial_waves_of_law(len(about.table))
-    return _MOST_WAVES if about.system.predicts_in_bulk else _MOST_WAVES_CALLED
+        return max_n_trial_frequencies(len(about.table))
+    return _MOST_FREQUENCIES if about.system.predicts_in_bulk else _MOST_FREQUENCIES_CALLED
 
 
 def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
@@ -193,14 +193,16 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         return np.asarray(c + theta[:, :1] * np.sin(2 * np.pi * c / theta[:, 1:2] + theta[:, 2:3]))
 
     act = _column_changer(name, add_wave)
-    waves = trial_wave_numbers(np.sort(values), [np.arange(len(values))], _most_trial_waves(about), _ROWS_OF_A_WAVE)
+    frequencies = trial_frequencies(
+        np.sort(values), [np.arange(len(values))], _max_n_trial_frequencies(about), _ROWS_OF_A_WAVE
+    )
     guess = 1e-4 * float(np.nanstd(values))
-    typical = about.typical_amplitude(Stage.INPUT, act, sine_and_cosine_entries(guess, 1 / waves), guess)
+    typical = about.typical_amplitude(Stage.INPUT, act, sine_and_cosine_entries(guess, 1 / frequencies), guess)
     if typical is None:
         return
     marginals = {
         "a": about.amplitude_prior(typical, positive=True),
-        "period": LogUniform(float(1 / waves[-1]) * 0.98, float(2 / waves[0])),
+        "period": LogUniform(float(1 / frequencies[-1]) * 0.98, float(2 / frequencies[0])),
         "phase": PHASE,
     }
     yield Form(
@@ -210,7 +212,7 @@ def _periodic_error_form(about: ReferenceFit, name: str) -> Iterator[Form]:
         (name, name, "rad"),
         (name,),
         act,
-        sine_and_cosine_entries(typical, 1 / waves),
+        sine_and_cosine_entries(typical, 1 / frequencies),
         (0,),
         lambda m, s: (
             f"{name} has a periodic error with an amplitude of {mean_with_sd(m[0], s[0], '')} "

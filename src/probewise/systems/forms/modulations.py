@@ -16,8 +16,8 @@ from probewise.systems.forms.form import ChangePoints, mean_with_sd
 from probewise.systems.table import RunTable
 
 _MOST_MOMENTS = 512
-_MOST_WAVES = 1024
-_ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial waves of one form: a fifth of a second
+_MOST_FREQUENCIES = 1024
+_ROWS_OF_WAVES = 250_000  # rows at which a law is solved for the trial frequencies of one form: a fifth of a second
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,12 +124,13 @@ def value_per_run(table: RunTable) -> Modulation:
     )
 
 
-def trial_wave_numbers(
-    values: FloatArray, groups: list[Any], most: int = _MOST_WAVES, rows_each: int = 2
+def trial_frequencies(
+    values: FloatArray, groups: list[Any], most: int = _MOST_FREQUENCIES, rows_each: int = 2
 ) -> FloatArray:
-    """Return trial wave numbers along a covariate, rising, in steps of half the resolution 1 / range.
+    """Return trial frequencies along a covariate, (n_trial,), rising evenly from half the resolution, 0.5 / range.
 
-    They go up to one wave in `rows_each` rows; there are 8 to `most`. `groups` are the rows of each run.
+    They go up to one wave in `rows_each` rows, and to 2 / range at least, in steps of about half the resolution; where
+    that gives fewer than 8 or more than `most`, there are 8 or `most`. `groups` are the rows of each run.
     """
     reach = float(np.ptp(values))
     gaps = np.concatenate([np.abs(np.diff(values[rows])) for rows in groups])
@@ -140,19 +141,19 @@ def trial_wave_numbers(
     return np.asarray(np.linspace(0.5 / reach, max(highest, 2 / reach), n))
 
 
-def most_trial_waves_of_law(n_points: int) -> int:
-    """Return how many trial waves of one form a law can afford; it is solved for the sine and the cosine of each."""
-    return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, _MOST_WAVES))
+def max_n_trial_frequencies(n_points: int) -> int:
+    """Return how many trial frequencies of a form a law can afford; it is solved for the sine and cosine of each."""
+    return int(np.clip(_ROWS_OF_WAVES // (2 * n_points), 64, _MOST_FREQUENCIES))
 
 
-def wave_number_prior(waves: FloatArray) -> LogUniform:
-    """Return the prior of a wave number: the trial ones, and a little beyond."""
-    return LogUniform(float(0.9 * waves[0]), float(waves[-1] * 1.02))
+def frequency_prior(frequencies: FloatArray) -> LogUniform:
+    """Return the prior of a frequency: the range of the trial ones, and a little beyond."""
+    return LogUniform(float(0.9 * frequencies[0]), float(frequencies[-1] * 1.02))
 
 
 def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
     """Return a sinusoid in time: a sin(2 pi hz t + phase)."""
-    waves = trial_wave_numbers(table.time_s, table.rows_by_scan())
+    frequencies = trial_frequencies(table.time_s, table.rows_by_scan())
 
     def at_rows(theta: FloatArray, rows: RunTable) -> FloatArray:
         return np.asarray(theta[:, :1] * np.sin(2 * np.pi * theta[:, 1:2] * rows.time_s + theta[:, 2:3]))
@@ -161,10 +162,10 @@ def sinusoid_in_time(table: RunTable, time_unit: str) -> Modulation:
         at_rows=at_rows,
         marginals=lambda a: {
             "a": replace(a, positive=True),
-            "hz": wave_number_prior(waves),
+            "hz": frequency_prior(frequencies),
             "phase": PHASE,
         },
-        entries=lambda size: sine_and_cosine_entries(size, waves),
+        entries=lambda size: sine_and_cosine_entries(size, frequencies),
         units=lambda unit: (unit, f"1/{time_unit}", "rad"),
         says=lambda what, unit, mean, sd: (
             f"{what} oscillates with an amplitude of {mean_with_sd(mean[0], sd[0], unit)} and a period of "

@@ -12,7 +12,7 @@ from probewise.priors import LogUniform, Uniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Form, mean_with_sd
-from probewise.systems.forms.modulations import trial_wave_numbers, wave_number_prior
+from probewise.systems.forms.modulations import frequency_prior, trial_frequencies
 from probewise.systems.forms.readings import settling_time_prior, time_since_start_of_run
 from probewise.systems.table import RunTable
 
@@ -34,7 +34,7 @@ def proposals_in_time(about: ReferenceFit) -> Iterator[Form]:
 def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     """Yield a shift of the reading during a share of every period: flat tops, and edges of unknown steepness."""
     own, table = about.system.simulator, about.table
-    waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
+    frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SQUARE_WAVES, _ROWS_OF_A_WAVE)
 
     def act(value: FloatArray, theta: FloatArray, rows: RunTable) -> FloatArray:
         a, hz, phase, share, edge = (theta[:, k : k + 1] for k in range(5))
@@ -42,7 +42,7 @@ def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
         return np.asarray(value + 0.5 * a * (1 + np.tanh(inside / edge)))
 
     phases, shares = np.arange(8) / 8 - 0.5, np.array([0.25, 0.5, 0.75])
-    grid = np.meshgrid(about.sd, waves, phases, shares, _SOFT, indexing="ij")
+    grid = np.meshgrid(about.sd, frequencies, phases, shares, _SOFT, indexing="ij")
     entries = np.stack([each.ravel() for each in grid], axis=-1)[:, None, :]
     typical = about.typical_amplitude(Stage.OFFSET, act, entries, about.sd)
     if typical is None:
@@ -54,7 +54,7 @@ def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
         Stage.OFFSET,
         {
             "a": about.amplitude_prior(typical),
-            "hz": wave_number_prior(waves),
+            "hz": frequency_prior(frequencies),
             "phase": Uniform(-1.0, 1.0),
             "share": Uniform(0.03, 0.97),
             "edge": LogUniform(0.03, 1.0),
@@ -76,7 +76,7 @@ def _square_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
 def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
     """Yield a sinusoid whose frequency rises or falls steadily along the recording, by a machine that runs up, say."""
     own, table = about.system.simulator, about.table
-    waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
+    frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), _MOST_SWEPT, _ROWS_OF_A_WAVE)
     begin, end = float(table.time_s.min()), float(table.time_s.max())
     middle, half = 0.5 * (begin + end), 0.5 * (end - begin)
 
@@ -86,7 +86,7 @@ def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
         return np.asarray(value + a * np.sin(2 * np.pi * hz * half * (u + 0.5 * sweep * u**2) + phase))
 
     settings = []
-    for hz in waves:
+    for hz in frequencies:
         n = 2 * max(int(np.ceil(_SWEEPS * hz * half)), 1)
         settings += [(hz, sweep) for sweep in np.linspace(-1, 1, n)]
     entries = sine_and_cosine_entries(about.sd, *np.transpose(settings))
@@ -100,7 +100,7 @@ def _swept_wave_proposal(about: ReferenceFit) -> Iterator[Form]:
         Stage.OFFSET,
         {
             "a": about.amplitude_prior(typical, positive=True),
-            "hz": wave_number_prior(waves),
+            "hz": frequency_prior(frequencies),
             "sweep": Uniform(-1.2, 1.2),
             "phase": PHASE,
         },

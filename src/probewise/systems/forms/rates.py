@@ -15,7 +15,7 @@ from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.clipping import clipping_levels
 from probewise.systems.forms.form import Form, mean_with_sd
-from probewise.systems.forms.modulations import most_trial_waves_of_law, trial_wave_numbers, wave_number_prior
+from probewise.systems.forms.modulations import frequency_prior, max_n_trial_frequencies, trial_frequencies
 from probewise.systems.motion import Limit, Motion
 
 _N_SIZES = 9
@@ -116,19 +116,19 @@ def _friction_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]
 def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterator[Form]:
     table = about.table
     time = table.time
-    waves = trial_wave_numbers(table.time_s, table.rows_by_scan(), most_trial_waves_of_law(len(table)))
+    frequencies = trial_frequencies(table.time_s, table.rows_by_scan(), max_n_trial_frequencies(len(table)))
 
     def act(value: Motion, theta: FloatArray, rows: Any) -> Motion:
         a, hz, phase = theta[:, :1], theta[:, 1:2], theta[:, 2:3]
         return value.with_term(state, lambda s, p, u: a * np.sin(2 * np.pi * hz * u[str(time)] + phase))
 
     guess = 1e-5 * _rms_rate(about, state)
-    typical = about.typical_amplitude(Stage.RATE, act, sine_and_cosine_entries(guess, waves), guess)
+    typical = about.typical_amplitude(Stage.RATE, act, sine_and_cosine_entries(guess, frequencies), guess)
     if typical is None:
         return
     marginals = {
         "a": about.amplitude_prior(typical, positive=True),
-        "hz": wave_number_prior(waves),
+        "hz": frequency_prior(frequencies),
         "phase": PHASE,
     }
     yield Form(
@@ -138,7 +138,7 @@ def _periodic_forcing_form(about: ReferenceFit, state: str, unit: str) -> Iterat
         (unit, f"1/{about.time_unit}", "rad"),
         ("time",),
         act,
-        sine_and_cosine_entries(typical, waves),
+        sine_and_cosine_entries(typical, frequencies),
         (0,),
         lambda mean, sd: (
             f"the rate of {state} lacks a sinusoidal term with an amplitude of {mean_with_sd(mean[0], sd[0], '')} "

@@ -26,7 +26,7 @@ class EdgeMisplacement:
 
 @dataclass(frozen=True)
 class ScanMisplacement:
-    """A displacement of the pattern in one scan, given by name."""
+    """A displacement of the pattern across its edge (along X if it has no single edge), in the one scan `scan`."""
 
     name: ClassVar[str] = "scan_misplacement"
     stage: ClassVar[Stage] = "pattern"

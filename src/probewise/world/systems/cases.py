@@ -26,8 +26,8 @@ from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.laws import LAWS
 from probewise.world.systems.noise import OTHER_NOISE, SystemNoise, noise_of_size
 from probewise.world.systems.rivals import rivals_with_nats, vocabulary_name
-from probewise.world.systems.rows import SystemRows
 from probewise.world.systems.strata import system_stratum_of
+from probewise.world.systems.table import SystemTable
 from probewise.world.systems.visible_covariates import visible_covariates_of
 from probewise.world.systems.vocabulary import FAMILIES, forms_of
 
@@ -46,31 +46,31 @@ class DrawnSystem:
 
     Parameters
     ----------
-    kind, rows
-        The system, and all its rows, including held-out ones.
+    kind, table
+        The system, and the table of all its rows, including held-out ones.
     shared, by_run
         True parameters; those per run have shape (n_runs,).
     """
 
     kind: SystemKind
-    rows: SystemRows
+    table: SystemTable
     shared: Mapping[str, float]
     by_run: Mapping[str, FloatArray]
 
     @cached_property
     def diagnosed_row_numbers(self) -> IntArray:
         """Numbers of the rows that are not held out."""
-        return np.flatnonzero(self.rows.run < self.rows.n_runs - 2)
+        return np.flatnonzero(self.table.run < self.table.n_runs - 2)
 
     @cached_property
-    def diagnosed_rows(self) -> SystemRows:
-        """The rows given to the diagnosis."""
-        return self.rows.take(self.diagnosed_row_numbers)
+    def diagnosed_table(self) -> SystemTable:
+        """The table of the rows given to the diagnosis."""
+        return self.table.take(self.diagnosed_row_numbers)
 
     @cached_property
     def nominal_model(self) -> Model:
         """The nominal model of those rows."""
-        return Model(self.kind, self.diagnosed_rows)
+        return Model(self.kind, self.diagnosed_table)
 
     @cached_property
     def true_coordinates(self) -> FloatArray:
@@ -87,10 +87,10 @@ class DrawnSystem:
     def true_system(self) -> TrueSystem:
         """The system at its true parameters, about which effects are built."""
         parameters = self.nominal_model.parameters_at(self.true_coordinates[None, :])
-        trace = simulate(self.kind, self.diagnosed_rows, parameters)
+        trace = simulate(self.kind, self.diagnosed_table, parameters)
         return TrueSystem(
             self.kind,
-            self.diagnosed_rows,
+            self.diagnosed_table,
             parameters,
             trace.readings[0],
             {name: v[0] for name, v in trace.states.items()},
@@ -98,10 +98,10 @@ class DrawnSystem:
 
     def simulate_all_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
         """Return noise-free readings with these effects at all rows, (n_points,)."""
-        whole = Model(self.kind, self.rows)
+        whole = Model(self.kind, self.table)
         with np.errstate(all="ignore"):
             at = whole.coordinates_of(self.shared, self.by_run)
-            trace = simulate(self.kind, self.rows, whole.parameters_at(at[None, :]), effects)
+            trace = simulate(self.kind, self.table, whole.parameters_at(at[None, :]), effects)
         return np.asarray(trace.readings[0])
 
     def simulate_diagnosed_rows(self, effects: Sequence[FormWithParameters]) -> FloatArray:
@@ -112,7 +112,7 @@ class DrawnSystem:
         with np.errstate(all="ignore"):
             readings: FloatArray = simulate(
                 self.kind,
-                self.diagnosed_rows,
+                self.diagnosed_table,
                 self.nominal_model.parameters_at(self.true_coordinates[None, :]),
                 effects,
             ).readings[0]
@@ -128,9 +128,9 @@ class DrawnSystem:
 
     # Old names.
     everywhere, changed = simulate_all_rows, simulate_diagnosed_rows
-    kept, seen, at, bare = (
+    rows, kept, seen, at, bare = (
         property(attrgetter(name))
-        for name in ("diagnosed_row_numbers", "diagnosed_rows", "true_coordinates", "fit_without_effects")
+        for name in ("table", "diagnosed_row_numbers", "diagnosed_table", "true_coordinates", "fit_without_effects")
     )
 
 
@@ -258,8 +258,8 @@ def _recorded_case(
     name = OTHER_NOISE[n_earlier % len(OTHER_NOISE)] if stratum.other_noise else "white"
     if name == "noise_per_run" and kind.run is None:
         name = "correlated_noise"  # the table has no column of runs
-    noise = noise_of_size(name, 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_rows, kind.sd, rng=rng)
-    readings = noise.draw(noise_free, drawn.rows, rng)
+    noise = noise_of_size(name, 12.0, noise_free[drawn.diagnosed_row_numbers], drawn.diagnosed_table, kind.sd, rng=rng)
+    readings = noise.draw(noise_free, drawn.table, rng)
     knows = str(rng.choice(["sd", "nothing", "step"], p=[0.6, 0.25, 0.15]))
     step = noise.step
     if step is None and knows == "step" and name == "white":
@@ -273,7 +273,7 @@ def _recorded_case(
         else ""
     )
     plain = bool(rng.random() < 0.5)
-    labels = tuple(str(k + 1) if plain else f"{kind.run}{k + 1:02d}" for k in range(drawn.rows.n_runs))
+    labels = tuple(str(k + 1) if plain else f"{kind.run}{k + 1:02d}" for k in range(drawn.table.n_runs))
     return SystemCase(
         seed,
         number,
@@ -380,7 +380,7 @@ def _effect_with_rivals(
     """Return an effect with its aliases and visible covariates, found in the presence of the other effects."""
     target = drawn.simulate_diagnosed_rows([e.form_with_parameters for e in (effect, *others)])
     beside = [AddedForm(e.form, e.values, tuple(n for n, step in e.form.steps.items() if step > 0)) for e in others]
-    model = Model(drawn.kind, drawn.diagnosed_rows, beside)
+    model = Model(drawn.kind, drawn.diagnosed_table, beside)
     start = model.coordinates_of(drawn.shared, drawn.by_run)
     fitted = model.fit(target, start)
     rivals = rivals_with_nats(

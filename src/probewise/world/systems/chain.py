@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import FormWithParameters, Instants
 from probewise.world.systems.kind import SystemKind
 from probewise.world.systems.motion import solve_law
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +23,10 @@ class NoiseFreeResult:
 
 
 def simulate(
-    kind: SystemKind, rows: SystemRows, parameters: Mapping[str, FloatArray], effects: Sequence[FormWithParameters] = ()
+    kind: SystemKind,
+    rows: SystemTable,
+    parameters: Mapping[str, FloatArray],
+    effects: Sequence[FormWithParameters] = (),
 ) -> NoiseFreeResult:
     """Simulate a system without noise: its readings and states.
 
@@ -63,7 +66,7 @@ def simulate(
     return NoiseFreeResult(apply_reading_effects(readings, rows, placed), states)
 
 
-def apply_reading_effects(readings: FloatArray, rows: SystemRows, effects: Sequence[FormWithParameters]) -> FloatArray:
+def apply_reading_effects(readings: FloatArray, rows: SystemTable, effects: Sequence[FormWithParameters]) -> FloatArray:
     """Apply the effects on the readings, in order."""
     for form, numbers in sorted((e for e in effects if e[0].side == "reading"), key=lambda e: e[0].order):
         readings = form.act(readings, rows, numbers)

@@ -6,7 +6,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.kind import Columns, SystemKind
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 _PAUSE = 0.15  # pause between runs, as a share of the first run's length
 
@@ -39,7 +39,7 @@ def sweep_there_and_back(rng: np.random.Generator, n: int, low: float, high: flo
     return np.asarray(low + (high - low) * np.concatenate([first, second]))
 
 
-def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
+def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
     """Design all runs of a case; the last two are held out, the last one in a new regime."""
     n_runs = kind.n_runs + 2
     each = int(np.clip(rng.integers(150, 420) // kind.n_runs, 24, 120))
@@ -61,7 +61,7 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemRows:
             columns.setdefault(name, []).append(np.round(values, decimals))
         run.append(np.full(n, k))
     joined = {name: np.concatenate(parts) for name, parts in columns.items()}
-    return SystemRows(joined, np.concatenate(run).astype(np.int64), kind.time, n_runs)
+    return SystemTable(joined, np.concatenate(run).astype(np.int64), kind.time, n_runs)
 
 
 def _irrelevant_columns(kind: SystemKind, n: int, k: int, regime: float, rng: np.random.Generator) -> Columns:

@@ -20,7 +20,7 @@ def write_system_case(case: SystemCase, directory: str | os.PathLike[str]) -> tu
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     seen = case.drawn.diagnosed_row_numbers
-    later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
+    later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
     texts = {
         "simulator.py": owners_file_text(case),
         "table.csv": table_text(case, seen),
@@ -40,7 +40,7 @@ def owners_file_text(case: SystemCase) -> str:
 
 def table_text(case: SystemCase, rows: IntArray) -> str:
     """Return these rows of the table as CSV."""
-    kind, laid = case.drawn.kind, case.drawn.rows
+    kind, laid = case.drawn.kind, case.drawn.table
     decimals = {**kind.decimals, **{c.name: c.decimals for c in kind.logged}, kind.reading: kind.reading_decimals}
     columns: dict[str, list[str]] = {}
     if kind.run is not None:
@@ -55,7 +55,7 @@ def table_text(case: SystemCase, rows: IntArray) -> str:
 def truth_of(case: SystemCase) -> dict[str, Any]:
     """Return the truth of a case as a JSON object, the content of truth.json."""
     seen = case.drawn.diagnosed_row_numbers
-    later = np.setdiff1d(np.arange(len(case.drawn.rows)), seen)
+    later = np.setdiff1d(np.arange(len(case.drawn.table)), seen)
     pair = len(case.effects) == 2
     effects = [_effect_json(effect) for effect in case.effects]
     if case.noise.name not in ("white", "quantised", "t4"):

@@ -14,7 +14,7 @@ from probewise.errors import NotConvergedError
 from probewise.world.systems.chain import simulate
 from probewise.world.systems.forms.form import Form, FormWithParameters
 from probewise.world.systems.kind import SystemKind
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 _STEP = 1e-4  # step of a coordinate for derivatives
 _FORM_STEP = 0.1  # of the form's own step
@@ -54,12 +54,12 @@ class Model:
     """
 
     kind: SystemKind
-    rows: SystemRows
+    table: SystemTable
     added: Sequence[AddedForm] = field(default=())
 
     @cached_property
     def _runs(self) -> list[int]:
-        return [int(self.rows.run[own[0]]) for own in self.rows.rows_by_run]
+        return [int(self.table.run[own[0]]) for own in self.table.rows_by_run]
 
     @property
     def n_nominal_coordinates(self) -> int:
@@ -78,7 +78,7 @@ class Model:
         out, n = {}, len(self.kind.shared_names)
         for k, name in enumerate(self.kind.shared_names):
             out[name] = self.kind.priors[name].value(x[:, k : k + 1])
-        at = np.searchsorted(self._runs, self.rows.run)
+        at = np.searchsorted(self._runs, self.table.run)
         for name in self.kind.per_run:
             out[name] = self.kind.priors[name].value(x[:, n : n + len(self._runs)])[:, at]
             n += len(self._runs)
@@ -98,7 +98,7 @@ class Model:
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return noise-free readings at coordinates (n_samples, n_coordinates): (n_samples, n_points)."""
-        return simulate(self.kind, self.rows, self.parameters_at(x), self.effects_at(x)).readings
+        return simulate(self.kind, self.table, self.parameters_at(x), self.effects_at(x)).readings
 
     def predict_with_slopes(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return readings (n_points,) and their slopes (n_points, n_coordinates).
@@ -115,14 +115,14 @@ class Model:
         found = self.predict(np.concatenate([x[None], x + steps, x - steps]))
         n = len(moves)
         slopes = (found[1 : 1 + n] - found[1 + n :]) / (2 * sizes[:, None])
-        out = np.zeros((len(self.rows), len(x)))
+        out = np.zeros((len(self.table), len(x)))
         for move, slope in zip(moves, slopes, strict=True):
             columns = np.flatnonzero(move)
             if len(columns) == 1 and not n_shared <= columns[0] < self.n_nominal_coordinates:
                 out[:, columns[0]] = slope
             else:
                 for column, run in zip(columns, self._runs, strict=True):
-                    here = self.rows.run == run
+                    here = self.table.run == run
                     out[here, column] = slope[here]
         return found[0], out
 
@@ -131,9 +131,9 @@ class Model:
         try:
             readings, slopes = self.predict_with_slopes(x)
         except NotConvergedError:
-            readings = np.full(len(self.rows), np.nan)
+            readings = np.full(len(self.table), np.nan)
         if not np.isfinite(readings).all():
-            return np.full(len(self.rows), _FAR * self.kind.sd), np.zeros((len(self.rows), len(x)))
+            return np.full(len(self.table), _FAR * self.kind.sd), np.zeros((len(self.table), len(x)))
         return readings, np.nan_to_num(slopes)
 
     def fit(self, readings: FloatArray, start: FloatArray, *, max_calls: int = 25) -> LeastSquaresFit:

@@ -19,7 +19,7 @@ from probewise._arrays import FloatArray, IntArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.forms.form import Form, FormWithParameters, Instants
 from probewise.world.systems.kind import SystemKind
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 _RTOL, _ATOL = 1e-8, 1e-10
 _CHECKS = np.array([0.25, 0.5, 0.75, 1.0])  # shares of a gap at which events are checked
@@ -31,7 +31,7 @@ _CLOSE = 1e-7  # share of a gap: closer events are merged
 
 def solve_law(
     kind: SystemKind,
-    rows: SystemRows,
+    rows: SystemTable,
     parameters: Mapping[str, FloatArray],
     columns: Mapping[str, FloatArray],
     effects: Sequence[FormWithParameters],
@@ -59,7 +59,7 @@ class _Integration:
     """The solution of a law for all samples and runs; parameters as of `solve_law`."""
 
     kind: SystemKind
-    rows: SystemRows
+    table: SystemTable
     parameters: Mapping[str, FloatArray]
     columns: Mapping[str, FloatArray]
     effects: Sequence[FormWithParameters]
@@ -67,8 +67,8 @@ class _Integration:
     @cached_property
     def row_by_position(self) -> IntArray:
         """Row at each position of each run, (n_places, n_runs); short runs repeat their last row."""
-        longest = max(len(own) for own in self.rows.rows_by_run)
-        filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.rows.rows_by_run]
+        longest = max(len(own) for own in self.table.rows_by_run)
+        filled = [np.append(own, np.full(longest - len(own), own[-1])) for own in self.table.rows_by_run]
         return np.stack(filled, axis=1)
 
     @cached_property
@@ -79,7 +79,7 @@ class _Integration:
 
     @cached_property
     def _rows_by_run_number(self) -> dict[int, IntArray]:
-        return {int(self.rows.run[own[0]]): own for own in self.rows.rows_by_run}
+        return {int(self.table.run[own[0]]): own for own in self.table.rows_by_run}
 
     @cached_property
     def delays(self) -> dict[str, FloatArray]:
@@ -111,10 +111,10 @@ class _Integration:
         """Return a function of the share of the gap from position k to the next, giving parameters and columns."""
         here, there = self.row_by_position[k, runs], self.row_by_position[k + 1, runs]
         first = self.row_by_position[0, runs]
-        law, time = self.kind.law, self.rows.time
+        law, time = self.kind.law, self.table.time
         assert law is not None
         assert time is not None
-        t, printed = self.columns[time], self.rows.t
+        t, printed = self.columns[time], self.table.t
         ends = {}
         for name in self.used_columns:
             if name in self.delays:
@@ -122,7 +122,7 @@ class _Integration:
             values = self.columns[name]
             holds = name in self.kind.drives and not law.linear
             ends[name] = (values[:, here], 0.0 if holds else values[:, there] - values[:, here])
-        run = self.rows.run[here]
+        run = self.table.run[here]
         base = {name: v if v.shape[1] == 1 else v[:, here] for name, v in self.parameters.items()}
         varying = [(form, numbers) for form, numbers in self.effects if form.side == "parameter"]
 
@@ -147,7 +147,7 @@ class _Integration:
         out = np.empty(t.shape)
         for j, number in enumerate(run):
             own = self._rows_by_run_number[int(number)]
-            times, values = self.rows.t[own], self.columns[name][0, own]
+            times, values = self.table.t[own], self.columns[name][0, own]
             if law.linear:
                 out[:, j] = np.interp(t[:, j], times, values)
             else:
@@ -167,11 +167,11 @@ class _Integration:
     def discontinuity_shares(self, k: int) -> list[float]:
         """Return shares of the gap from position k to the next: 0, the discontinuities of any sample or run, and 1."""
         here, there = self.row_by_position[k], self.row_by_position[k + 1]
-        begin, gap = self.rows.t[here], self.rows.t[there] - self.rows.t[here]
+        begin, gap = self.table.t[here], self.table.t[there] - self.table.t[here]
         moments = [form.breaks(numbers) for form, numbers in self.effects if form.breaks is not None]
         if self.delays:
             for tau in self.delays.values():
-                moments.append((self.rows.t[:, None] + np.ravel(tau)).ravel())
+                moments.append((self.table.t[:, None] + np.ravel(tau)).ravel())
         if not moments:
             return [0.0, 1.0]
         joined = np.concatenate([np.ravel(m) for m in moments])
@@ -197,7 +197,7 @@ class _Integration:
 
         A gap of a sample and run in which friction or a bound changes its mode is integrated again with events.
         """
-        time = self.rows.time
+        time = self.table.time
         assert time is not None
         t = self.columns[time]
         gap, at, hard = (
@@ -265,8 +265,8 @@ class _Integration:
     def _states_at_rows(self, names: list[str], kept: FloatArray) -> dict[str, FloatArray]:
         out = {}
         for name, values in zip(names, kept, strict=True):
-            found = np.empty((self.n_samples, len(self.rows)))
-            for j, own in enumerate(self.rows.rows_by_run):
+            found = np.empty((self.n_samples, len(self.table)))
+            for j, own in enumerate(self.table.rows_by_run):
                 found[:, own] = values[:, j, : len(own)]
             out[name] = found
         return out
@@ -278,7 +278,7 @@ class _Integration:
 
         return _Integration(
             self.kind,
-            self.rows,
+            self.table,
             {name: of_sample(v) for name, v in self.parameters.items()},
             {name: of_sample(v) for name, v in self.columns.items()},
             [(form, {name: of_sample(v) for name, v in numbers.items()}) for form, numbers in self.effects],
@@ -294,7 +294,7 @@ class _Integration:
 
     def integrate_gap_with_events(self, s: FloatArray, k: int, j: int, names: list[str]) -> FloatArray:
         """Integrate from position k of run j to the next for one sample, with events of friction and bounds."""
-        time = self.rows.time
+        time = self.table.time
         assert time is not None
         t = self.columns[time]
         gap = float(t[0, self.row_by_position[k + 1, j]] - t[0, self.row_by_position[k, j]])

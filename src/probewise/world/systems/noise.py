@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from probewise._arrays import FloatArray
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 OTHER_NOISE = (
     "correlated_noise",
@@ -45,14 +45,14 @@ class SystemNoise:
     """
 
     name: str
-    draw: Callable[[FloatArray, SystemRows, np.random.Generator], FloatArray]
+    draw: Callable[[FloatArray, SystemTable, np.random.Generator], FloatArray]
     parameters: Mapping[str, object] = field(default_factory=dict)
     size_lambda: float = 0.0
     step: float | None = None
 
 
 def noise_of_size(
-    name: str, wanted: float, readings: FloatArray, rows: SystemRows, sd: float, *, rng: np.random.Generator
+    name: str, wanted: float, readings: FloatArray, rows: SystemTable, sd: float, *, rng: np.random.Generator
 ) -> SystemNoise:
     """Return a noise, as detectable as an effect of size `wanted` if its strength can be chosen.
 
@@ -122,7 +122,7 @@ def noise_of_size(
             )
 
 
-def _ar1_noise(rows: SystemRows, rho: float, rng: np.random.Generator) -> FloatArray:
+def _ar1_noise(rows: SystemTable, rho: float, rng: np.random.Generator) -> FloatArray:
     """Draw AR(1) noise of sd 1 within each run, (n_points,)."""
     own = rng.standard_normal(len(rows))
     for run in rows.rows_by_run:

@@ -28,7 +28,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     """
     drawn, kind = case.drawn, case.drawn.kind
     beside = [AddedForm(e.form, e.values, fitted_parameters(e.form)) for e in case.effects]
-    model = Model(kind, drawn.diagnosed_rows, beside)
+    model = Model(kind, drawn.diagnosed_table, beside)
     fitted = model.fit(case.readings[drawn.diagnosed_row_numbers], model.coordinates_of(drawn.shared, drawn.by_run))
     _, s, vt = np.linalg.svd(fitted.slopes / kind.sd, full_matrices=False)
     wide = np.where(s > 1e-6 * s.max(), 1 / np.maximum(s, 1e-300), 0.0)
@@ -36,7 +36,7 @@ def right_predictions(case: SystemCase, n_samples: int, *, rng: np.random.Genera
     for k, name in enumerate(name for b in beside for name in b.free):
         if name == "tau_s" and kind.law is not None:
             x[:, model.n_nominal_coordinates + k] = _rounded_to_quantiles(x[:, model.n_nominal_coordinates + k])
-    later = drawn.rows.take(np.flatnonzero(drawn.rows.run >= drawn.rows.n_runs - 2))
+    later = drawn.table.take(np.flatnonzero(drawn.table.run >= drawn.table.n_runs - 2))
     ahead = Model(kind, later, beside)
     n_shared = len(kind.shared_names)
     n_runs = len(later.rows_by_run)

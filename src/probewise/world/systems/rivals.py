@@ -81,7 +81,7 @@ def rivals_with_nats(
             continue
         wider = Model(
             true.kind,
-            true.rows,
+            true.table,
             [*model.added, AddedForm(candidate.form, candidate.start, fitted_parameters(candidate.form))],
         )
         own = [candidate.start[name] / (0.1 * candidate.form.steps[name]) for name in fitted_parameters(candidate.form)]
@@ -136,13 +136,13 @@ def templates_of(
     parameters, beside = model.parameters_at(x), model.effects_at(x)
     inner = [e for e in beside if e[0].side != "reading"]
     outer = [e for e in beside if e[0].side == "reading"]
-    bare = simulate(true.kind, true.rows, parameters, inner).readings
+    bare = simulate(true.kind, true.table, parameters, inner).readings
     out: dict[Form, FloatArray] = {}
     with np.errstate(all="ignore"):
         for form in (f for f in forms if f.side == "reading"):
             unread = np.repeat(bare, len(settings[form]), axis=0)
             out[form] = (
-                apply_reading_effects(unread, true.rows, [*outer, (form, parameter_arrays(settings[form]))])
+                apply_reading_effects(unread, true.table, [*outer, (form, parameter_arrays(settings[form]))])
                 - fitted.readings
             )
         alone, together = _split_by_way_of_simulation(true, [f for f in forms if f.side != "reading"])
@@ -209,6 +209,6 @@ def _simulated_or_nan(
 ) -> FloatArray:
     """Simulate; NaN if a law diverges."""
     try:
-        return simulate(true.kind, true.rows, parameters, effects).readings
+        return simulate(true.kind, true.table, parameters, effects).readings
     except NotConvergedError:
-        return np.full((n, len(true.rows)), np.nan)
+        return np.full((n, len(true.table)), np.nan)

@@ -25,7 +25,7 @@ def visible_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -
     true
         The system.
     """
-    rows = true.rows
+    rows = true.table
     pooled = {name: values for name, values in rows.columns.items() if name != rows.time}
     pooled |= {"level": true.readings, "previous": _change_from_previous_row(true)}
     pooled |= {f"state:{name}": values for name, values in true.states.items()}
@@ -40,8 +40,8 @@ def visible_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -
 
 
 def _change_from_previous_row(true: TrueSystem) -> FloatArray:
-    out = np.zeros(len(true.rows))
-    for own in true.rows.rows_by_run:
+    out = np.zeros(len(true.table))
+    for own in true.table.rows_by_run:
         out[own[1:]] = np.diff(true.readings[own])
     return out
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, Self, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 Side: TypeAlias = Literal["input", "parameter", "rate", "reading"]
 
@@ -35,7 +35,7 @@ class Instants:
     row: FloatArray
 
     @classmethod
-    def at_rows(cls, rows: SystemRows) -> Self:
+    def at_rows(cls, rows: SystemTable) -> Self:
         """Return the instants of all rows."""
         return cls(rows.t[None, :], rows.time_since_start[None, :], rows.columns, rows.run, np.arange(float(len(rows))))
 

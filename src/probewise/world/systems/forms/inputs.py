@@ -12,16 +12,16 @@ from probewise.world.systems.forms.form import Form, Numbers
 from probewise.world.systems.forms.modulations import amplitude_and_phase, scale_only_member, wave_bank
 from probewise.world.systems.forms.readings import delayed
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
-Change = Callable[[FloatArray, SystemRows, Numbers], Any]
+Change = Callable[[FloatArray, SystemTable, Numbers], Any]
 
 
 def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
     """Yield the forms on each column that drives the system, and on the clock."""
     for column in true.kind.drives:
         yield from _forms_of_column(true, column)
-    time = true.rows.time
+    time = true.table.time
     # A clock error is detectable only if the law or the formula uses time.
     if time is not None and (true.kind.law is not None or true.kind.restarts_time):
         yield _linear_form("clock_drift", time, lambda c, rows, v: c * (1 + v["a"]), 1e-3, 0.5, ("time", time))
@@ -29,7 +29,7 @@ def forms_of_inputs(true: TrueSystem) -> Iterator[Form]:
 
 def _act_on_column(
     column: str, change: Change
-) -> Callable[[Mapping[str, FloatArray], SystemRows, Numbers], dict[str, Any]]:
+) -> Callable[[Mapping[str, FloatArray], SystemTable, Numbers], dict[str, Any]]:
     """Return the `Form.act` that changes one column."""
     return lambda columns, rows, v: {**columns, column: np.asarray(change(columns[column], rows, v))}
 
@@ -74,7 +74,7 @@ def _nonlinear_form(
 
 
 def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
-    values, spread = true.rows.columns[column], true.sd_of(column)
+    values, spread = true.table.columns[column], true.sd_of(column)
     low, high = float(values.min()), float(values.max())
     span, own = high - low, (column, "level")
     if not span > 0:
@@ -106,13 +106,13 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
             sizes,
             own,
         )
-    moves = np.concatenate([np.diff(values[rows]) for rows in true.rows.rows_by_run])
+    moves = np.concatenate([np.diff(values[rows]) for rows in true.table.rows_by_run])
     if (moves > 0).mean() > 0.02 and (moves < 0).mean() > 0.02:
         yield _nonlinear_form(f"backlash:{column}", "width", behind_gear_play, column, sizes, ("previous", column))
     if len(np.unique(values)) > 20:
         waves = np.linspace(0.4, min(len(np.unique(values)) / 4, 60), 60) / span
 
-        def add_wave(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+        def add_wave(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
             return np.asarray(c + v["a"] * np.sin(2 * np.pi * c / v["period"] + v["phase"]))
 
         first = 0.01 * spread
@@ -136,8 +136,8 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
             own,
             signed=False,
         )
-    if true.rows.time is not None:
-        taus = true.rows.median_gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
+    if true.table.time is not None:
+        taus = true.table.median_gap * np.geomspace(0.05, 6, 12 if true.kind.law is None else 5)
         yield _nonlinear_form(
             f"input_delay:{column}",
             "tau_s",
@@ -149,7 +149,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         )
 
 
-def behind_gear_play(c: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+def behind_gear_play(c: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
     """Return a column behind gear play: it rests until the play is taken up.
 
     At the start of each run, the play is taken up in the direction of the first motion.

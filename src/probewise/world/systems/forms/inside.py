@@ -17,12 +17,12 @@ _N_WAVES = 20
 
 def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
     """Yield the ways in which each parameter may vary."""
-    over = {"steps": modulations.step(true)}
-    if true.rows.time is not None:
-        over["drifts"] = modulations.along_time(true)
+    common = {"steps": modulations.step(true)}
+    if true.table.time is not None:
+        common["drifts"] = modulations.along_time(true)
     for name in true.kind.priors:
-        own = dict(over)
-        if name not in true.kind.per_run and true.kind.run is not None and len(true.rows.rows_by_run) > 1:
+        own = dict(common)
+        if name not in true.kind.per_run and true.kind.run is not None and len(true.table.rows_by_run) > 1:
             own["differs"] = modulations.by_run(true)
         if name in true.kind.per_run and true.kind.law is not None:
             own = {}  # initial values do not vary within a run
@@ -39,7 +39,7 @@ def varying_parameter(true: TrueSystem, name: str, target: str, how: Modulation)
     return Form(
         name,
         "parameter",
-        how.over,
+        how.value_at,
         how.of_amplitude,
         how.draw,
         how.bank(0.1 * first),
@@ -129,7 +129,7 @@ def _periodic_term(true: TrueSystem, state: str) -> Form:
     return Form(
         f"periodic_forcing:{state}",
         "rate",
-        lambda s, now, v: how.over(now, v),
+        lambda s, now, v: how.value_at(now, v),
         how.of_amplitude,
         how.draw,
         how.bank(0.1 * first),

@@ -17,10 +17,10 @@ from probewise.world.systems.forms.true_system import TrueSystem, draw_log_unifo
 class Modulation:
     """A variation in proportion to an amplitude; attributes as in `Form`, some of them functions of the amplitude.
 
-    `over` is its value as a function of instants and parameters, `reach` the scale of that value at amplitude 1.
+    `value_at` is its value as a function of instants and parameters, `reach` the scale of that value at amplitude 1.
     """
 
-    over: Callable[[Instants, Numbers], Any]
+    value_at: Callable[[Instants, Numbers], Any]
     of_amplitude: Callable[[float, dict[str, float]], dict[str, float]]
     draw: Callable[[np.random.Generator], dict[str, float]]
     bank: Callable[[float], Bank]
@@ -39,10 +39,10 @@ def scale_only_member(group: Sequence[dict[str, float]], amounts: FloatArray) ->
 
 
 def _of_amplitude_alone(
-    over: Callable[[Instants, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
+    value_at: Callable[[Instants, Numbers], Any], covariates: tuple[str, ...], reach: float, uses: tuple[str, ...] = ()
 ) -> Modulation:
     return Modulation(
-        over,
+        value_at,
         lambda a, drawn: {"a": a},
         lambda rng: {},
         lambda a: [[{"a": a}]],
@@ -56,8 +56,8 @@ def _of_amplitude_alone(
 
 def along_time(true: TrueSystem) -> Modulation:
     """Return a linear drift in recorded time."""
-    names = ("time",) if true.rows.time in (None, "time") else ("time", str(true.rows.time))
-    return _of_amplitude_alone(lambda now, v: v["a"] * now.t, names, float(np.abs(true.rows.t).max()))
+    names = ("time",) if true.table.time in (None, "time") else ("time", str(true.table.time))
+    return _of_amplitude_alone(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
 
 
 def with_column(true: TrueSystem, column: str) -> Modulation:
@@ -70,20 +70,20 @@ def with_column(true: TrueSystem, column: str) -> Modulation:
 
 def step(true: TrueSystem) -> Modulation:
     """Return a step at a time, or at a row if there is no time."""
-    at, timed = ("at_s", True) if true.rows.time is not None else ("at_row", False)
-    moments = np.quantile(np.unique(true.rows.t), np.linspace(0.02, 0.98, 40))
+    at, timed = ("at_s", True) if true.table.time is not None else ("at_row", False)
+    moments = np.quantile(np.unique(true.table.t), np.linspace(0.02, 0.98, 40))
 
-    def over(now: Instants, v: Numbers) -> Any:
+    def value_at(now: Instants, v: Numbers) -> Any:
         return v["a"] * ((now.t if timed else now.row) > v[at])
 
     return Modulation(
-        over,
+        value_at,
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {at: true.random_time(rng)},
         lambda a: [[{"a": a, at: float(moment)}] for moment in moments],
         scale_only_member,
         lambda a: {"a": a, at: 0.0},
-        ("time", str(true.rows.time)) if timed else ("row",),
+        ("time", str(true.table.time)) if timed else ("row",),
         1.0,
         breaks=(lambda v: np.asarray(v[at])) if timed else None,
     )
@@ -91,11 +91,11 @@ def step(true: TrueSystem) -> Modulation:
 
 def by_run(true: TrueSystem) -> Modulation:
     """Return a random value per run, including held-out runs, scaled by the amplitude."""
-    n = true.rows.n_runs
+    n = true.table.n_runs
     names = [f"values[{k}]" for k in range(n)]
-    present = [int(true.rows.run[own[0]]) for own in true.rows.rows_by_run]
+    present = [int(true.table.run[own[0]]) for own in true.table.rows_by_run]
 
-    def over(now: Instants, v: Numbers) -> Any:
+    def value_at(now: Instants, v: Numbers) -> Any:
         values = np.concatenate(np.broadcast_arrays(*(np.atleast_2d(v[name]) for name in names)), axis=1)
         return values[:, now.run]
 
@@ -103,7 +103,7 @@ def by_run(true: TrueSystem) -> Modulation:
         return {name: float(sum(m * each[name] for m, each in zip(amounts, group, strict=True))) for name in names}
 
     return Modulation(
-        over,
+        value_at,
         lambda a, drawn: {name: a * drawn[name] for name in names},
         lambda rng: dict(zip(names, rng.standard_normal(n).tolist(), strict=True)),
         lambda a: [[{name: a * (name == names[k]) for name in names} for k in present]],
@@ -127,7 +127,7 @@ def amplitude_and_phase(group: Sequence[dict[str, float]], amounts: FloatArray) 
 
 def waves(true: TrueSystem, n: int) -> Modulation:
     """Return one sinusoid in time, up to one period in four rows; the bank has n frequencies."""
-    rows = true.rows
+    rows = true.table
     slowest, fastest = 1.5 / rows.duration, 0.25 / rows.median_gap
     return Modulation(
         lambda now, v: v["a"] * np.sin(2 * np.pi * v["hz"] * now.t + v["phase"]),
@@ -144,15 +144,15 @@ def waves(true: TrueSystem, n: int) -> Modulation:
 
 def settling(true: TrueSystem) -> Modulation:
     """Return an exponential settling after the start of each run."""
-    longest = float(true.rows.time_since_start.max())
-    taus = np.geomspace(true.rows.median_gap, longest, 12)
+    longest = float(true.table.time_since_start.max())
+    taus = np.geomspace(true.table.median_gap, longest, 12)
     return Modulation(
         lambda now, v: v["a"] * np.exp(-now.since / np.maximum(v["tau_s"], 1e-12)),
         lambda a, drawn: {"a": a, **drawn},
-        lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.rows.median_gap, 0.4 * longest)},
+        lambda rng: {"tau_s": draw_log_uniform(rng, 3 * true.table.median_gap, 0.4 * longest)},
         lambda a: [[{"a": a, "tau_s": float(tau)}] for tau in taus],
         scale_only_member,
         lambda a: {"a": a, "tau_s": 0.05 * longest},
-        ("time", "run", str(true.rows.time)),
+        ("time", "run", str(true.table.time)),
         1.0,
     )

@@ -12,7 +12,7 @@ from probewise.world.systems.forms.inside import term_in_rate
 from probewise.world.systems.forms.modulations import scale_only_member
 from probewise.world.systems.forms.readings import OFFSET
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 OUT_OF_VOCABULARY = (
     "product",
@@ -37,7 +37,7 @@ def forms_out_of_vocabulary(true: TrueSystem, rng: np.random.Generator) -> Itera
     yield _switch(true, first, float(rng.uniform(0.55, 0.8)))
     yield _soft_limited_sum(true, first)
     yield _bend_with_column(true, first)
-    if true.rows.time is not None:
+    if true.table.time is not None:
         yield _square_wave(true, rng)
         yield _chirp(true)
         yield _two_settlings(true)
@@ -52,12 +52,12 @@ def _added_to_reading(
     true: TrueSystem,
     name: str,
     shape: str,
-    over: object,
+    addition: object,
     covariates: tuple[str, ...],
     drawn: dict[str, float] | None = None,
 ) -> Form:
-    def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-        return np.asarray(y + v["a"] * over(y, rows, v))  # type: ignore[operator]
+    def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        return np.asarray(y + v["a"] * addition(y, rows, v))  # type: ignore[operator]
 
     sd = true.noise_sd
     return Form(
@@ -90,7 +90,7 @@ def _product(true: TrueSystem, one: str, other: str) -> Form:
 
 
 def _switch(true: TrueSystem, column: str, share: float) -> Form:
-    at = float(np.quantile(true.rows.columns[column], share))
+    at = float(np.quantile(true.table.columns[column], share))
     return _added_to_reading(
         true,
         f"switch:{column}",
@@ -104,7 +104,7 @@ def _soft_limited_sum(true: TrueSystem, column: str) -> Form:
     """Return the form that adds the sum of a column's absolute deviations since the start of the run, soft-limited."""
     middle, spread = true.mean_of(column), true.sd_of(column)
 
-    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         out = np.empty(len(rows))
         for own in rows.rows_by_run:
             out[own] = np.tanh(np.cumsum(np.abs(rows.columns[column][own] - middle)) / spread / 12)
@@ -114,7 +114,7 @@ def _soft_limited_sum(true: TrueSystem, column: str) -> Form:
         true,
         f"memory:{column}",
         "y + a tanh(sum of abs(C - mean C) since the start of the run)",
-        over,
+        addition,
         ("time", "run", column),
     )
 
@@ -127,42 +127,46 @@ def _bend_with_column(true: TrueSystem, column: str) -> Form:
         float(true.readings.max()),
     )
 
-    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         z = np.clip((y - low) / (high - low), 0, 1)
         return np.asarray(4 * z * (1 - z) * (rows.columns[column] - middle) / spread)
 
     return _added_to_reading(
-        true, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", over, (column, "level")
+        true, f"fading_bend:{column}", "y + a 4 z (1 - z)(C - mean C) / sd C", addition, (column, "level")
     )
 
 
 def _square_wave(true: TrueSystem, rng: np.random.Generator) -> Form:
-    hz = draw_log_uniform(rng, 4 / true.rows.duration, 0.06 / true.rows.median_gap)
+    hz = draw_log_uniform(rng, 4 / true.table.duration, 0.06 / true.table.median_gap)
 
-    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         return np.where((hz * rows.t) % 1.0 < 0.3, 1.0, 0.0)
 
     return _added_to_reading(
-        true, "square_wave", "y + a while (t / P) mod 1 < 0.3", over, ("time", str(true.rows.time)), {"hz": hz}
+        true, "square_wave", "y + a while (t / P) mod 1 < 0.3", addition, ("time", str(true.table.time)), {"hz": hz}
     )
 
 
 def _chirp(true: TrueSystem) -> Form:
-    begin, end = float(true.rows.t.min()), float(true.rows.t.max())
+    begin, end = float(true.table.t.min()), float(true.table.t.max())
 
-    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         z = (rows.t - begin) / (end - begin)
         return np.asarray(np.sin(2 * np.pi * (3 * z + 8 * z**2)))
 
     return _added_to_reading(
-        true, "chirp", "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time", over, ("time", str(true.rows.time))
+        true,
+        "chirp",
+        "y + a sin(2 pi (3 z + 8 z^2)), z the share of the time",
+        addition,
+        ("time", str(true.table.time)),
     )
 
 
 def _two_settlings(true: TrueSystem) -> Form:
-    longest = float(true.rows.time_since_start.max())
+    longest = float(true.table.time_since_start.max())
 
-    def over(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    def addition(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         since = Instants.at_rows(rows).since[0]
         return np.asarray(np.exp(-since / (0.05 * longest)) - 1.5 * np.exp(-since / (0.35 * longest)))
 
@@ -170,8 +174,8 @@ def _two_settlings(true: TrueSystem) -> Form:
         true,
         "two_settlings",
         "y + a (exp(-t / tau) - 1.5 exp(-t / (7 tau)))",
-        over,
-        ("time", "run", str(true.rows.time)),
+        addition,
+        ("time", "run", str(true.table.time)),
     )
 
 

@@ -12,7 +12,7 @@ from probewise.world.systems.forms import modulations
 from probewise.world.systems.forms.form import Form, Instants, Numbers
 from probewise.world.systems.forms.modulations import Modulation
 from probewise.world.systems.forms.true_system import TrueSystem
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 GAIN, OFFSET, _BEND, _LAG, _CEILING = range(5)
 _N_WAVES = 240
@@ -28,8 +28,8 @@ def forms_of_readings(true: TrueSystem) -> Iterator[Form]:
 def modulated_reading(true: TrueSystem, name: str, how: Modulation, *, gain: bool = False) -> Form:
     """Return the form by which an offset, or with `gain` a factor 1 + modulation, varies the reading."""
 
-    def act(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
-        change = how.over(Instants.at_rows(rows), v)
+    def act(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
+        change = how.value_at(Instants.at_rows(rows), v)
         return np.asarray(y * (1 + change) if gain else y + change)
 
     typical = float(np.sqrt(np.mean(true.readings**2))) if gain else 1.0
@@ -52,11 +52,11 @@ def modulated_reading(true: TrueSystem, name: str, how: Modulation, *, gain: boo
 
 
 def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
-    timed = true.rows.time is not None
+    timed = true.table.time is not None
     both = {"step": modulations.step(true)}
     if timed:
         both["drift"] = modulations.along_time(true)
-    if true.kind.run is not None and len(true.rows.rows_by_run) > 1:
+    if true.kind.run is not None and len(true.table.rows_by_run) > 1:
         both["per_run"] = modulations.by_run(true)
     for kind, how in both.items():
         yield modulated_reading(true, f"offset_{kind}", how)
@@ -68,7 +68,7 @@ def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
         yield modulated_reading(true, "settling", modulations.settling(true))
 
 
-def direction_of_change(y: FloatArray, rows: SystemRows) -> FloatArray:
+def direction_of_change(y: FloatArray, rows: SystemTable) -> FloatArray:
     """Return the sign of change of readings (n_samples, n_points); rests keep the last sign, the first row the next."""
     out = np.zeros_like(y)
     for own in rows.rows_by_run:
@@ -99,7 +99,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         order=OFFSET,
     )
 
-    def bend(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+    def bend(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
         z = (y - low) / (high - low)
         return np.asarray(y + v["a"] * (high - low) * (np.sign(z) * np.abs(z) ** v["power"] - z))
 
@@ -141,7 +141,7 @@ def _nonlinear_forms(true: TrueSystem) -> Iterator[Form]:
         )
 
 
-def _make_clip(upper: bool) -> Callable[[FloatArray, SystemRows, Numbers], FloatArray]:
+def _make_clip(upper: bool) -> Callable[[FloatArray, SystemTable, Numbers], FloatArray]:
     """Return the `Form.act` that clips readings at the parameter "level", from above or below."""
     bound = np.minimum if upper else np.maximum
     return lambda y, rows, v: np.asarray(bound(y, v["level"]))
@@ -152,7 +152,7 @@ def _make_clip_level(end: float, sign: float) -> Callable[[float, dict[str, floa
     return lambda a, drawn: {"level": end + sign * a}
 
 
-def delayed(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray:
+def delayed(values: FloatArray, rows: SystemTable, tau: FloatArray) -> FloatArray:
     """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs: interpolated, constant before the first."""
     n = max(len(values), len(tau))
     values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
@@ -164,7 +164,7 @@ def delayed(values: FloatArray, rows: SystemRows, tau: FloatArray) -> FloatArray
     return out
 
 
-def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
+def _lagged(y: FloatArray, rows: SystemTable, v: Numbers) -> FloatArray:
     tau = np.maximum(np.broadcast_to(v["tau_s"], (max(len(y), len(v["tau_s"])), 1)), 1e-12)
     out = np.array(np.broadcast_to(y, (len(tau), y.shape[1])))
     for own in rows.rows_by_run:
@@ -175,9 +175,9 @@ def _lagged(y: FloatArray, rows: SystemRows, v: Numbers) -> FloatArray:
 
 
 def _lag_and_delay_forms(true: TrueSystem) -> Iterator[Form]:
-    if true.rows.time is None:
+    if true.table.time is None:
         return
-    gap = true.rows.median_gap
+    gap = true.table.median_gap
     acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: delayed(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
     for name, (act, least) in acts.items():
         yield Form(

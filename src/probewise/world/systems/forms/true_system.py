@@ -11,7 +11,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import NotConvergedError
 from probewise.world.systems.kind import SystemKind
-from probewise.world.systems.rows import SystemRows
+from probewise.world.systems.table import SystemTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,8 +20,8 @@ class TrueSystem:
 
     Parameters
     ----------
-    kind, rows
-        The system, and the rows given to the diagnosis.
+    kind, table
+        The system, and the table of the rows given to the diagnosis.
     parameters
         True parameters, (1, 1) or (1, n_points).
     readings, states
@@ -29,7 +29,7 @@ class TrueSystem:
     """
 
     kind: SystemKind
-    rows: SystemRows
+    table: SystemTable
     parameters: Mapping[str, FloatArray]
     readings: FloatArray
     states: Mapping[str, FloatArray]
@@ -42,28 +42,28 @@ class TrueSystem:
     @property
     def varying_columns(self) -> tuple[str, ...]:
         """Columns that vary, except time."""
-        return tuple(name for name, v in self.rows.columns.items() if name != self.rows.time and np.ptp(v) > 0)
+        return tuple(name for name, v in self.table.columns.items() if name != self.table.time and np.ptp(v) > 0)
 
     def mean_of(self, column: str) -> float:
         """Return the mean of a column."""
-        return float(self.rows.columns[column].mean())
+        return float(self.table.columns[column].mean())
 
     def sd_of(self, column: str) -> float:
         """Return the sd of a column."""
-        return float(self.rows.columns[column].std())
+        return float(self.table.columns[column].std())
 
     def rms_rate(self, state: str) -> float:
         """Return the root-mean-square rate of a state, from its values at the rows."""
         found = []
-        for own in self.rows.rows_by_run:
-            gaps = np.diff(self.rows.t[own])
+        for own in self.table.rows_by_run:
+            gaps = np.diff(self.table.t[own])
             found.append(np.diff(self.states[state][own])[gaps > 0] / gaps[gaps > 0])
         return float(np.sqrt(np.mean(np.concatenate(found) ** 2)))
 
     def random_time(self, rng: np.random.Generator) -> float:
         """Draw a time, or a row, well inside the recording."""
-        at = float(np.quantile(self.rows.t, rng.uniform(0.2, 0.8)))
-        return math.floor(at) + 0.5 if self.rows.time is None else at
+        at = float(np.quantile(self.table.t, rng.uniform(0.2, 0.8)))
+        return math.floor(at) + 0.5 if self.table.time is None else at
 
 
 def draw_log_uniform(rng: np.random.Generator, low: float, high: float) -> float:

@@ -1,4 +1,4 @@
-"""The rows of a recording of a system: columns, time and runs, as recorded."""
+"""The table of a recording of a system: columns, time and runs, as recorded."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, eq=False)
-class SystemRows:
+class SystemTable:
     """Rows in order of time; every array is (n_points,).
 
     Parameters
@@ -64,6 +64,6 @@ class SystemRows:
         """Time from the first row to the last."""
         return float(np.ptp(self.t))
 
-    def take(self, kept: FloatArray | IntArray) -> SystemRows:
+    def take(self, kept: FloatArray | IntArray) -> SystemTable:
         """Keep these rows; runs keep their numbers."""
         return replace(self, columns={name: values[kept] for name, values in self.columns.items()}, run=self.run[kept])

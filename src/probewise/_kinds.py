@@ -28,29 +28,29 @@ def require_rng(rng: object) -> None:
     raise ParameterError("rng", rng, f"a NumPy random generator: np.random.default_rng({seed})")
 
 
-def require_number(name: str, value: object, allowed: str = "a number") -> float:
+def checked_number(name: str, value: object, allowed: str = "a number") -> float:
     """Return a real number as a float; raise ParameterError for a text, a list, None, an array of several."""
     if isinstance(value, Real) or (isinstance(value, np.ndarray) and value.ndim == 0 and value.dtype.kind in "iuf"):
         return float(value)
     raise ParameterError(name, value, allowed)
 
 
-def require_finite_number(name: str, value: object, allowed: str = "a finite number") -> float:
+def checked_finite_number(name: str, value: object, allowed: str = "a finite number") -> float:
     """Return a finite real number as a float, or raise ParameterError."""
-    number = require_number(name, value, allowed)
+    number = checked_number(name, value, allowed)
     if not math.isfinite(number):
         raise ParameterError(name, value, allowed)
     return number
 
 
-def require_whole(name: str, value: object, *, least: int | None = 1) -> int:
+def checked_whole(name: str, value: object, *, least: int | None = 1) -> int:
     """Return a whole number, of at least `least` where that is given, as an int, or raise ParameterError."""
     if isinstance(value, Integral) and not isinstance(value, bool) and (least is None or int(value) >= least):
         return int(value)
     raise ParameterError(name, value, "a whole number" + ("" if least is None else f", {least} or more"))
 
 
-def require_pair(name: str, value: object, allowed: str = "two finite numbers (x, y)") -> tuple[float, float]:
+def checked_pair(name: str, value: object, allowed: str = "two finite numbers (x, y)") -> tuple[float, float]:
     """Return two finite numbers as a tuple of floats, or raise ParameterError."""
     if isinstance(value, Sequence | np.ndarray) and not isinstance(value, str | bytes) and len(value) == 2:
         first, second = value
@@ -59,7 +59,7 @@ def require_pair(name: str, value: object, allowed: str = "two finite numbers (x
     raise ParameterError(name, value, allowed)
 
 
-def require_one_or_several_numbers(name: str, value: object) -> tuple[float, ...]:
+def checked_one_or_several_numbers(name: str, value: object) -> tuple[float, ...]:
     """Return a number, or each of a list of finite numbers, as a tuple; raise ParameterError for a text or None."""
     if isinstance(value, Real):
         value = (value,)
@@ -98,7 +98,7 @@ def require_flag(name: str, value: object) -> None:
     require_kind(name, value, (bool, np.bool_), "True or False")
 
 
-def require_path(name: str, value: object, allowed: str = "the name of a file: a text or a Path") -> Path:
+def checked_path(name: str, value: object, allowed: str = "the name of a file: a text or a Path") -> Path:
     """Return a file name as a Path, or raise ParameterError."""
     if isinstance(value, os.PathLike) or (isinstance(value, str) and value):
         named = os.fspath(value)
@@ -158,20 +158,20 @@ def require_progress(value: object, allowed: str = "a function") -> None:
     require_accepts_named("progress", value, ("stage", "done", "total", "note"), allowed)
 
 
-def require_text(name: str, value: object, allowed: str = "a text") -> str:
+def checked_text(name: str, value: object, allowed: str = "a text") -> str:
     """Return a text that is not empty, or raise ParameterError."""
     if isinstance(value, str) and value:
         return str(value)
     raise ParameterError(name, value, allowed)
 
 
-def require_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
+def checked_texts(name: str, value: object, allowed: str) -> tuple[str, ...]:
     """Return several texts as a tuple; raise ParameterError for a single text, whose letters it would be."""
     if isinstance(value, str) or not isinstance(value, Sequence | set | frozenset | np.ndarray | Mapping):
         raise ParameterError(
             name, value, f"{allowed}, in a list" + (f": [{value!r}]" if isinstance(value, str) else "")
         )
-    return tuple(require_text(name, each, allowed) for each in value)
+    return tuple(checked_text(name, each, allowed) for each in value)
 
 
 def require_mapping(name: str, value: object, allowed: str) -> None:
@@ -179,4 +179,4 @@ def require_mapping(name: str, value: object, allowed: str) -> None:
     require_kind(name, value, Mapping, allowed)
     assert isinstance(value, Mapping)
     for each in value:
-        require_text(f"a name in {name}", each)
+        checked_text(f"a name in {name}", each)

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from probewise._arrays import FloatArray, floats
-from probewise._kinds import require_kind, require_like, require_number
+from probewise._kinds import checked_number, require_kind, require_like
 from probewise.errors import ParameterError, ShapeError
 
 __all__ = [
@@ -98,7 +98,7 @@ class Uniform:
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise ParameterError("Uniform(low, high)", (self.low, self.high), "finite, low < high")
 
@@ -128,7 +128,7 @@ class LogUniform:
 
     def __post_init__(self) -> None:
         for name in ("low", "high"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         if not (0 < self.low < self.high < math.inf):
             raise ParameterError("LogUniform(low, high)", (self.low, self.high), "0 < low < high, finite")
 
@@ -160,7 +160,7 @@ class Normal:
 
     def __post_init__(self) -> None:
         for name in ("mean", "sd"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         if not (math.isfinite(self.mean) and 0 < self.sd < math.inf):
             raise ParameterError("Normal(mean, sd)", (self.mean, self.sd), "finite, sd > 0")
 
@@ -190,7 +190,7 @@ class LogNormal:
 
     def __post_init__(self) -> None:
         for name in ("median", "log_sd"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         if not (0 < self.median < math.inf and 0 < self.log_sd < math.inf):
             raise ParameterError("LogNormal(median, log_sd)", (self.median, self.log_sd), "greater than 0, finite")
 

@@ -292,13 +292,13 @@ def explore(
     """
     from probewise import experiment as posing
     from probewise._kinds import (
+        checked_number,
+        checked_one_or_several_numbers,
+        checked_path,
+        checked_whole,
         require_flag,
         require_kind,
-        require_number,
-        require_one_or_several_numbers,
-        require_path,
         require_rng,
-        require_whole,
     )
     from probewise._progress import progress_or_bar
     from probewise.arm import LegoArm, instrument_of
@@ -324,16 +324,16 @@ def explore(
         naive=naive,
         utility=utility,
         learn_sensor=learn_sensor,
-        batch=require_whole("batch", batch),
-        orientations_rad=require_one_or_several_numbers("orientations_rad", orientations_rad),
-        heights_mm=require_one_or_several_numbers("heights_mm", heights_mm),
-        repeats=tuple(require_whole("repeats", n) for n in require_one_or_several_numbers("repeats", repeats)),
-        trust=None if trust is None else require_number("trust", trust, "a number greater than 0, up to 1"),
+        batch=checked_whole("batch", batch),
+        orientations_rad=checked_one_or_several_numbers("orientations_rad", orientations_rad),
+        heights_mm=checked_one_or_several_numbers("heights_mm", heights_mm),
+        repeats=tuple(checked_whole("repeats", n) for n in checked_one_or_several_numbers("repeats", repeats)),
+        trust=None if trust is None else checked_number("trust", trust, "a number greater than 0, up to 1"),
         cards=tuple(cards),
     )
     if isinstance(arm, LegoArm) and arm.geometry.accuracy is not None:
         asked = replace(asked, fitted_arm=posing.FittedArm.from_geometry_and_sensor(arm.geometry, sensor))
-    path = None if journal is None else require_path("journal", journal)
+    path = None if journal is None else checked_path("journal", journal)
     before = posing.read_journal(path) if path is not None and path.exists() else None
     about = {**posing.sensor_entry(sensor), "arm": "simulated" if arm is None else type(arm).__name__}
     taken = () if before is None else before.readings

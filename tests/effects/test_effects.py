@@ -43,7 +43,7 @@ from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, Poses, ReadingNoise, Stage
+from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseParameters, Poses, Stage
 
 PLAN = with_jittered_times(two_way_plan(), rng=np.random.default_rng(0))
 EXTENT = Extent(10.0, 60.0, PLAN)
@@ -413,7 +413,7 @@ def test_nonlinearity_keeps_black_and_white():
 
 
 def test_correlated_noise_sets_the_memory_and_not_the_sd():
-    level = ReadingNoise(sd=np.full((1, 1), 0.6), rho=np.zeros((1, 1)))
+    level = NoiseParameters(sd=np.full((1, 1), 0.6), rho=np.zeros((1, 1)))
     out = CorrelatedNoise().apply(level, np.array([[0.3]]), there_and_back())
     assert out.rho[0, 0] == 0.3
     assert out.sd[0, 0] == 0.6

@@ -22,7 +22,7 @@ from probewise.effects import (
 )
 from probewise.recordings import paper_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, ReadingNoise
+from probewise.sensor import Chain, FixedLevels, FixedMixture, NoiseParameters
 
 SD = 0.6
 N = 408
@@ -39,9 +39,9 @@ NOISES = {
 }
 
 
-def level_of(name: str) -> ReadingNoise:
+def level_of(name: str) -> NoiseParameters:
     effect, values = NOISES[name]
-    return CHAIN.with_effects(effect).noise_of_readings(np.array([values]), PLAN, np.full((1, 1), SD))
+    return CHAIN.with_effects(effect).noise_parameters(np.array([values]), PLAN, np.full((1, 1), SD))
 
 
 @pytest.mark.parametrize("name", NOISES)
@@ -92,7 +92,7 @@ def test_noise_that_grows_with_the_light_does_so():
 
 def test_memory_stays_within_a_scan():
     scan = np.repeat([0, 1], 2)
-    level = ReadingNoise(np.ones((1, 1)), np.full((1, 1), 0.8))
+    level = NoiseParameters(np.ones((1, 1)), np.full((1, 1), 0.8))
     drawn = draw_readings(level, np.zeros((50_000, 4)), scan, rng=np.random.default_rng(0))
     found = np.corrcoef(drawn.T)
     wanted = np.array([[1, 0.8, 0, 0], [0.8, 1, 0, 0], [0, 0, 1, 0.8], [0, 0, 0.8, 1]])

@@ -25,7 +25,7 @@ from probewise.sensor import (
     FreeLevels,
     FreeMixture,
     NaiveSensor,
-    ReadingNoise,
+    NoiseParameters,
     SceneView,
     Stage,
     footprint_of,
@@ -249,7 +249,7 @@ CURVE = Doer("curve", Stage.RESPONSE, lambda u, t: u**t)
 GAIN = Doer("gain", Stage.GAIN, lambda signal, t: signal * (1 + t))
 OFFSET = Doer("offset", Stage.OFFSET, lambda reading, t: reading + t)
 CLIP = Doer("clip", Stage.SATURATION, lambda reading, t: np.minimum(reading, t))
-LOUD = Doer("loud", Stage.NOISE, lambda noise, t: ReadingNoise(noise.sd * t, noise.rho))
+LOUD = Doer("loud", Stage.NOISE, lambda noise, t: NoiseParameters(noise.sd * t, noise.rho))
 
 
 def test_effects_stack_in_the_order_of_the_stages_whatever_the_order_given():
@@ -353,7 +353,7 @@ def test_effects_on_the_noise_leave_the_prediction_alone():
     plan, theta = plan_of(), np.concatenate([thetas(3, 1), [[1.0], [2.0], [3.0]]], axis=1)
     chain = base.with_effects(LOUD)
     assert np.array_equal(chain.predict(theta, plan), base.predict(theta[:, :-1], plan))
-    level = chain.noise_of_readings(theta, plan, np.array([[0.5]]))
+    level = chain.noise_parameters(theta, plan, np.array([[0.5]]))
     assert level.sd[:, 0].tolist() == [0.5, 1.0, 1.5]
     assert level.rho.tolist() == [[0.0]]
 

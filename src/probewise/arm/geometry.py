@@ -111,7 +111,7 @@ class Joint:
         return round((angle_rad + side * self.play_rad / 2 - self.home_rad) * self.counts_per_rad)
 
     def angle_at(self, counts: float, side: int = 0) -> float:
-        """Return the joint angle at a motor count; see `counts_at`."""
+        """Return the joint angle (radians) at a motor count; see `counts_at`."""
         return self.home_rad + counts / self.counts_per_rad - side * self.play_rad / 2
 
 

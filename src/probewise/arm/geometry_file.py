@@ -9,7 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise.arm.geometry import JOINTS, Accuracy, Geometry, Joint
 from probewise.arm.uncertainty import FITTED
 from probewise.errors import FileError, ParameterError, shown
@@ -36,7 +36,7 @@ def read_geometry(path: str | Path) -> Geometry:
         If the file is missing or not TOML, a number is missing or not allowed, or a name is unknown; the message gives
         file, entry, content and what is allowed.
     """
-    path = require_path("path", path)
+    path = checked_path("path", path)
     text = read_text(path, "an arm's geometry, TOML in UTF-8")
     try:
         content = tomllib.loads(text)

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import Protocol, Self
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._kinds import require_kind, require_number, warn_of_likely_degrees
+from probewise._kinds import checked_number, require_kind, warn_of_likely_degrees
 
 
 @dataclass(frozen=True)
@@ -22,10 +22,10 @@ class Pose:
 
     def __post_init__(self) -> None:
         for name in ("x_mm", "y_mm", "orientation_rad"):
-            object.__setattr__(self, name, require_number(name, getattr(self, name)))
+            object.__setattr__(self, name, checked_number(name, getattr(self, name)))
         warn_of_likely_degrees("orientation_rad", self.orientation_rad)
         if self.height_mm is not None:
-            object.__setattr__(self, "height_mm", require_number("height_mm", self.height_mm, "a number or None"))
+            object.__setattr__(self, "height_mm", checked_number("height_mm", self.height_mm, "a number or None"))
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class Reading:
 
     def __post_init__(self) -> None:
         order = "in the order Reading(value, pose, time_s)"
-        object.__setattr__(self, "value", require_number("value", self.value, f"a number, {order}"))
+        object.__setattr__(self, "value", checked_number("value", self.value, f"a number, {order}"))
         require_pose(self.pose, order)
-        object.__setattr__(self, "time_s", require_number("time_s", self.time_s, f"a number, {order}"))
+        object.__setattr__(self, "time_s", checked_number("time_s", self.time_s, f"a number, {order}"))
         require_kind("covariates", self.covariates, Mapping, "numbers by name")
 
 

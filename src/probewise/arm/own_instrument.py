@@ -17,7 +17,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._kinds import require_callable, require_finite_number, require_like
+from probewise._kinds import checked_finite_number, require_callable, require_like
 from probewise._signals import defer_signals
 from probewise.arm.basics import Clock
 from probewise.arm.instrument import Instrument, Pose, Reading
@@ -196,7 +196,7 @@ class OwnInstrument:
         time_s = known.pop("time_s", now_s)
         place = {name: known.pop(name, getattr(pose, name)) for name in _OF_THE_POSE}
         for name, number in (("time_s", time_s), *place.items()):
-            require_finite_number(f"{name} of what measure returned", number)
+            checked_finite_number(f"{name} of what measure returned", number)
         value = _checked_value("value of what measure returned", found["value"])
         return Reading(value, Pose(**place, height_mm=pose.height_mm), time_s, known)
 

@@ -10,7 +10,7 @@ from typing import Self, TypeAlias
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, floats
-from probewise._kinds import require_callable, require_like, require_number
+from probewise._kinds import checked_number, require_callable, require_like
 from probewise.arm.instrument import Pose, Reading, require_pose
 from probewise.arm.reach import Reach, Workspace, require_within_reach
 from probewise.arm.scale import ReadingScale
@@ -66,7 +66,7 @@ class SimulatedArm:
         last: Reading | None = None,
     ) -> None:
         require_callable("light", light, "a function light(pose, time_s, height_mm) that returns the reading there")
-        if not require_number("height_mm", height_mm) > 0:
+        if not checked_number("height_mm", height_mm) > 0:
             raise ParameterError("height_mm", height_mm, "greater than 0")
         if reach is not None:
             require_like(
@@ -145,7 +145,7 @@ class SimulatedArm:
             raise ReachError("height_mm", height_mm, "above the surface: finite, greater than 0")
         self._time_s += float(self.travel_s(self._pose, place)[0])
         self._pose = pose
-        value = require_number("what light returned", self._light(pose, self._time_s, height_mm))
+        value = checked_number("what light returned", self._light(pose, self._time_s, height_mm))
         value = value if self._scale is None else self._scale.convert(value)
         return Reading(value=value, pose=pose, time_s=self._time_s, covariates={"height_mm": height_mm})
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
-from probewise._kinds import require_flag, require_rng, require_whole
+from probewise._kinds import checked_whole, require_flag, require_rng
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments, sorted_by_mass
 from probewise.calibration.noise import draw_pooled_sd, noise_by_scan
 from probewise.calibration.order_problems import OrderProblems
@@ -183,7 +183,7 @@ def calibrate(
     require_recording(recording)
     require_described(recording.plan)
     require_rng(rng)
-    require_whole("n_live", n_live)
+    checked_whole("n_live", n_live)
     wanted = _checked_orders(orders)
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
     require_flag("quick", quick)

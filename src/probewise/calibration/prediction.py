@@ -99,6 +99,6 @@ def predict(
     for first in range(0, n_samples, per_block):
         progress("predicting", first, n_samples)
         block = slice(first, first + per_block)
-        noise = chain.noise_of_readings(theta[block], plan, sensor.noise_sd[block, None])
+        noise = chain.noise_parameters(theta[block], plan, sensor.noise_sd[block, None])
         mixture.add(model.predict(theta[block], plan), noise)
     return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)

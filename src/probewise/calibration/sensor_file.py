@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise._kinds import require_kind, require_path
+from probewise._kinds import checked_path, require_kind
 from probewise._posterior_samples import NamedSamples, checked_samples, interval_table, require_masks_of_absent_effects
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
@@ -382,7 +382,7 @@ def write_sensor(sensor: FittedSensor, path: str | os.PathLike[str]) -> None:
         If the file cannot be written.
     """
     require_sensor(sensor)
-    path = require_path("path", path)
+    path = checked_path("path", path)
     write_text_atomically(path, sensor.to_json())
 
 
@@ -394,7 +394,7 @@ def read_sensor(path: str | os.PathLike[str]) -> FittedSensor:
     FileError
         If the file is missing, damaged, or of another format.
     """
-    path = require_path("path", path, "the name of a sensor.json file; a FittedSensor needs no reading")
+    path = checked_path("path", path, "the name of a sensor.json file; a FittedSensor needs no reading")
     return FittedSensor.from_json(read_text(path, _ALLOWED), path)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._kinds import require_one_of, require_rng, require_texts
+from probewise._kinds import checked_texts, require_one_of, require_rng
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.prepared import Prepared
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
@@ -43,7 +43,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     """
     require_recording(recording)
     require_rng(rng)
-    names = require_texts("names", names, "names of effects")
+    names = checked_texts("names", names, "names of effects")
     extent = Extent.of(recording)
     effects: dict[str, NamedEffect[Any]] = {}
     for name in names:

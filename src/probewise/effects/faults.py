@@ -14,7 +14,7 @@ from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import ReadingNoise, Stage
+from probewise.sensor.stages import NoiseParameters, Stage
 
 _FAR = 4.0  # noise sds beyond which a reading may be lost rather than noisy
 
@@ -33,7 +33,7 @@ class Outliers(NoiseEffect):
     def prior(self) -> Product:
         return Product({"share": LogUniform(2e-3, 0.2), "size": LogUniform(2.5, 40.0)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, wide_share=theta[:, :1], wide_times=theta[:, 1:2])
 
     def bank(self) -> FloatArray:
@@ -75,7 +75,7 @@ class Dropouts(NoiseEffect):
     def prior(self) -> Product:
         return Product({"share": LogUniform(2e-3, 0.2), "value": Uniform(self.lowest, self.highest)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, lost_share=theta[:, :1], lost_value=theta[:, 1:2])
 
     def bank(self) -> FloatArray:

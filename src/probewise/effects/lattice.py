@@ -15,7 +15,7 @@ from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import ReadingNoise, Stage
+from probewise.sensor.stages import NoiseParameters, Stage
 
 _TELLING = 15.0  # least ratio of a lattice's step to the rounding of the printed values
 _DIGITS = 1e-6  # of a step: below this a difference is rounding
@@ -49,7 +49,7 @@ class Quantisation(NoiseEffect):
     def prior(self) -> Product:
         return Product({"step": LogUniform(self.smallest, self.largest)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, step=theta[:, :1])
 
     def nodes(self, residuals: FloatArray, rows: FittedReadings) -> FloatArray:

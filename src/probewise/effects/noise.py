@@ -15,7 +15,7 @@ from probewise.effects.noise_distribution import FittedReadings
 from probewise.effects.vocabulary import NoiseEffect, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import ReadingNoise, Stage
+from probewise.sensor.stages import NoiseParameters, Stage
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class CorrelatedNoise(NoiseEffect):
     def prior(self) -> Product:
         return Product({"rho": Uniform(self.lowest, self.highest)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         """Return the noise with this correlation; the sd of a single reading does not change."""
         return replace(value, rho=theta[:, :1])
 
@@ -64,7 +64,7 @@ class SignalDependentNoise(NoiseEffect):
     def prior(self) -> Product:
         return Product({"ratio": LogUniform(self.least, self.most)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         return replace(value, sd=value.sd * np.sqrt(1 + theta[:, :1] * np.clip(value.seen, 0.0, 1.0)))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
@@ -94,7 +94,7 @@ class DriftingNoise(NoiseEffect):
     def prior(self) -> Product:
         return Product({"growth": LogUniform(self.least, self.most)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         elapsed = (plan.time_s - plan.time_s.min()) / (float(np.ptp(plan.time_s)) or 1.0)
         return replace(value, sd=value.sd * theta[:, :1] ** (elapsed - 0.5))
 
@@ -125,7 +125,7 @@ class RandomWalk(NoiseEffect):
         """Prior of the sd of a step in noise sds, log-uniform."""
         return Product({"sd_per_row": LogUniform(self.least, self.most)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         """Return the noise with steps of this sd; the sd of a reading about the walk does not change."""
         return replace(
             value, walk=theta[:, :1], walked=np.asarray(self.n_before + 1.0 + np.arange(len(plan)), dtype=np.float64)
@@ -216,7 +216,7 @@ class NoisePerRun(NoiseEffect):
         widths = 1 / np.sqrt(2 * np.maximum(np.array(self.n_rows or (1,) * len(self.runs)), 1))
         return np.asarray(nodes * np.exp(widths * rng.standard_normal(nodes.shape)))
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         """Return the noise, its sd times the value of each reading's run; 1 for a run that is not listed."""
         known = {name: k for k, name in enumerate(self.runs)}
         at = np.array([known.get(name, len(self.runs)) for name in plan.scan_names])

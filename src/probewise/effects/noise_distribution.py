@@ -9,7 +9,7 @@ import numpy as np
 from probewise._arrays import FloatArray, IntArray
 from probewise._renamed import renamed_arguments
 from probewise.effects.density import log_cell_density, log_gaussian_density
-from probewise.sensor.stages import ReadingNoise
+from probewise.sensor.stages import NoiseParameters
 
 _NARROW = 1e-3  # of the noise sd: the sd of a lost reading about its value
 
@@ -24,7 +24,7 @@ class FittedReadings:
 
 
 @renamed_arguments(level="noise")
-def log_density(noise: ReadingNoise, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+def log_density(noise: NoiseParameters, readings: FloatArray, predicted: FloatArray) -> FloatArray:
     """Return the natural log of the density of each reading alone, (n_samples, n_points), per unit of the reading.
 
     Parameters
@@ -49,14 +49,14 @@ def log_density(noise: ReadingNoise, readings: FloatArray, predicted: FloatArray
 
 
 @renamed_arguments(level="noise")
-def variance(noise: ReadingNoise) -> FloatArray:
+def variance(noise: NoiseParameters) -> FloatArray:
     """Return the variance of a reading that is not lost, with outliers, random walk and rounding; it broadcasts."""
     noise = _with_walk_variance(noise)
     wide = 1 + noise.wide_share * (noise.wide_times**2 - 1)
     return np.asarray(noise.sd**2 * wide + noise.step**2 / 12)
 
 
-def _with_walk_variance(noise: ReadingNoise) -> ReadingNoise:
+def _with_walk_variance(noise: NoiseParameters) -> NoiseParameters:
     """Return the noise with the random walk's marginal variance at each row included in its sd."""
     if not np.any(noise.walk):
         return noise
@@ -74,7 +74,7 @@ def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray,
 
 @renamed_arguments(level="noise")
 def draw_readings(
-    noise: ReadingNoise, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator
+    noise: NoiseParameters, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator
 ) -> FloatArray:
     """Draw readings, (n_samples, n_points): AR(1) noise, outliers, random walk, lost readings, then rounding.
 

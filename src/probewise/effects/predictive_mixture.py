@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._renamed import renamed_arguments
 from probewise.effects.noise_distribution import log_density, variance
-from probewise.sensor.stages import ReadingNoise
+from probewise.sensor.stages import NoiseParameters
 
 
 @dataclass(eq=False)
@@ -39,7 +39,7 @@ class PredictiveMixture:
         self._log_sum = np.full(int(self.scored.sum()), -np.inf)
 
     @renamed_arguments(level="noise")
-    def add(self, mean: FloatArray, noise: ReadingNoise, between: FloatArray | None = None) -> None:
+    def add(self, mean: FloatArray, noise: NoiseParameters, between: FloatArray | None = None) -> None:
         """Add noise-free predictions, (n_samples, n_points), and the noise about them.
 
         `between` (n_points,) is an additional smoothing sd of the density, for samples whose predictions lie farther
@@ -73,7 +73,7 @@ class PredictiveMixture:
         return base + shift, np.sqrt(spread + self._of_noise / n), scores
 
 
-def _noise_of_rows(noise: ReadingNoise, rows: BoolArray) -> ReadingNoise:
+def _noise_of_rows(noise: NoiseParameters, rows: BoolArray) -> NoiseParameters:
     """Return the noise of some rows, given by their mask (n_points,)."""
     if noise.sd.shape[-1] == 1:
         return noise

@@ -15,7 +15,7 @@ from probewise.effects.extent import Extent
 from probewise.effects.noise_distribution import FittedReadings
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
-from probewise.sensor.stages import Effect, ReadingNoise
+from probewise.sensor.stages import Effect, NoiseParameters
 
 V = TypeVar("V")
 
@@ -171,7 +171,7 @@ def require_effect_classes(effects: object) -> None:
 _OWN = ("name", "stage", "units", "covariates", "prior", "apply", "bank", "sentence")
 
 
-class NoiseEffect(NamedEffect[ReadingNoise], Protocol):
+class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
     """An effect on the noise; it changes the mean of the readings only where `changes_the_mean` is True."""
 
     n_nodes: ClassVar[int] = 10

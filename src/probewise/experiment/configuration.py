@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._kinds import require_callable, require_number
+from probewise._kinds import checked_number, require_callable
 from probewise._version import __version__
 from probewise.arm.instrument import Reading
 from probewise.errors import ParameterError
@@ -156,7 +156,7 @@ class Experiment:
         require_shape(self.shape)
         require_model(self.model)
         require_likelihood(self.likelihood)
-        require_number("noise_sd", self.noise_sd)
+        checked_number("noise_sd", self.noise_sd)
         require_callable("utility", self.utility, "a utility of probewise.inquiry, such as InformationGain()")
         self._require_thresholds_in_range()
         self._require_counts()

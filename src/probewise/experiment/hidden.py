@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from probewise._arrays import FloatArray, floats, frozen
-from probewise._kinds import require_finite_number, require_rng
+from probewise._kinds import checked_finite_number, require_rng
 from probewise.errors import ParameterError
 from probewise.experiment.simulation import surface_of_region
 from probewise.priors import Prior
@@ -134,7 +134,7 @@ def _theta_in_prior_order(names: Sequence[str], values: object) -> FloatArray:
         return floats(values, "truth")  # type: ignore[arg-type]
     if set(values) != set(names):
         raise ParameterError("truth", values, f"one number for each of {', '.join(names)}")
-    return np.array([require_finite_number(f"truth[{name!r}]", values[name]) for name in names])
+    return np.array([checked_finite_number(f"truth[{name!r}]", values[name]) for name in names])
 
 
 def _conditional_lows_and_highs(prior: Prior, theta: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -26,7 +26,7 @@ from typing import Any, Self
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, shown
 from probewise.recordings.atomic import write_and_sync, write_text_atomically
@@ -147,7 +147,7 @@ def read_journal(path: str | Path) -> Journal:
     FileError
         If the file is missing, is not a journal of this version, or is damaged before its last line.
     """
-    raw = read_bytes(require_path("path", path), "a journal written by this package")
+    raw = read_bytes(checked_path("path", path), "a journal written by this package")
     *lines, tail = raw.split(b"\n")
     if not lines:
         raise FileError(path, "no whole first line", f'a journal, whose first line says "format": "{FORMAT}"', row=1)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._kinds import require_callable, require_kind, require_path, require_rng, require_whole
+from probewise._kinds import checked_path, checked_whole, require_callable, require_kind, require_rng
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
@@ -272,9 +272,9 @@ def explore(
     require_measures("instrument", instrument)
     require_kind("experiment", experiment, Experiment, "an Experiment, such as experiment_for(...) poses")
     require_rng(rng)
-    require_whole("max_readings", max_readings)
+    checked_whole("max_readings", max_readings)
     seed = _run_seed(rng)
-    path = None if journal is None else require_path("journal", getattr(journal, "path", journal))
+    path = None if journal is None else checked_path("journal", getattr(journal, "path", journal))
     before = journal if isinstance(journal, Journal) else None
     if before is None and path is not None and path.exists():
         before = read_journal(path)

@@ -22,7 +22,7 @@ from probewise.effects import (
 )
 from probewise.effects.density import log_gaussian_density
 from probewise.priors import LogUniform
-from probewise.sensor import ReadingNoise
+from probewise.sensor import NoiseParameters
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
@@ -250,7 +250,7 @@ def _log_density_per_reading(
     """Return the log density of each reading, or log probability of its cell, (n_samples, n_points)."""
     if not step:
         return log_gaussian_density(readings, predicted, sd)
-    noise = ReadingNoise(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
+    noise = NoiseParameters(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
     return np.asarray(log_density(noise, readings, predicted) + math.log(step))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from probewise._arrays import FloatArray, floats
-from probewise._kinds import require_number
+from probewise._kinds import checked_number
 from probewise.effects.density import log_gaussian_density
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
@@ -36,7 +36,7 @@ class Naive:
 
     def __post_init__(self) -> None:
         for name in ("mu_black", "sd_black", "mu_white", "sd_white"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         for name in ("sd_black", "sd_white"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ParameterError(name, getattr(self, name), "greater than 0, finite")

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from probewise._arrays import FloatArray, floats
-from probewise._kinds import require_number
+from probewise._kinds import checked_number
 from probewise.effects.density import log_mass_between
 from probewise.errors import ParameterError
 from probewise.inference._residuals import residuals
@@ -43,7 +43,7 @@ class Rounded:
 
     def __post_init__(self) -> None:
         for name in ("sd", "step", "low", "high"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         for name in ("sd", "step"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ParameterError(name, getattr(self, name), "greater than 0, finite")

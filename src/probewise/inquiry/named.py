@@ -20,6 +20,11 @@ def utility_named(text: str, *, bin_width: float = 1.0) -> Utility:
         The name.
     bin_width
         Width of the bins of "entropy", in the unit of readings: the step of the instrument.
+
+    Raises
+    ------
+    ParameterError
+        If no utility has the name.
     """
     name, _, parameter = text.partition(":")
     if name == "about" and parameter:

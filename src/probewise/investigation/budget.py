@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._kinds import require_number
+from probewise._kinds import checked_number
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 
@@ -24,7 +24,7 @@ class Budget:
 
     def __post_init__(self) -> None:
         for name in ("readings", "minutes"):
-            if not require_number(name, getattr(self, name)) >= 0:
+            if not checked_number(name, getattr(self, name)) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
     def minus(self, plan: Plan, after_s: float) -> Budget:

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from probewise._kinds import require_accepts_positional, require_kind, require_rng, require_whole
+from probewise._kinds import checked_whole, require_accepts_positional, require_kind, require_rng
 from probewise.diagnosis import Diagnosis, SensorPrior, diagnose
 from probewise.effects import VOCABULARY, NamedEffect
 from probewise.investigation.budget import Budget
@@ -34,9 +34,9 @@ def investigate(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Generator[Round, None, None]:
-    """Record and diagnose until a hypothesis has probability 0.95, no reading would help, or the budget is spent.
+    """Record and diagnose until an explanation is settled, no reading would help, or the budget is spent.
 
-    It also ends after `rounds` rounds.
+    It is settled if it has probability 0.95 and the verdict is not `cannot_tell`. All ends after `rounds` rounds.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def investigate(
     require_rng(rng)
     if budget is not None:
         require_kind("budget", budget, Budget, "a Budget(readings=..., minutes=...), or None")
-    require_whole("rounds", rounds)
+    checked_whole("rounds", rounds)
     return _rounds_until_stop(
         record,
         plan,

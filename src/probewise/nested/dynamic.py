@@ -18,7 +18,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise._arrays import IntArray
-from probewise._kinds import require_rng, require_whole
+from probewise._kinds import checked_whole, require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError, ShapeError
 from probewise.nested.checkpoint import BirthRecords, LivePoints
 from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
@@ -85,12 +85,12 @@ def intensified(
     """
     require_rng(rng)
     least = least_live(len(result.names))
-    if require_whole("n_live", n_live, least=None) < least:
+    if checked_whole("n_live", n_live, least=None) < least:
         raise ParameterError("n_live", n_live, f"{least} or more for {len(result.names)} parameters")
     if goal not in ("posterior", "evidence"):
         raise ParameterError("goal", goal, "'posterior' or 'evidence'")
     if max_calls is not None:
-        require_whole("max_calls", max_calls, least=n_live)
+        checked_whole("max_calls", max_calls, least=n_live)
     evaluate = Evaluator(problem)
     _require_complete_run_of(result, evaluate)
     seed_state = generator_state_as_json(rng.bit_generator.state)
@@ -115,7 +115,7 @@ class _Thread:
 
 
 def _require_complete_run_of(result: NestedResult, evaluate: Evaluator) -> None:
-    """Raise unless a run is complete and of this problem: ShapeError for other parameters, else ParameterError."""
+    """Raise unless a run is complete, of this problem, and has parameters: ShapeError for others, or ParameterError."""
     if evaluate.names != result.names:
         raise ShapeError(f"the problem has the parameters {evaluate.names}; allowed: those of the run, {result.names}")
     if not result.names:

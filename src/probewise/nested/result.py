@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from probewise._arrays import IntArray, frozen_int
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise._version import __version__
 from probewise.errors import FileError
 from probewise.nested import conversions
@@ -259,7 +259,7 @@ class NestedResult(DeadPoints):
 
     def save(self, path: str | Path) -> None:
         """Write the result to one .npz file, atomically."""
-        path = require_path("path", path)
+        path = checked_path("path", path)
         head = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
         head["agreement"] = None if self.agreement is None else asdict(self.agreement)
         head["check"] = None if self.check is None else asdict(self.check)
@@ -279,7 +279,7 @@ class NestedResult(DeadPoints):
         FileError
             If the file is damaged, or is not a result in this version of the format.
         """
-        path = require_path("path", path)
+        path = checked_path("path", path)
         try:
             # Opened here, since np.load leaves a damaged file open.
             with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as file:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise._kinds import require_number, require_rng
+from probewise._kinds import checked_number, require_rng
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.nested.check import check_and_repeat
 from probewise.nested.evaluate import Samplable
@@ -112,7 +112,7 @@ def run(
     """
     require_rng(rng)
     posed = as_problem(problem, prior, names, vectorized, pass_dict, periodic)
-    if not require_number("max_cost", max_cost) >= 1:
+    if not checked_number("max_cost", max_cost) >= 1:
         raise ParameterError("max_cost", max_cost, "1 (no check) or more")
     moving: Move = SliceMove() if move is None else move
     once = partial(

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._arrays import FloatArray
-from probewise._kinds import require_finite_number, require_rng, require_whole
+from probewise._kinds import checked_finite_number, checked_whole, require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
 from probewise.nested.function_problem import AnyPrior, as_problem
@@ -138,9 +138,9 @@ def run_slow(
     """
     require_rng(rng)
     posed = as_problem(problem, prior, names, vectorized, pass_dict, ())
-    if not require_finite_number("error", error) > 0:
+    if not checked_finite_number("error", error) > 0:
         raise ParameterError("error", error, "greater than 0")
-    max_calls = require_whole("max_calls", max_calls, least=_LEAST_CALLS)
+    max_calls = checked_whole("max_calls", max_calls, least=_LEAST_CALLS)
     evaluate = Evaluator(posed, executor=executor, n_parts=n_workers or 1)
     report = progress or (lambda n_calls: None)
     n_params = len(evaluate.names)

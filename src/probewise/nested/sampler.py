@@ -15,13 +15,13 @@ import numpy as np
 from scipy.special import logsumexp
 
 from probewise._kinds import (
+    checked_finite_number,
+    checked_path,
+    checked_whole,
     require_callable,
-    require_finite_number,
     require_flag,
     require_like,
-    require_path,
     require_rng,
-    require_whole,
 )
 from probewise.errors import NotConvergedError, ParameterError
 from probewise.nested.checkpoint import (
@@ -139,7 +139,7 @@ def run_once(
         return_interrupted=return_interrupted,
     )
     if n_workers is not None:
-        n_workers = require_whole("n_workers", n_workers)
+        n_workers = checked_whole("n_workers", n_workers)
     evaluate = Evaluator(problem, executor=executor, n_parts=n_workers or os.cpu_count() or 1)
     n_params = len(evaluate.names)
     n_live, n_replaced = _checked_n_live_and_n_replaced(n_live, n_replaced, max_calls, n_params)
@@ -229,13 +229,13 @@ def _checked_n_live_and_n_replaced(
 ) -> tuple[int, int]:
     """Return the number of live points and that of those replaced per round, or raise ParameterError."""
     least = least_live(n_params)
-    n_live = require_whole("n_live", n_live, least=None)
+    n_live = checked_whole("n_live", n_live, least=None)
     if n_live < least:
         raise ParameterError("n_live", n_live, f"{least} or more for {n_params} parameters")
-    n_replaced = n_live // 2 if n_replaced is None else require_whole("n_replaced", n_replaced, least=None)
+    n_replaced = n_live // 2 if n_replaced is None else checked_whole("n_replaced", n_replaced, least=None)
     if not 1 <= n_replaced <= n_live // 2:
         raise ParameterError("n_replaced", n_replaced, f"1 to n_live / 2 = {n_live // 2}")
-    if max_calls is not None and require_whole("max_calls", max_calls, least=None) < n_live:
+    if max_calls is not None and checked_whole("max_calls", max_calls, least=None) < n_live:
         raise ParameterError("max_calls", max_calls, f"n_live = {n_live} or more")
     return n_live, n_replaced
 
@@ -259,8 +259,8 @@ def _require_options(
         allowed = "a function called with a RoundSummary after every round, or None; a run shows no bar by itself"
         require_callable("progress", progress, allowed)
     if checkpoint is not None:
-        require_path("checkpoint", checkpoint)
-    if not require_finite_number("checkpoint_every_s", checkpoint_every_s) >= 0:
+        checked_path("checkpoint", checkpoint)
+    if not checked_finite_number("checkpoint_every_s", checkpoint_every_s) >= 0:
         raise ParameterError("checkpoint_every_s", checkpoint_every_s, "0 or more")
     if executor is not None:
         allowed = (

@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
-from probewise._kinds import require_number, require_rng, require_whole
+from probewise._kinds import checked_number, checked_whole, require_rng
 from probewise.errors import ParameterError
 from probewise.nested.weights import resampled_rows, weighted_quantiles
 
@@ -32,7 +32,7 @@ class WeightedSamples(ShowsItself):
     def draw_rows(self, n: int, *, rng: np.random.Generator) -> IntArray:
         """Draw the row numbers of `n` equally weighted samples, (n,), in random order; see `samples`."""
         require_rng(rng)
-        n = require_whole("n", n)
+        n = checked_whole("n", n)
         return np.asarray(rng.permutation(resampled_rows(self.weight, n, rng)))
 
     rows = draw_rows  # its earlier name
@@ -62,6 +62,6 @@ class WeightedSamples(ShowsItself):
         """Central interval of each parameter that holds `mass`, (2, n_params): lower, upper."""
         share = "greater than 0, less than 1"
         columns = ", ".join(f"{name} {k}" for k, name in enumerate(self.names))
-        if not 0 < require_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
+        if not 0 < checked_number("mass", mass, f"a number {share}; columns of the result are {columns}") < 1:
             raise ParameterError("mass", mass, share)
         return self.quantiles([0.5 - mass / 2, 0.5 + mass / 2])

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
@@ -90,7 +90,7 @@ def write_recording(recording: Recording, path: PathLike) -> None:
     inst = recording.plan.instrumentation
     largest = math.inf if inst.min is not None and inst.max is not None else LARGEST
     readings = _number_cells("readings", recording.readings, largest)
-    _write_with_json(recording.plan, require_path("path", path), plan_columns(recording.plan) | {"reading": readings})
+    _write_with_json(recording.plan, checked_path("path", path), plan_columns(recording.plan) | {"reading": readings})
 
 
 def write_plan(plan: Plan, path: PathLike) -> None:
@@ -104,7 +104,7 @@ def write_plan(plan: Plan, path: PathLike) -> None:
         If the files cannot be written.
     """
     require_plan(plan)
-    _write_with_json(plan, require_path("path", path), plan_columns(plan))
+    _write_with_json(plan, checked_path("path", path), plan_columns(plan))
 
 
 def plan_columns(plan: Plan) -> dict[str, Sequence[str]]:
@@ -139,7 +139,7 @@ def _checked_csv_path(path: object) -> Path:
     allowed = (
         "the name of a CSV file; a table or arrays in memory: Recording.from_table(...), Recording.from_arrays(...)"
     )
-    return require_path("path", path, allowed)
+    return checked_path("path", path, allowed)
 
 
 def _degree_cells(angles_rad: FloatArray) -> list[str]:

@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray, floats
-from probewise._kinds import require_finite_number, require_pair
+from probewise._kinds import checked_finite_number, checked_pair
 from probewise.errors import ParameterError
 
 
@@ -25,9 +25,9 @@ class _CheckedPattern:
         for field in dataclasses.fields(self):  # type: ignore[arg-type]  # every pattern is a dataclass
             value: object = getattr(self, field.name)
             if field.type == "float":
-                value = require_finite_number(field.name, value)
+                value = checked_finite_number(field.name, value)
             elif field.type == "tuple[float, float]":
-                value = require_pair(field.name, value)
+                value = checked_pair(field.name, value)
             object.__setattr__(self, field.name, value)
 
     def _require_positive(self, name: str) -> None:
@@ -67,7 +67,7 @@ class Quadrant(_CheckedPattern):
     def __post_init__(self) -> None:
         super().__post_init__()
         allowed = "(1, 1), (1, -1), (-1, 1) or (-1, -1)"
-        dx, dy = require_pair("direction", self.direction, allowed)
+        dx, dy = checked_pair("direction", self.direction, allowed)
         if not abs(dx) == abs(dy) == 1:
             raise ParameterError("direction", self.direction, allowed)
         object.__setattr__(self, "direction", (int(dx), int(dy)))
@@ -101,7 +101,7 @@ class Polygon(_CheckedPattern):
         vertices: object = self.vertices_mm
         if not isinstance(vertices, Sequence | np.ndarray) or isinstance(vertices, str) or len(vertices) < 3:
             raise ParameterError("vertices_mm", vertices, allowed)
-        pairs = tuple(require_pair(f"vertices_mm[{k}]", corner) for k, corner in enumerate(vertices))
+        pairs = tuple(checked_pair(f"vertices_mm[{k}]", corner) for k, corner in enumerate(vertices))
         object.__setattr__(self, "vertices_mm", pairs)
 
 

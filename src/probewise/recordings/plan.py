@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen, frozen_int, require_finite
 from probewise._display import ShowsItself
-from probewise._kinds import require_finite_number, require_kind, warn_of_likely_degrees
+from probewise._kinds import checked_finite_number, require_kind, warn_of_likely_degrees
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.columns import (
     TableLike,
@@ -50,7 +50,7 @@ class Instrumentation:
             require_kind(name, getattr(self, name), str, "a text")
         for name in ("min", "max", "step", "height_mm"):
             if getattr(self, name) is not None:
-                object.__setattr__(self, name, require_finite_number(name, getattr(self, name), "a number or None"))
+                object.__setattr__(self, name, checked_finite_number(name, getattr(self, name), "a number or None"))
         if self.min is not None and self.max is not None and self.min >= self.max:
             raise ParameterError("max", self.max, f"greater than min, {self.min:g}")
         for name in ("step", "height_mm"):

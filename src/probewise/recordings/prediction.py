@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise._display import ShowsItself
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings.atomic import write_text_atomically
 from probewise.recordings.files import plan_columns
@@ -96,7 +96,7 @@ def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArra
     FileError
         If the file is missing, or a cell is not a valid number.
     """
-    table = read_table(require_path("path", path))
+    table = read_table(checked_path("path", path))
     table.require_columns("mean", "sd", "log_density")
     mean, sd = table.numbers("mean"), table.numbers("sd")
     if np.any(sd <= 0):

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise.errors import FileError, shortened
 from probewise.recordings.text import read_text
 
@@ -34,7 +34,7 @@ def run_python_file(path: str | os.PathLike[str], what: str) -> Mapping[str, Any
     FileError
         If it cannot be read or run; the error names the line if there is one.
     """
-    path = require_path("path", path, what)
+    path = checked_path("path", path, what)
     return run_python_text(read_text(path, what), path)
 
 

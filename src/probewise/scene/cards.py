@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise._kinds import require_number
+from probewise._kinds import checked_number
 from probewise.errors import ParameterError
 from probewise.scene.albedo import Region
 from probewise.scene.regions import PolygonRegion, edge_distance, outlines
@@ -29,7 +29,7 @@ class Card:
 
     def __post_init__(self) -> None:
         for name in ("x_mm", "y_mm", "width_mm", "height_mm", "albedo"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         if not (math.isfinite(self.x_mm) and math.isfinite(self.y_mm)):
             raise ParameterError("(x_mm, y_mm) of a card", (self.x_mm, self.y_mm), "finite: its centre")
         for name in ("width_mm", "height_mm"):

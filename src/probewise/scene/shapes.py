@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._kinds import require_kind, require_number, require_pair, require_whole
+from probewise._kinds import checked_number, checked_pair, checked_whole, require_kind
 from probewise.errors import ParameterError
 from probewise.priors import Prior, Product, Uniform, checked_columns
 from probewise.scene.albedo import Region, Shape, require_shape
@@ -31,7 +31,7 @@ class Field:
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "height_mm"):
-            value = require_number(name, getattr(self, name))
+            value = checked_number(name, getattr(self, name))
             if not 0 < value < math.inf:
                 raise ParameterError(name, value, "greater than 0, finite")
 
@@ -85,7 +85,7 @@ class PlacedPrior:
 def _require_bounds_fit_field(shape: str, name: str, bounds: Bounds, field: Field, *, reach: float | None) -> None:
     """Raise ParameterError unless 0 < low < high and, with `reach`, a half width of `reach` x high fits the field."""
     require_kind("field", field, Field, "a Field: Field(width_mm, height_mm)")
-    low, high = require_pair(name, bounds, "(low, high): its prior is even between them")
+    low, high = checked_pair(name, bounds, "(low, high): its prior is even between them")
     if not 0 < low < high < math.inf:
         raise ParameterError(name, bounds, "0 < low < high, finite")
     if reach is not None and 2 * (reach_mm := reach * high) >= min(field.width_mm, field.height_mm):
@@ -236,7 +236,7 @@ class RegularPolygon:
     inside: bool = False
 
     def __post_init__(self) -> None:
-        require_whole("n_sides", self.n_sides, least=3)
+        checked_whole("n_sides", self.n_sides, least=3)
         reach = 1.0 if self.inside else None
         _require_bounds_fit_field("RegularPolygon", "radius_mm", self.radius_mm, self.field, reach=reach)
 

@@ -27,8 +27,8 @@ from probewise.sensor.stages import (
     AnyEffect,
     Effect,
     Footprint,
+    NoiseParameters,
     Poses,
-    ReadingNoise,
     SceneView,
     SensorModel,
     Stage,
@@ -52,8 +52,8 @@ __all__ = [
     "FreeMixture",
     "Levels",
     "NaiveSensor",
+    "NoiseParameters",
     "Poses",
-    "ReadingNoise",
     "SSFField",
     "SSFModel",
     "SceneView",
@@ -90,8 +90,8 @@ free_form = free_form_parameters
 FieldSSF = DiscreteSSF
 """The old name of `DiscreteSSF`."""
 
-NoiseLevel = ReadingNoise
-"""The old name of `ReadingNoise`."""
+NoiseLevel = NoiseParameters
+"""The old name of `NoiseParameters`."""
 
 mean_mixture = merged_mean_mixture
 """The old name of `merged_mean_mixture`."""

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise._kinds import require_like, require_number
+from probewise._kinds import checked_number, require_like
 from probewise.errors import ParameterError
 from probewise.recordings.columns import how_to_describe_pattern
 from probewise.recordings.plan import Plan
@@ -28,8 +28,8 @@ from probewise.sensor.ssf import DiscreteSSF, FreeMixture, SSFModel
 from probewise.sensor.stages import (
     AnyEffect,
     Footprint,
+    NoiseParameters,
     Poses,
-    ReadingNoise,
     SceneView,
     Stage,
     View,
@@ -81,7 +81,7 @@ class FixedLevels:
 
     def __post_init__(self) -> None:
         for name in ("i_min", "i_max"):
-            require_number(name, getattr(self, name))
+            checked_number(name, getattr(self, name))
         if not (np.isfinite(self.i_min) and np.isfinite(self.i_max)):
             raise ParameterError("FixedLevels(i_min, i_max)", (self.i_min, self.i_max), "finite numbers")
 
@@ -282,17 +282,17 @@ class Chain:
         """Layout of the last plan, by that plan, where no parameter changes it; otherwise empty."""
         return {}
 
-    def noise_of_readings(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> ReadingNoise:
+    def noise_parameters(self, theta: FloatArray, plan: Plan, sd: FloatArray) -> NoiseParameters:
         """Return the noise of each reading: `sd`, broadcasting to (n_samples, n_points), and the effects on it."""
         require_columns(theta, self.names)
-        start = ReadingNoise(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
+        start = NoiseParameters(np.asarray(sd, dtype=np.float64), np.zeros((1, 1)))
         if not any(effect.stage == Stage.NOISE for effect in self.effects):
             return start
         start = replace(start, seen=self.white_fraction(theta, plan))
-        noise: ReadingNoise = self._stage_applier(theta, plan)(Stage.NOISE, start)
+        noise: NoiseParameters = self._stage_applier(theta, plan)(Stage.NOISE, start)
         return noise
 
-    noise_level = noise_of_readings  # its earlier name
+    noise_level = noise_parameters  # its earlier name
 
     def _stage_applier(self, theta: FloatArray, plan: Plan) -> Callable[[Stage, Any], Any]:
         """Return a function that applies the effects of one stage to that stage's value."""

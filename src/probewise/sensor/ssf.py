@@ -11,7 +11,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, frozen, require_finite
 from probewise._display import ShowsItself
-from probewise._kinds import require_whole
+from probewise._kinds import checked_whole
 from probewise.errors import ParameterError, ShapeError
 from probewise.sensor.stages import Footprint
 
@@ -88,7 +88,7 @@ class FreeMixture:
     n_gaussians: int
 
     def __post_init__(self) -> None:
-        require_whole("n_gaussians", self.n_gaussians)
+        checked_whole("n_gaussians", self.n_gaussians)
 
     @cached_property
     def names(self) -> tuple[str, ...]:

@@ -99,7 +99,7 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class ReadingNoise:
+class NoiseParameters:
     """Noise of the readings: `sd` broadcasts to (n_samples, n_points); unless stated, the rest are (n_samples, 1).
 
     `rho` is the AR(1) correlation within a scan. A random walk of the offset has steps of `walk` sds from row to row
@@ -128,7 +128,7 @@ class Effect(Protocol[V]):
 
     `apply` takes and returns that stage's value: Poses, SceneView, Footprint, View (SEEN), an
     array (n_samples, n_points) of seen fraction u (RESPONSE), signal (GAIN), reading (OFFSET,
-    LAG, SATURATION), or ReadingNoise (NOISE).
+    LAG, SATURATION), or NoiseParameters (NOISE).
     """
 
     @property

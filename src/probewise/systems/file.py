@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError
 from probewise.recordings.python_file import error_on_one_line, run_python_text
 from probewise.recordings.text import read_text
@@ -44,7 +44,7 @@ def read_simulator(path: str | os.PathLike[str]) -> Simulator:
     FileError
         If it cannot be read or run, or is inconsistent; the message names the line, if there is one.
     """
-    path = require_path("path", path, "the name of a Python file that describes a simulator")
+    path = checked_path("path", path, "the name of a Python file that describes a simulator")
     text = read_text(path, "a Python file that describes a simulator")
     said = run_python_text(text, path)
     try:

@@ -20,7 +20,7 @@ from probewise.recordings import Instrumentation, write_text_atomically
 from probewise.recordings.plan import Plan
 from probewise.recordings.prediction import prediction_summary
 from probewise.recordings.table import csv_text, number_text
-from probewise.sensor import ReadingNoise, Stage
+from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
@@ -152,7 +152,7 @@ def predict_system(
         n_failed += int((~there).sum())
         if there.any():
             sd = fitted.noise_sd[first : first + per_block][there, None]
-            mixture.add(mean[there], _noise_of_readings(fitted, chain, block[there], mean[there], sd, own), between)
+            mixture.add(mean[there], _noise_parameters(fitted, chain, block[there], mean[there], sd, own), between)
     if n_failed == n_samples:
         raise ParameterError(
             "simulate" if system.caller else "rates",
@@ -280,9 +280,9 @@ def draw_for_new_run(known: FloatArray, *, rng: np.random.Generator) -> FloatArr
     return np.asarray(known.mean(axis=1) + spread * np.sqrt(1 + 1 / n_runs) * rng.standard_t(n_runs + 1, len(known)))
 
 
-def _noise_of_readings(
+def _noise_parameters(
     fitted: FittedSystem, chain: SystemChain, theta: FloatArray, mean: FloatArray, sd: FloatArray, table: RunTable
-) -> ReadingNoise:
+) -> NoiseParameters:
     """Return the noise of each reading: its sd with the noise effects applied."""
     low, high = fitted.level
     seen = np.clip((mean - low) / ((high - low) or 1.0), 0.0, 1.0)
@@ -291,7 +291,7 @@ def _noise_of_readings(
         values = fitted.known.table.covariates[declared]
         typical = float(np.median(values[np.isfinite(values) & (values > 0)]))
         sd = sd * relative_sds_of_column(table, declared, typical)
-    noise = ReadingNoise(sd, np.zeros((1, 1)), seen=seen)
+    noise = NoiseParameters(sd, np.zeros((1, 1)), seen=seen)
     for effect, columns in effects_with_columns(chain.effects, chain.system.n_params):
         if effect.stage is Stage.NOISE:
             noise = effect.apply(noise, theta[:, columns], cast(Any, table))

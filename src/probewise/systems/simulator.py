@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import FloatArray
-from probewise._kinds import require_callable, require_kind, require_mapping, require_text, require_texts
+from probewise._kinds import checked_text, checked_texts, require_callable, require_kind, require_mapping
 from probewise.errors import ParameterError
 from probewise.priors import LogUniform, Marginal, Normal, Uniform
 from probewise.systems.table import RunTable
@@ -187,11 +187,11 @@ class Simulator:
             raise ParameterError(
                 "simulate, rates", found, "one of them: def simulate(p, data), or states and def rates(s, p, u)"
             )
-        require_text("reading", self.reading, "the name of the column that is predicted")
+        checked_text("reading", self.reading, "the name of the column that is predicted")
         require_kind("unit", self.unit, str, "a text")
         for name, column in (("time", self.time), ("run", self.run)):
             if column is not None:
-                require_text(name, column, "the name of a column, or None")
+                checked_text(name, column, "the name of a column, or None")
         if self.simulate is not None:
             way = "a function simulate(parameters, columns); of a file: read_simulator('FILE.py') of probewise.systems"
             require_callable("simulate", self.simulate, way)
@@ -201,8 +201,8 @@ class Simulator:
         if not self.parameters:
             raise ParameterError("parameters", {}, "one parameter or more, each with its prior")
         object.__setattr__(self, "parameters", {n: parse_prior(n, prior) for n, prior in self.parameters.items()})
-        object.__setattr__(self, "per_run", require_texts("per_run", self.per_run, "names of parameters"))
-        object.__setattr__(self, "controls", require_texts("controls", self.controls, "names of columns"))
+        object.__setattr__(self, "per_run", checked_texts("per_run", self.per_run, "names of parameters"))
+        object.__setattr__(self, "controls", checked_texts("controls", self.controls, "names of columns"))
         object.__setattr__(self, "noise", Noise.of(self.noise))
         require_mapping("extra", self.extra, "effects by name: {'drag': Extra(prior, null, says)}")
         for name in self.per_run:

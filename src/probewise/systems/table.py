@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
-from probewise._kinds import require_path
+from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
 from probewise.recordings.table import csv_text, number_text, read_table
@@ -178,7 +178,7 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
     FileError
         If the file is unusable or lacks a column; the message gives row, column, content and what is allowed.
     """
-    table = read_table(require_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)"))
+    table = read_table(checked_path("path", path, "the name of a CSV file; columns in memory make a RunTable(...)"))
     if not len(table):
         raise FileError(path, "there is no row below the header", "one row for each reading")
     table.require_columns(*(name for name in (time, run) if name is not None))

@@ -9,7 +9,7 @@ from scipy.special import gammaln, logsumexp
 
 from probewise.diagnosis.noise.law import NoiseLaw, white_noise
 from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, draw_readings, variance
-from probewise.sensor import ReadingNoise
+from probewise.sensor import NoiseParameters
 
 
 def test_a_walk_is_whitened_as_the_root_of_its_covariance_does():
@@ -39,7 +39,9 @@ def test_what_is_kept_of_a_walk_has_walked_over_what_is_left_out():
 
 def test_draws_of_a_walk_scatter_as_it_says():
     level = replace(
-        RandomWalk(n_before=0).apply(ReadingNoise(np.array([[2.0]]), np.zeros((1, 1))), np.array([[0.3]]), range(50)),
+        RandomWalk(n_before=0).apply(
+            NoiseParameters(np.array([[2.0]]), np.zeros((1, 1))), np.array([[0.3]]), range(50)
+        ),
     )
     draws = np.concatenate(
         [

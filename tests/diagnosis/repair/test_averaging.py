@@ -63,7 +63,7 @@ def test_an_effect_at_nothing_does_nothing(name):
     # Two quadratures where a pose changes, and a central difference where a scene does.
     np.testing.assert_allclose(chain.predict(theta, PLAN), samples.chain.predict(samples.theta, PLAN), atol=2e-4)
     level, plain = (
-        c.noise_of_readings(t, PLAN, np.ones((5, 1))) for c, t in ((chain, theta), (samples.chain, samples.theta))
+        c.noise_parameters(t, PLAN, np.ones((5, 1))) for c, t in ((chain, theta), (samples.chain, samples.theta))
     )
     for share in ("sd", "rho", "wide_share", "lost_share", "step"):
         here, there = np.broadcast_arrays(getattr(level, share), getattr(plain, share))

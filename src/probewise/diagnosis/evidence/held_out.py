@@ -133,9 +133,9 @@ def _refit_log_densities(
 def _sequential_log_densities(
     law: NoiseLaw, miss: FloatArray, slopes: FloatArray, mean: FloatArray, covariance: FloatArray, sigma_2: float
 ) -> FloatArray:
-    """Return the log density of each reading given those before it, (n,); `mean` and `covariance` are updated.
+    """Return the log density of each reading given those before it, (n,), 0 for lost ones.
 
-    Whitened readings are independent, given the coordinates; a constant of the whitening, the same for every model of
+    `mean` and `covariance` are those of the coordinates before the first reading. Whitened readings are independent, given the coordinates; a constant of the whitening, the same for every model of
     the mean, is left out.
     """
     innovations, turned = law(miss), law(slopes)

@@ -15,7 +15,7 @@ from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
 from probewise.recordings.plan import Recording
-from probewise.sensor.stages import ReadingNoise, effects_with_columns
+from probewise.sensor.stages import NoiseParameters, effects_with_columns
 
 _FAR = 4.0  # noise sds from its prediction beyond which a reading counts as lost
 _MANY = 12  # nodes of one effect above which they are thinned before combination with another's
@@ -93,7 +93,7 @@ class NoiseModel:
                 [np.repeat(settings, len(bank), axis=0), np.tile(bank, (len(settings), 1))], axis=1
             )
             log_weights = (log_weights[:, None] + log_each).ravel()
-        noise = self._noise_at_nodes(settings, seen)
+        noise = self._noise_parameters_at_nodes(settings, seen)
         far = np.abs(residuals) > _FAR * sd
         laws = tuple(self._law_at_node(noise, k, far) for k in range(len(settings)))
         if self.rounding:
@@ -112,7 +112,7 @@ class NoiseModel:
             return self.likely[effect.name]
         return effect.weighed_nodes(residuals, rows)
 
-    def _noise_at_nodes(self, settings: FloatArray, seen: FloatArray) -> ReadingNoise:
+    def _noise_parameters_at_nodes(self, settings: FloatArray, seen: FloatArray) -> NoiseParameters:
         """Return the noise at all nodes at once: relative sds and correlations with every noise effect applied.
 
         `settings` (n_nodes, n_params) holds each effect's columns in turn; `seen` (n_usable,) are the predictions.
@@ -120,12 +120,12 @@ class NoiseModel:
         plan, usable = self.recording.plan, self.recording.usable
         everywhere = np.zeros((1, len(plan)))
         everywhere[0, usable] = seen
-        noise = ReadingNoise(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
+        noise = NoiseParameters(sd=self.recording.relative_sd[None, :], rho=np.zeros((1, 1)), seen=everywhere)
         for effect, own in effects_with_columns(self.effects):
             noise = effect.apply(noise, settings[:, own], plan)
         return noise
 
-    def _law_at_node(self, noise: ReadingNoise, node: int, far: BoolArray) -> NoiseLaw:
+    def _law_at_node(self, noise: NoiseParameters, node: int, far: BoolArray) -> NoiseLaw:
         def value_at_node(values: FloatArray) -> float:
             return float(values[min(node, len(values) - 1), 0])
 

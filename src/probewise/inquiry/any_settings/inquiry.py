@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray, floats
 from probewise._display import ShowsItself
-from probewise._kinds import did_you_mean, require_callable, require_finite_number, require_rng, require_whole
+from probewise._kinds import checked_finite_number, checked_whole, did_you_mean, require_callable, require_rng
 from probewise.errors import ParameterError, ShapeError
 from probewise.inquiry.any_settings.acquisition import Predictive
 from probewise.inquiry.any_settings.noise import AnyNoise, ReadingNoise
@@ -90,8 +90,8 @@ class Inquiry(ShowsItself):
         self._goal = _checked_goal(goal, self._model.prior.names)
         self._cost_s = cost_s
         self._n_samples, self._n_live = (
-            require_whole("n_samples", n_samples, least=400),
-            require_whole("n_live", n_live),
+            checked_whole("n_samples", n_samples, least=400),
+            checked_whole("n_live", n_live),
         )
         self._posterior = prior_samples(self._model.prior, self._n_samples, rng=rng)
         self._taken: list[tuple[Any, float]] = []
@@ -196,7 +196,7 @@ class Inquiry(ShowsItself):
         NotConvergedError
             If no hypothesis could have given these readings. The posterior is unchanged.
         """
-        value = require_finite_number("reading", reading, "a finite number; leave out a missing reading")
+        value = checked_finite_number("reading", reading, "a finite number; leave out a missing reading")
         at = self._settings.parsed(self.next() if setting is None else setting)
         readings = _append_reading(self._readings, self._model, at, value)
         theta = self._posterior.theta
@@ -212,7 +212,7 @@ class Inquiry(ShowsItself):
         Greedy on the joint information (Nemhauser, Wolsey & Fisher 1978): each is the best addition to those before
         it, averaged over simulated readings there. Pass the results one by one to `tell(reading, setting)`.
         """
-        require_whole("n", n)
+        checked_whole("n", n)
         everywhere = np.ones(len(self._settings), dtype=np.bool_)
         rows = [choose(self.utility, everywhere, rng=self._rng)]
         theta, noise = self._posterior.theta, self._model.noise
@@ -292,7 +292,7 @@ def _checked_goal(goal: Mapping[str, float] | None, names: tuple[str, ...]) -> d
     for name, sd in goal.items():
         if name not in names:
             raise ParameterError("goal", name, f"parameters among {', '.join(names)}{did_you_mean(name, names)}")
-        if not require_finite_number(f"goal[{name!r}]", sd) > 0:
+        if not checked_finite_number(f"goal[{name!r}]", sd) > 0:
             raise ParameterError(f"goal[{name!r}]", sd, "greater than 0")
     return dict(goal)
 

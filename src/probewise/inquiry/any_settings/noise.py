@@ -12,7 +12,7 @@ import numpy as np
 from scipy.special import gammaln, ndtr, stdtr, stdtrit
 
 from probewise._arrays import FloatArray
-from probewise._kinds import require_number
+from probewise._kinds import checked_number
 from probewise.errors import ParameterError, ShapeError
 from probewise.priors import Marginal
 
@@ -51,15 +51,15 @@ class ReadingNoise:
     def __post_init__(self) -> None:
         if isinstance(self.sd, type | str | bytes):
             raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
-        if not (self.inferred or callable(self.sd)) and not 0 < require_number("noise sd", self.sd, _ALLOWED_SD) < (
+        if not (self.inferred or callable(self.sd)) and not 0 < checked_number("noise sd", self.sd, _ALLOWED_SD) < (
             math.inf
         ):
             raise ParameterError("noise sd", self.sd, _ALLOWED_SD)
         if self.inferred and not np.min(self.sd.from_unit(np.array([1e-9, 0.5]))) > 0:  # type: ignore[union-attr]
             raise ParameterError("noise sd", self.sd, "a prior of numbers greater than 0, such as LogUniform(0.1, 10)")
-        if not require_number("dof", self.dof) > 0:
+        if not checked_number("dof", self.dof) > 0:
             raise ParameterError("dof", self.dof, "greater than 0; infinity is the Gaussian")
-        if not 0 <= require_number("outliers", self.outliers) < 1:
+        if not 0 <= checked_number("outliers", self.outliers) < 1:
             raise ParameterError(
                 "outliers", self.outliers, "0 or more, below 1: the share of readings that are outliers"
             )

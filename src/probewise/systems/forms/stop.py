@@ -13,7 +13,7 @@ from probewise.effects import Extent, NoiseEffect, lattice_step
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan, Recording
 from probewise.sensor import Stage
-from probewise.sensor.stages import ReadingNoise
+from probewise.sensor.stages import NoiseParameters
 
 _LEAST_IN_TURN = 5  # successive readings of exactly one value
 _LEAST_IN_ALL = 8
@@ -60,7 +60,7 @@ class MeterStop(NoiseEffect):
         near = 1e-9 * (1 + abs(self.level))
         return Product({"level": Uniform(self.level - near, self.level + near)})
 
-    def apply(self, value: ReadingNoise, theta: FloatArray, plan: Plan) -> ReadingNoise:
+    def apply(self, value: NoiseParameters, theta: FloatArray, plan: Plan) -> NoiseParameters:
         """Return the noise unchanged."""
         return value
 

@@ -40,7 +40,7 @@ class NamedSamples(ShowsItself):
         return {name: (float(a), float(b)) for name, a, b in zip(self.names, low, high, strict=True)}
 
 
-def interval_table(rows: Sequence[tuple[str, float, tuple[float, float]]]) -> list[str]:
+def interval_table_lines(rows: Sequence[tuple[str, float, tuple[float, float]]]) -> list[str]:
     """Return the lines of a text table: name, median and 95 % interval of each quantity."""
     width = max(9, *(len(name) for name, _, _ in rows))
     return [

@@ -14,7 +14,7 @@ from probewise.challenge import (
     reliability_bins,
     score,
 )
-from probewise.challenge.estimates import bootstrapped, mean, share
+from probewise.challenge.estimates import bootstrapped, estimated_share, mean
 
 
 def row(results, name):
@@ -26,7 +26,7 @@ def test_wilson_s_interval():
     """(k + z^2/2 -+ z sqrt(k (n - k)/n + z^2/4)) / (n + z^2): 8 of 10."""
     z = 1.959963984540054
     centre, half = (8 + z * z / 2) / (10 + z * z), z * math.sqrt(8 * 2 / 10 + z * z / 4) / (10 + z * z)
-    found = share([True] * 8 + [False] * 2)
+    found = estimated_share([True] * 8 + [False] * 2)
     assert (found.value, found.n) == (0.8, 10)
     assert (found.low, found.high) == pytest.approx((centre - half, centre + half))
 
@@ -52,8 +52,8 @@ def test_a_row_is_decided_only_by_its_whole_interval(low, high, decision):
 
 
 def test_no_case_decides_nothing():
-    assert Row("x", share([]), least=0.9).decision == "open"
-    assert Row("x", share([])).decision is None
+    assert Row("x", estimated_share([]), least=0.9).decision == "open"
+    assert Row("x", estimated_share([])).decision is None
 
 
 def test_false_alarms_are_counted_at_both_levels(make):

@@ -33,7 +33,7 @@ from probewise.diagnosis.fitting.sensor_prior import sensor_from_posterior
 from probewise.diagnosis.joining import join
 from probewise.diagnosis.judgement.judged import Hypothesis, credible_labels, verdict_from_probabilities
 from probewise.diagnosis.light_sensor.covariates import covariate_of
-from probewise.diagnosis.noise.law import NoiseLaw, noise_statistics, rows_to_previous_usable, white_noise
+from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable, noise_statistics, white_noise
 from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
@@ -193,7 +193,7 @@ def test_whitening_is_the_inverse_root_of_the_covariance():
     readings = recording.readings.copy()
     readings[2] = np.nan
     recording = Recording(recording.plan, readings)
-    steps = rows_to_previous_usable(recording)
+    steps = n_rows_since_previous_usable(recording)
     np.testing.assert_array_equal(steps, [0, 1, 2, 1, 1, 0, 1, 1, 1, 1, 1])
     rows = np.flatnonzero(recording.usable)
     nodes = NoiseModel((CorrelatedNoise(),), recording).nodes_for_predictions(np.zeros(len(rows)))

@@ -11,7 +11,7 @@ from scipy.special import ndtr
 from probewise.arm import read_geometry, shipped_geometry_path
 from probewise.arm.fitting import fit_geometry
 from probewise.arm.geometry import Accuracy
-from probewise.arm.marks import places_of_marks
+from probewise.arm.marks import choose_mark_places
 from probewise.arm.uncertainty import FITTED, RULER_SDS, places_at_values, slopes_mm, values_of_fitted
 from probewise.errors import FileError, ParameterError
 from probewise.experiment import FittedArm, explore, found_shape, result_json, run, run_with_arm_error, samples_csv
@@ -174,7 +174,7 @@ def test_a_journal_is_not_continued_with_an_arm_that_is_known_otherwise(small_fo
 
 def built_and_fitted(rng):
     """Build an arm as a ruler leaves it, touch marks with it to 1 mm, fit it: the geometry, and what is true."""
-    marks = places_of_marks(ARM)
+    marks = choose_mark_places(ARM)
     turned = ARM.angles_rad(marks, 32.0) - values_of_fitted(ARM)[:3]
     true = values_of_fitted(ARM) + RULER_SDS * rng.standard_normal(9)
     met = places_at_values(ARM, true, turned) + rng.standard_normal((len(marks), 3))

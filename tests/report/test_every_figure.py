@@ -11,7 +11,7 @@ from PIL import Image
 
 from probewise.arm.geometry_file import read_geometry, shipped_geometry_path
 from probewise.challenge import Bin
-from probewise.challenge.estimates import share
+from probewise.challenge.estimates import estimated_share
 from probewise.errors import ShapeError
 from probewise.nested import run
 from probewise.priors import Product, Uniform
@@ -124,7 +124,7 @@ FIGURES = {
         s.recording, np.sin(np.arange(len(s.recording))), np.zeros(len(s.recording))
     ),
     "reliability_diagram": lambda s: plots.reliability_diagram(
-        [Bin(0.15, share([True] * 3 + [False] * 17)), Bin(0.5, share([True] * 11 + [False] * 9))]
+        [Bin(0.15, estimated_share([True] * 3 + [False] * 17)), Bin(0.5, estimated_share([True] * 11 + [False] * 9))]
     ),
     "predicted_and_recorded": lambda s: plots.predicted_and_recorded(
         np.arange(40.0), np.arange(40.0) + 0.3, np.ones(40), label="temp_c", unit="degC"

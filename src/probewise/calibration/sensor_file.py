@@ -15,7 +15,12 @@ import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import checked_path, require_kind
-from probewise._posterior_samples import NamedSamples, checked_samples, interval_table, require_masks_of_absent_effects
+from probewise._posterior_samples import (
+    NamedSamples,
+    checked_samples,
+    interval_table_lines,
+    require_masks_of_absent_effects,
+)
 from probewise._version import __version__
 from probewise.calibration.fields import mean_field
 from probewise.calibration.noise import ScanNoise
@@ -250,7 +255,7 @@ class FittedSensor(NamedSamples):
         median, interval = self.median(), self.interval()
         rows = [(q.name, q.median, q.interval95) for q in self.ssf_quantities()]
         rows += [(name, median[name], interval[name]) for name in told]
-        return "\n".join([*lines, *interval_table(rows), *(f"note: {note}" for note in self.notes)])
+        return "\n".join([*lines, *interval_table_lines(rows), *(f"note: {note}" for note in self.notes)])
 
     def _effect_with_share_of_samples(self, effect: str) -> str:
         share = 1.0 - self.absent[effect].mean() if effect in self.absent else 1.0

@@ -27,7 +27,7 @@ class Estimate:
 _NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
-def share(hits: list[bool]) -> Estimate:
+def estimated_share(hits: list[bool]) -> Estimate:
     """Estimate a proportion, with Wilson's interval (Wilson 1927)."""
     if not hits:
         return _NOTHING

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
-from probewise.challenge.estimates import Estimate, bootstrapped, share
+from probewise.challenge.estimates import Estimate, bootstrapped, estimated_share
 from probewise.challenge.scoring import leading_probability_and_correctness
 
 _EDGES = np.linspace(0, 1, 11)
@@ -30,7 +30,7 @@ def reliability_bins(results: Sequence[Mapping[str, Any]]) -> tuple[Bin, ...]:
     return tuple(
         Bin(
             float(np.mean([p for (p, _), at in zip(said, of_case, strict=True) if at == k])),
-            share([right for (_, right), at in zip(said, of_case, strict=True) if at == k]),
+            estimated_share([right for (_, right), at in zip(said, of_case, strict=True) if at == k]),
         )
         for k in np.unique(of_case)
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from probewise.challenge.estimates import Estimate, mean, share
+from probewise.challenge.estimates import Estimate, estimated_share, mean
 from probewise.challenge.scoring import (
     Result,
     acts_on_mean,
@@ -45,9 +45,9 @@ def score_rounds(results: Sequence[Result]) -> tuple[Row, ...]:
         *_rows_before_and_after(last, first, "two effects: a false extra", _share_of_pairs_with_false_extra, most=0.03),
         *_rows_before_and_after(last, first, "physics named, clean", _share_of_clean_with_effect_named, most=0.005),
         Row("extra readings, median of those not settled at once", _median_further_readings(last), most=80.0),
-        Row("settled at last", share([r["rounds"][-1]["settled"] for r in last])),
+        Row("settled at last", estimated_share([r["rounds"][-1]["settled"] for r in last])),
         Row("processor time of an investigation (s)", mean([r["cpu_s"] for r in last])),
-        Row("cases that failed", share(["failed" in r for r in results])),
+        Row("cases that failed", estimated_share(["failed" in r for r in results])),
     )
 
 
@@ -64,7 +64,7 @@ def _rows_before_and_after(
 
 
 def _share_named(results: list[Result], size: float) -> Estimate:
-    return share([is_leading_name_right(r) for r in cases_with_one_effect(results, size)])
+    return estimated_share([is_leading_name_right(r) for r in cases_with_one_effect(results, size)])
 
 
 def _mean_set_size(results: list[Result], size: float) -> Estimate:
@@ -72,7 +72,7 @@ def _mean_set_size(results: list[Result], size: float) -> Estimate:
 
 
 def _share_of_sets_with_truth(results: list[Result]) -> Estimate:
-    return share([credible_set_covers(r, merged=False) for r in results])
+    return estimated_share([credible_set_covers(r, merged=False) for r in results])
 
 
 def _share_detected(results: list[Result]) -> Estimate:
@@ -84,15 +84,15 @@ def _pair_results(results: list[Result]) -> list[Result]:
 
 
 def _share_of_pairs_named(results: list[Result]) -> Estimate:
-    return share([is_leading_name_right(r) for r in _pair_results(results)])
+    return estimated_share([is_leading_name_right(r) for r in _pair_results(results)])
 
 
 def _share_of_pairs_with_false_extra(results: list[Result]) -> Estimate:
-    return share([has_false_extra(r) for r in _pair_results(results)])
+    return estimated_share([has_false_extra(r) for r in _pair_results(results)])
 
 
 def _share_of_clean_with_effect_named(results: list[Result]) -> Estimate:
-    return share([names_effect_on_mean(r) for r in results if r["kind"] == "clean"])
+    return estimated_share([names_effect_on_mean(r) for r in results if r["kind"] == "clean"])
 
 
 def _median_further_readings(results: list[Result]) -> Estimate:

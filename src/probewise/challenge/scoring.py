@@ -74,7 +74,7 @@ def has_false_extra(result: Result) -> bool:
 
 
 def count_extra_names(names: Sequence[str], wanted: Sequence[frozenset[str]]) -> int:
-    """Count the names that match no wanted effect."""
+    """Count the names that match no wanted effect; each effect matches one name."""
     most = max(
         sum(name in right for name, right in zip(order, wanted, strict=False))
         for order in itertools.permutations([*names, *[""] * len(wanted)], len(wanted))

@@ -11,7 +11,7 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import Estimate, bootstrapped, mean, share
+from probewise.challenge.estimates import Estimate, bootstrapped, estimated_share, mean
 from probewise.challenge.oracle_baseline import (
     oracle_covariate_rate,
     oracle_name_rate,
@@ -86,7 +86,7 @@ def score(results: Sequence[Result]) -> tuple[Row, ...]:
         *_out_of_vocabulary_rows(done),
         *_alias_rows(done),
         *_time_rows(done),
-        Row("cases that failed", share(["failed" in r for r in results])),
+        Row("cases that failed", estimated_share(["failed" in r for r in results])),
     )
 
 
@@ -95,7 +95,10 @@ def detected_and_named_by_effect(results: Sequence[Result], size: float = 8.0) -
     singles = cases_with_one_effect([r for r in results if "failed" not in r], size)
     names = dict.fromkeys(r["hidden"][0]["name"] for r in singles)
     own = {name: [r for r in singles if r["hidden"][0]["name"] == name] for name in names}
-    return {name: (rejection_rate(rs, 0.01), share([is_leading_name_right(r) for r in rs])) for name, rs in own.items()}
+    return {
+        name: (rejection_rate(rs, 0.01), estimated_share([is_leading_name_right(r) for r in rs]))
+        for name, rs in own.items()
+    }
 
 
 def _clean_rows(done: list[Result]) -> list[Row]:
@@ -107,10 +110,10 @@ def _clean_rows(done: list[Result]) -> list[Row]:
         Row("false alarms, clean, alpha .01", rejection_rate(white, 0.01), 0.006, 0.015),
         Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
         *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05), most=0.06) for m in models),
-        Row("physics named, clean", share([names_effect_on_mean(r) for r in clean]), most=0.005),
+        Row("physics named, clean", estimated_share([names_effect_on_mean(r) for r in clean]), most=0.005),
         Row(
             "physics named, one Gaussian more",
-            share([names_effect_on_mean(r) for r in done if r["kind"] == "ssf_order"]),
+            estimated_share([names_effect_on_mean(r) for r in done if r["kind"] == "ssf_order"]),
             most=0.01,
         ),
     ]
@@ -127,15 +130,17 @@ def _detection_rows(done: list[Result]) -> list[Row]:
         for size, least in targets.items()
     ]
     each = [detected for detected, _ in detected_and_named_by_effect(_cases_distinguishable_from_ssf(done)).values()]
-    worst = min(each, key=lambda e: (e.value, e.high), default=share([]))
+    worst = min(each, key=lambda e: (e.value, e.high), default=estimated_share([]))
     return [*rows, Row("detection, lambda 8, least of all effects", worst, 0.9)]
 
 
 def _naming_rows(done: list[Result]) -> list[Row]:
     targets = {6.0: 0.9, 8.0: 0.97, 12.0: 0.99, 20.0: 0.995}
-    found = {size: share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]) for size in targets}
+    found = {
+        size: estimated_share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]) for size in targets
+    }
     falls = [_difference_of_shares(a, b) for a, b in pairwise(found.values()) if a.n and b.n]
-    worst = max(falls, key=lambda fall: fall.value, default=share([]))
+    worst = max(falls, key=lambda fall: fall.value, default=estimated_share([]))
     rows = []
     for size, least in targets.items():
         like = [oracle_name_rate(r["hidden"][0]) for r in cases_with_one_effect(done, size)]
@@ -173,10 +178,14 @@ def _probability_rows(done: list[Result]) -> list[Row]:
             Row(f"  oracle, aliases as one, lambda {size:g}", mean(like)),
         ]
     return [
-        Row("95 % credible set holds the truth", share([credible_set_covers(r, merged=False) for r in done]), 0.95),
+        Row(
+            "95 % credible set holds the truth",
+            estimated_share([credible_set_covers(r, merged=False) for r in done]),
+            0.95,
+        ),
         *rows,
         Row("expected calibration error", calibration_error(done), most=0.02),
-        Row("wrong name stated above .9", share([is_confidently_wrong(r) for r in done]), most=0.005),
+        Row("wrong name stated above .9", estimated_share([is_confidently_wrong(r) for r in done]), most=0.005),
     ]
 
 
@@ -197,7 +206,7 @@ def _place_rows(done: list[Result]) -> list[Row]:
     first = [bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]
     return [
         *(Row(f"overlap of the place, lambda {size:g}", mean(local[size]), least) for size, least in targets.items()),
-        Row("right covariate first, lambda 8", share(first), 0.98),
+        Row("right covariate first, lambda 8", estimated_share(first), 0.98),
         Row("  oracle against the hardest rival", mean([oracle_covariate_rate(r["hidden"][0]) for r in shown])),
     ]
 
@@ -219,7 +228,7 @@ def _interval_rows(done: list[Result]) -> list[Row]:
 
 def share_of_intervals_with_truth(intervals: list[list[float]]) -> Estimate:
     """Estimate the share of intervals, [truth, low, high] each, that cover the truth."""
-    return share([low <= truth <= high for truth, low, high in intervals])
+    return estimated_share([low <= truth <= high for truth, low, high in intervals])
 
 
 def _held_out_rows(done: list[Result]) -> list[Row]:
@@ -235,10 +244,11 @@ def _held_out_rows(done: list[Result]) -> list[Row]:
             "  share of what the truth itself would gain", bootstrapped(_gains_by_scan(white, "true"), _ratio_of_gains)
         ),
         Row("  the same, outside the vocabulary", bootstrapped(_gains_by_scan(outside, "true"), _ratio_of_gains)),
-        Row("held-out worse than the null by over 1 nat", share(worse), most=0.01),
+        Row("held-out worse than the null by over 1 nat", estimated_share(worse), most=0.01),
         # The scatter that noise alone causes in the best gain possible with these readings.
         Row(
-            "  of the right model, fitted to the same", share([bool(own < -1.0) for own in gains[:, :, 1].sum(axis=1)])
+            "  of the right model, fitted to the same",
+            estimated_share([bool(own < -1.0) for own in gains[:, :, 1].sum(axis=1)]),
         ),
     ]
 
@@ -264,9 +274,9 @@ def _pair_rows(done: list[Result]) -> list[Row]:
     both = [is_leading_name_right(r) for r in pairs]
     shown = [right for r, right in zip(pairs, both, strict=True) if _each_keeps_size_beside_other(r)]
     return [
-        Row("two effects: both named", share(both), 0.95),
-        Row("  where neither hides the other", share(shown)),
-        Row("two effects: a false extra", share([has_false_extra(r) for r in pairs]), most=0.03),
+        Row("two effects: both named", estimated_share(both), 0.95),
+        Row("  where neither hides the other", estimated_share(shown)),
+        Row("two effects: a false extra", estimated_share([has_false_extra(r) for r in pairs]), most=0.03),
     ]
 
 
@@ -283,12 +293,12 @@ def _out_of_vocabulary_rows(done: list[Result]) -> list[Row]:
         *(
             Row(
                 f"outside the vocabulary: unknown, lambda {size:g}",
-                share([r["verdict"] == "unknown" for r in outside if r["size"] == size]),
+                estimated_share([r["verdict"] == "unknown" for r in outside if r["size"] == size]),
                 least,
             )
             for size, least in targets.items()
         ),
-        Row("false unknown", share([r["verdict"] == "unknown" for r in inside]), most=0.02),
+        Row("false unknown", estimated_share([r["verdict"] == "unknown" for r in inside]), most=0.02),
     ]
 
 
@@ -296,11 +306,15 @@ def _alias_rows(done: list[Result]) -> list[Row]:
     aliased = [r for r in done if r["kind"] == "alias"]
     settled = [r | r["settled"] if r["settled"] else r for r in aliased]
     return [
-        Row("aliased pair: cannot tell", share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
-        Row("aliased pair: sure of the wrong name", share([is_confidently_wrong(r) for r in aliased]), most=0.01),
+        Row("aliased pair: cannot tell", estimated_share([r["verdict"] == "cannot_tell" for r in aliased]), 0.98),
+        Row(
+            "aliased pair: sure of the wrong name",
+            estimated_share([is_confidently_wrong(r) for r in aliased]),
+            most=0.01,
+        ),
         Row(
             "right name after the advised readings",
-            share([leading_probability_and_correctness(r)[1] for r in settled]),
+            estimated_share([leading_probability_and_correctness(r)[1] for r in settled]),
             0.95,
         ),
         Row(
@@ -340,7 +354,7 @@ def _cases_with_mean_effects(results: Sequence[Result]) -> list[Result]:
 
 def rejection_rate(results: Sequence[Result], alpha: float) -> Estimate:
     """Estimate how often the test of the mean rejects at significance level `alpha`."""
-    return share([r["p_value"] <= alpha for r in results])
+    return estimated_share([r["p_value"] <= alpha for r in results])
 
 
 def names_effect_on_mean(result: Result) -> bool:

@@ -52,7 +52,7 @@ class Inputs:
         return means["I_min"], means["I_max"]
 
 
-def checked_inputs(arguments: argparse.Namespace) -> Inputs:
+def read_checked_inputs(arguments: argparse.Namespace) -> Inputs:
     """Read the files that the options name, check the options, and build the experiment.
 
     Raises ParameterError or FileError if an option contradicts another, or a file cannot be read.

@@ -345,7 +345,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
     """Bring the sensor to one mark after another as a person directs; save each at once to the file `kept`."""
     from probewise.arm import LegoArm
     from probewise.arm.mark_file import TouchedMark, read_turns_and_places, write_marks
-    from probewise.arm.marks import places_of_marks
+    from probewise.arm.marks import choose_mark_places
     from probewise.cli._marks import bring_to_mark
 
     chosen = parse_arm(arguments.arm)
@@ -358,7 +358,7 @@ def _touch_and_save_marks(arguments: argparse.Namespace, geometry: Geometry, kep
         rows = zip(*(array.tolist() for array in read_turns_and_places(kept)), strict=True)
         taken = [TouchedMark(tuple(turned), tuple(place)) for turned, place in rows]
     done = {mark.place_mm[:2] for mark in taken}
-    marks = [(x, y) for x, y in places_of_marks(geometry).tolist()]
+    marks = [(x, y) for x, y in choose_mark_places(geometry).tolist()]
     arguments.scene = arguments.sensor = arguments.seed = None
     instrument, bench = _open_instrument(arguments, geometry)
     assert isinstance(instrument, LegoArm)
@@ -393,7 +393,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
 
     from probewise.arm import LegoArm, require_within_reach
     from probewise.arm.height_check import HeightReading, check_heights
-    from probewise.arm.marks import places_of_marks
+    from probewise.arm.marks import choose_mark_places
 
     if arguments.arm is not None and not parse_arm(arguments.arm).is_lego:
         raise ParameterError("--arm", arguments.arm, "nxt:PORT, or emulator:TRUE.toml")
@@ -401,7 +401,7 @@ def _compare_heights_by_light(arguments: argparse.Namespace, geometry: Geometry)
         raise ParameterError("--readings", arguments.readings, f"up to {_MOST_READINGS}")
     width, height = geometry.field_mm
     places = [parse_place("X,Y", text) for text in arguments.places]
-    places = places or [(width / 2, height / 2), *((x, y) for x, y in places_of_marks(geometry).tolist())]
+    places = places or [(width / 2, height / 2), *((x, y) for x, y in choose_mark_places(geometry).tolist())]
     if len(places) < 2:
         raise ParameterError("X,Y", " ".join(arguments.places), "two places or more: heights are compared")
     require_within_reach(geometry, np.array(places), "place")

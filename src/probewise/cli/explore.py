@@ -161,12 +161,12 @@ def run(arguments: argparse.Namespace) -> int:
     from probewise import experiment as posing
     from probewise._progress import progress_shown
     from probewise.cli._explore_arm import open_arm_and_truth
-    from probewise.cli._explore_inputs import checked_inputs
+    from probewise.cli._explore_inputs import read_checked_inputs
     from probewise.cli._explore_pictures import Pictures
     from probewise.experiment import Exploration, explore, read_journal, shadow_run
 
     out = checked_output_directory(arguments.out)
-    inputs = checked_inputs(arguments)
+    inputs = read_checked_inputs(arguments)
     journal = out / "journal.jsonl"
     before = _journal_so_far(journal, resume=arguments.resume)
     site = open_arm_and_truth(arguments, inputs, () if before is None else before.readings)

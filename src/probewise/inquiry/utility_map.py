@@ -144,7 +144,7 @@ def entropy_map(
 
 
 def reachable_rows(reachable: BoolArray, n_places: int, n_combinations: int = 1) -> IntArray:
-    """Return the indices of the designs at reachable places, (n_places,) -> (n,)."""
+    """Return the indices of the designs at reachable places, (n_places,) -> (n,); ReachError if there are none."""
     if reachable.shape != (n_places,):
         raise ShapeError(f"reachable has shape {reachable.shape}; allowed: ({n_places},), one per place")
     if not reachable.any():

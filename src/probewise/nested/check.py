@@ -285,7 +285,7 @@ def _choose_agreeing_run_and_estimate(
 ) -> tuple[NestedResult, _SecondEstimate]:
     """Return the run and the second estimate that agree, given a repetition of the run with longer chains.
 
-    If none do, or there is no repetition, return them as they were.
+    If none do, or there is no repetition without warnings, return them as they were.
     """
     if again is None or again.warnings:
         return now, second

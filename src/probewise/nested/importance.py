@@ -382,7 +382,8 @@ def pareto_k(log_weight: FloatArray, tail: float = 3.0) -> float:
 
     A generalised Pareto distribution is fitted to the largest weights, `tail` sqrt(n) of them but at most a
     fifth, with the estimator of Zhang & Stephens (2009), as in Vehtari et al. (2024). Below 0.5 the
-    weights have a finite variance; above 0.7 their mean converges too slowly to be used.
+    weights have a finite variance; above 0.7 their mean converges too slowly to be used. It is infinite for fewer than
+    25 weights, and minus infinity where fewer than five of the tail stand out.
     """
     n = len(log_weight)
     n_tail = int(min(0.2 * n, tail * math.sqrt(n)))

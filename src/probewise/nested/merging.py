@@ -125,7 +125,10 @@ def _error_and_doubts(
 
 
 def agreement_of(results: Iterable[NestedResult]) -> Agreement:
-    """Compare the evidences of independent runs by chi-square; a merged run counts as its single runs."""
+    """Compare the evidences of independent runs by chi-square; a merged run counts as its single runs.
+
+    Raises ParameterError for fewer than two runs.
+    """
     log_z, log_z_error = list[float](), list[float]()
     for result in results:
         runs = result.agreement

@@ -37,7 +37,7 @@ def target_table(rows: Sequence[Row]) -> Markup:
         header,
         (
             (
-                _keep_indentation(row.name),
+                _indented_row_name(row.name),
                 _value_text(row.found) if row.found.n else "–",
                 typeset(_interval_text(row.found)),
                 str(row.found.n),
@@ -49,7 +49,7 @@ def target_table(rows: Sequence[Row]) -> Markup:
     )
 
 
-def _keep_indentation(name: str) -> str:
+def _indented_row_name(name: str) -> str:
     """Write a row's name: an em space for indentation, since HTML drops plain spaces, and spaces for underscores."""
     own = name.lstrip()
     return "\u2003" * (len(name) > len(own)) + own.replace("_", " ")

@@ -70,21 +70,21 @@ class StraightEdges:
         return _DistinctEdgeViews.from_edges(self)
 
     @cached_property
-    def _contiguous_rows(self) -> slice | None:
+    def _rows_as_slice(self) -> slice | None:
         """The rows as a slice where they are contiguous, so that the result can be a view instead of a copy."""
         together = bool((np.diff(self.rows) == 1).all())
         return slice(int(self.rows[0]), int(self.rows[-1]) + 1) if together else None
 
     def write_response(self, footprint: Footprint, out: FloatArray) -> None:
         """Write each hypothesis' response into the columns `rows` of `out`, (n_samples, n_points)."""
-        seen = np.empty((len(out), len(self.rows))) if self._contiguous_rows is None else out[:, self._contiguous_rows]
+        seen = np.empty((len(out), len(self.rows))) if self._rows_as_slice is None else out[:, self._rows_as_slice]
         if len(self.distance_mm) == 1 and not _varies_with_reading(footprint):
             self._distinct_views.write_response(footprint, seen)
         else:
             self._write_shares_by_hypothesis(footprint, seen)
             seen *= self.inside - self.outside
             seen += self.outside
-        if self._contiguous_rows is None:
+        if self._rows_as_slice is None:
             out[:, self.rows] = seen
 
     def _write_shares_by_hypothesis(self, footprint: Footprint, share: FloatArray) -> None:
@@ -113,9 +113,9 @@ class StraightEdges:
 
     def _own_columns(self, array: FloatArray) -> FloatArray:
         """Select the columns of these readings, as a view where they are contiguous."""
-        if self._contiguous_rows is None or array.shape[1] == 1:
+        if self._rows_as_slice is None or array.shape[1] == 1:
             return select_reading_columns(array, self.rows)
-        return array[:, self._contiguous_rows]
+        return array[:, self._rows_as_slice]
 
 
 @dataclass(frozen=True, eq=False)

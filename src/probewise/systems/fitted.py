@@ -15,7 +15,12 @@ from numpy.typing import NDArray
 
 from probewise._arrays import BoolArray, FloatArray
 from probewise._kinds import require_kind
-from probewise._posterior_samples import NamedSamples, checked_samples, interval_table, require_masks_of_absent_effects
+from probewise._posterior_samples import (
+    NamedSamples,
+    checked_samples,
+    interval_table_lines,
+    require_masks_of_absent_effects,
+)
 from probewise._version import __version__
 from probewise.effects import EFFECTS
 from probewise.errors import FileError, ParameterError, ProbewiseError
@@ -102,7 +107,7 @@ class FittedSystem(NamedSamples):
     def parameter_table(self) -> str:
         """Return a text table of each parameter's median and 95 % interval."""
         median, interval = self.median(), self.interval()
-        return "\n".join(interval_table([(name, median[name], interval[name]) for name in self.names]))
+        return "\n".join(interval_table_lines([(name, median[name], interval[name]) for name in self.names]))
 
     def to_json(self) -> str:
         """Serialise as strict JSON, format "system/1"."""

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.challenge.estimates import bootstrapped, mean, share
+from probewise.challenge.estimates import bootstrapped, estimated_share, mean
 from probewise.challenge.reliability import calibration_error
 from probewise.challenge.scoring import (
     Result,
@@ -51,7 +51,7 @@ def score_systems(results: Sequence[Result]) -> tuple[Row, ...]:
         *_held_out_rows(done),
         *_unlisted_law_rows(done),
         *_time_rows(done),
-        Row("cases that failed", share(["failed" in r for r in results])),
+        Row("cases that failed", estimated_share(["failed" in r for r in results])),
     )
 
 
@@ -63,11 +63,11 @@ def _clean_rows(done: list[Result]) -> list[Row]:
         Row("false alarms, clean, alpha .05", rejection_rate(white, 0.05), 0.03, 0.06),
         Row("false alarms, other noise, alpha .05", rejection_rate(other, 0.05), most=0.06),
         *(Row(f"  {m}", rejection_rate([r for r in other if r["noise_model"] == m], 0.05)) for m in models),
-        Row("physics named, clean", share([names_effect_on_mean(r) for r in white]), most=0.005),
-        Row("physics named, other noise", share([names_effect_on_mean(r) for r in other]), most=0.005),
+        Row("physics named, clean", estimated_share([names_effect_on_mean(r) for r in white]), most=0.005),
+        Row("physics named, other noise", estimated_share([names_effect_on_mean(r) for r in other]), most=0.005),
         Row(
             "noise told as it is, other noise",
-            share([leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]),
+            estimated_share([leading_hypothesis(r, clean=True)[0] == tuple(r["truth"]) for r in other]),
         ),
     ]
 
@@ -80,23 +80,25 @@ def _naming_rows(done: list[Result]) -> list[Row]:
         *(
             Row(
                 f"right name and target first, lambda {size:g}",
-                share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]),
+                estimated_share([is_leading_name_right(r) for r in cases_with_one_effect(done, size)]),
                 least,
             )
             for size, least in targets.items()
         ),
         Row(
             "right covariate first, lambda 12",
-            share([bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]),
+            estimated_share([bool(r["where"]) and r["where"][0] in r["hidden"][0]["shows_in"] for r in shown]),
             0.95,
         ),
-        Row("two effects, lambda 12 each: both named", share([is_leading_name_right(r) for r in pairs]), 0.85),
+        Row(
+            "two effects, lambda 12 each: both named", estimated_share([is_leading_name_right(r) for r in pairs]), 0.85
+        ),
     ]
 
 
 def _probability_rows(done: list[Result]) -> list[Row]:
     own = cases_with_one_effect(done, 12.0)
-    covered, covered_of_all = (share([credible_set_covers(r, merged=True) for r in rs]) for rs in (own, done))
+    covered, covered_of_all = (estimated_share([credible_set_covers(r, merged=True) for r in rs]) for rs in (own, done))
     return [
         Row("95 % credible set holds the truth or its alias, lambda 12", covered, 0.95),
         Row("  the same, all cases", covered_of_all),
@@ -105,7 +107,7 @@ def _probability_rows(done: list[Result]) -> list[Row]:
             mean([set_size_with_aliases_merged(r) for r in own]),
             most=1.4,
         ),
-        Row("wrong name stated above .9", share([_is_confidently_wrong(r) for r in done]), most=0.01),
+        Row("wrong name stated above .9", estimated_share([_is_confidently_wrong(r) for r in done]), most=0.01),
         Row("expected calibration error", calibration_error(done)),
     ]
 
@@ -146,8 +148,8 @@ def _held_out_rows(done: list[Result]) -> list[Row]:
     every = [g[0] for g in (gains_on_held_out_runs(r, "true") for r in done) if g is not None]
     return [
         Row("held-out runs: median share of the right model's gain", shares, 0.95),
-        Row("held-out worse than the null by over 3 nats", share([bool(g < -3.0) for g in every])),
-        Row("  of clean ones", share([bool(g < -3.0) for g in clean])),
+        Row("held-out worse than the null by over 3 nats", estimated_share([bool(g < -3.0) for g in every])),
+        Row("  of clean ones", estimated_share([bool(g < -3.0) for g in clean])),
     ]
 
 
@@ -157,10 +159,12 @@ def _unlisted_law_rows(done: list[Result]) -> list[Row]:
     good = [_gains_as_much_as_true_law(r) for r in outside]
     told = [g or r["verdict"] == "unknown" for g, r in zip(good, outside, strict=True)]
     return [
-        Row("not on the list, lambda 20: unknown, or as good as the true law", share(told), 0.9),
-        Row("  by a formula or a name", share(good), 0.6),
-        Row("  a formula found", share([bool(r["formula"]) for r in outside])),
-        Row("false unknown", share([r["verdict"] == "unknown" for r in inside if not is_out_of_vocabulary(r)])),
+        Row("not on the list, lambda 20: unknown, or as good as the true law", estimated_share(told), 0.9),
+        Row("  by a formula or a name", estimated_share(good), 0.6),
+        Row("  a formula found", estimated_share([bool(r["formula"]) for r in outside])),
+        Row(
+            "false unknown", estimated_share([r["verdict"] == "unknown" for r in inside if not is_out_of_vocabulary(r)])
+        ),
     ]
 
 

@@ -72,7 +72,9 @@ def collinear_pairs(problem: Linearised, templates: Mapping[str, FloatArray], *,
 
 
 def aliases_with_separating_plans(searched: Searched, problem: Linearised, found: Fit) -> list[Alias]:
-    """List the aliased pairs of named effects on the mean, by their best-fitting entries, with plans that separate them.
+    """List the aliased pairs of named effects on the mean, with the plans that separate them.
+
+    Each effect is taken by its best-fitting bank entry.
 
     Parameters
     ----------

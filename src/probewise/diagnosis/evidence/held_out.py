@@ -135,8 +135,8 @@ def _sequential_log_densities(
 ) -> FloatArray:
     """Return the log density of each reading given those before it, (n,), 0 for lost ones.
 
-    `mean` and `covariance` are those of the coordinates before the first reading. Whitened readings are independent, given the coordinates; a constant of the whitening, the same for every model of
-    the mean, is left out.
+    `mean` and `covariance` are those of the coordinates before the first reading. Whitened readings are independent,
+    given the coordinates; a constant of the whitening, the same for every model of the mean, is left out.
     """
     innovations, turned = law(miss), law(slopes)
     mean, covariance, out = mean.copy(), covariance.copy(), np.zeros(len(miss))

@@ -23,7 +23,7 @@ _EM_STEPS = 12
 _LEAST = 1e-150  # least scale, for readings that are exactly as predicted
 
 
-def rows_to_previous_usable(recording: Recording) -> IntArray:
+def n_rows_since_previous_usable(recording: Recording) -> IntArray:
     """Return the number of rows back to the previous usable reading of the same scan, 0 if there is none.
 
     Shape (n_usable,): neighbours of a missing reading are two steps apart.

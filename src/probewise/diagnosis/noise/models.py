@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray, IntArray
-from probewise.diagnosis.noise.law import NoiseLaw, rows_to_previous_usable
+from probewise.diagnosis.noise.law import NoiseLaw, n_rows_since_previous_usable
 from probewise.diagnosis.noise.rounded_normal import RoundedNormal
 from probewise.effects import FittedReadings, NoiseEffect, lattice_step
 from probewise.inference import sd_floor
@@ -135,13 +135,15 @@ class NoiseModel:
         value = value_at_node(noise.lost_value)
         lost = far & (np.abs(self._usable_readings - value) <= 1e-9 * (1 + abs(value))) & (lost_share > 0)
         carry = np.where(
-            self._rows_to_previous_in_scan > 0,
-            value_at_node(noise.rho) ** np.maximum(self._rows_to_previous_in_scan, 1),
+            self._n_rows_since_previous_in_scan > 0,
+            value_at_node(noise.rho) ** np.maximum(self._n_rows_since_previous_in_scan, 1),
             0.0,
         )
         carry[lost] = 0.0
         carry[1:][lost[:-1]] = 0.0
-        walk = value_at_node(noise.walk) ** 2 * self._rows_to_previous_in_table if np.any(noise.walk) else np.zeros(0)
+        walk = (
+            value_at_node(noise.walk) ** 2 * self._n_rows_since_previous_in_table if np.any(noise.walk) else np.zeros(0)
+        )
         log_extra = 0.0
         if lost_share > 0:
             n_lost, cells = (
@@ -168,11 +170,12 @@ class NoiseModel:
         return self.recording.readings[self.recording.usable]
 
     @cached_property
-    def _rows_to_previous_in_scan(self) -> IntArray:
-        return rows_to_previous_usable(self.recording)
+    def _n_rows_since_previous_in_scan(self) -> IntArray:
+        """Number of rows since the previous usable one of the scan, 0 for its first, (n_usable,)."""
+        return n_rows_since_previous_usable(self.recording)
 
     @cached_property
-    def _rows_to_previous_in_table(self) -> FloatArray:
+    def _n_rows_since_previous_in_table(self) -> FloatArray:
         """Number of rows since the previous usable one, even of another run; for the first, since the table's start."""
         return np.diff(np.flatnonzero(self.recording.usable), prepend=-1).astype(np.float64)
 
@@ -250,7 +253,7 @@ def rough_sd(recording: Recording) -> float:
 
     The estimate includes rounding; equal readings are spread over a step, so that the median is not one of few values.
     """
-    readings, steps = recording.readings[recording.usable], rows_to_previous_usable(recording)
+    readings, steps = recording.readings[recording.usable], n_rows_since_previous_usable(recording)
     inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1
     bends = np.sort(readings[inner - 1] - 2 * readings[inner] + readings[inner + 1])
     step = lattice_step(readings)

@@ -62,7 +62,7 @@ def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, 
     columns = columns[:, norms > 0] / norms[norms > 0]
     everything = np.ones(len(found.residuals), dtype=np.bool_)
     plain = np.zeros((len(columns), 0))
-    change = found.residuals - _residuals_and_variances(found, problem, columns, everything, everything)[0]
+    change = found.residuals - _predictive_residuals_and_variances(found, problem, columns, everything, everything)[0]
 
     def gain_per_reading(out: BoolArray) -> FloatArray:
         return _held_out_log_densities(found, problem, columns, out) - _held_out_log_densities(
@@ -131,7 +131,7 @@ def improvement_and_correction(
     return gain, change
 
 
-def _residuals_and_variances(
+def _predictive_residuals_and_variances(
     found: Fit, problem: Linearised, columns: FloatArray, kept: BoolArray, asked: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
     """Fit parameters and amplitudes to the `kept` rows; return residuals and variances of the mean for `asked` rows."""
@@ -154,8 +154,8 @@ def _residuals_and_variances(
 
 
 def _held_out_log_densities(found: Fit, problem: Linearised, columns: FloatArray, out: BoolArray) -> FloatArray:
-    miss, spread = _residuals_and_variances(found, problem, columns, ~out, out)
-    kept_miss, _ = _residuals_and_variances(found, problem, columns, ~out, ~out)
+    miss, spread = _predictive_residuals_and_variances(found, problem, columns, ~out, out)
+    kept_miss, _ = _predictive_residuals_and_variances(found, problem, columns, ~out, ~out)
     n_free = max(len(kept_miss) - found.slopes.shape[1] - columns.shape[1], 1)
     total = float(kept_miss @ kept_miss) / n_free + spread
     return np.asarray(-0.5 * np.log(2 * math.pi * total) - 0.5 * miss**2 / total)

@@ -75,7 +75,7 @@ class UnknownEffects:
                     self.shares = {k: math.exp(v - total) for k, v in by_family.items()}
 
     def drop_superfluous(self, candidates: Collection[WeighedFit]) -> None:
-        """Drop an unknown effect, alone or beside named ones, if one or two more named effects explain as much.
+        """Drop an unknown effect, alone or beside one named effect, if one or two more named effects explain as much.
 
         No unknown effect may then be significant beside them. A basis of many columns, such as one value per scan, can
         imitate named effects. Two names are chosen from many more combinations than one, so they must explain

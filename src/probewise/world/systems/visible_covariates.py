@@ -31,9 +31,11 @@ def visible_covariates_of(form: Form, residuals: FloatArray, true: TrueSystem) -
     pooled |= {f"state:{name}": values for name, values in true.states.items()}
     if rows.time is not None:
         pooled["time"] = rows.t
-    shares = {name: _explained_share(residuals, _bin_numbers(values)) for name, values in pooled.items()}
+    shares = {
+        name: _excess_share_explained_by_groups(residuals, _bin_numbers(values)) for name, values in pooled.items()
+    }
     if len(rows.rows_by_run) > 1:
-        shares["run"] = _explained_share(residuals, rows.run)
+        shares["run"] = _excess_share_explained_by_groups(residuals, rows.run)
     best = max(shares.values())
     plain = [name for name, share in shares.items() if share >= _AS_PLAIN * best and share > _PLAIN]
     return tuple(dict.fromkeys((*form.covariates, *sorted(plain, key=lambda name: -shares[name]))))
@@ -51,7 +53,7 @@ def _bin_numbers(values: FloatArray) -> FloatArray:
     return np.asarray(np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0)))
 
 
-def _explained_share(residuals: FloatArray, groups: FloatArray | IntArray) -> float:
+def _excess_share_explained_by_groups(residuals: FloatArray, groups: FloatArray | IntArray) -> float:
     """Return the share of the sum of squares that group means explain, minus its expectation for white noise."""
     total, explained, n_groups = float(residuals @ residuals), 0.0, 0
     for group in np.unique(groups):

@@ -9,7 +9,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
-from probewise.world.systems.forms.modulations import amplitude_and_phase, scale_only_member, wave_bank
+from probewise.world.systems.forms.modulations import scale_only_member, starting_point_of_wave, wave_bank
 from probewise.world.systems.forms.readings import delayed
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.table import SystemTable
@@ -129,7 +129,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
                 "phase": float(rng.uniform(0, 2 * np.pi)),
             },
             bank,
-            amplitude_and_phase,
+            starting_point_of_wave,
             {"a": first, "period": 0.002 * span, "phase": 0.05},
             first,
             0.2 * span,

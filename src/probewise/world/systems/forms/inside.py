@@ -17,20 +17,22 @@ _N_WAVES = 20
 
 def forms_of_parameters(true: TrueSystem) -> Iterator[Form]:
     """Yield the ways in which each parameter may vary."""
-    common = {"steps": modulations.step(true)}
+    common = {"steps": modulations.step_at_change_point(true)}
     if true.table.time is not None:
-        common["drifts"] = modulations.along_time(true)
+        common["drifts"] = modulations.linear_drift(true)
     for name in true.kind.priors:
         own = dict(common)
         if name not in true.kind.per_run and true.kind.run is not None and len(true.table.rows_by_run) > 1:
-            own["differs"] = modulations.by_run(true)
+            own["differs"] = modulations.value_per_run(true)
         if name in true.kind.per_run and true.kind.law is not None:
             own = {}  # initial values do not vary within a run
         for kind, how in own.items():
             yield varying_parameter(true, f"{kind}:{name}", name, how)
         if not (name in true.kind.per_run and true.kind.law is not None):
             for column in true.varying_columns:
-                yield varying_parameter(true, f"depends:{name}:{column}", name, modulations.with_column(true, column))
+                yield varying_parameter(
+                    true, f"depends:{name}:{column}", name, modulations.proportional_to_column(true, column)
+                )
 
 
 def varying_parameter(true: TrueSystem, name: str, target: str, how: Modulation) -> Form:
@@ -124,7 +126,7 @@ def _term_in_state(state: str, term: Callable[[Any], Any]) -> Callable[[Any, Any
 
 
 def _periodic_term(true: TrueSystem, state: str) -> Form:
-    how = modulations.waves(true, _N_WAVES)
+    how = modulations.sinusoid_in_time(true, _N_WAVES)
     first = 0.02 * true.rms_rate(state)
     return Form(
         f"periodic_forcing:{state}",

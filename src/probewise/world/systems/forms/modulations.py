@@ -54,13 +54,13 @@ def _of_amplitude_alone(
     )
 
 
-def along_time(true: TrueSystem) -> Modulation:
+def linear_drift(true: TrueSystem) -> Modulation:
     """Return a linear drift in recorded time."""
     names = ("time",) if true.table.time in (None, "time") else ("time", str(true.table.time))
     return _of_amplitude_alone(lambda now, v: v["a"] * now.t, names, float(np.abs(true.table.t).max()))
 
 
-def with_column(true: TrueSystem, column: str) -> Modulation:
+def proportional_to_column(true: TrueSystem, column: str) -> Modulation:
     """Return a variation in proportion to a column, about its mean over the recording."""
     middle = true.mean_of(column)
     return _of_amplitude_alone(
@@ -68,7 +68,7 @@ def with_column(true: TrueSystem, column: str) -> Modulation:
     )
 
 
-def step(true: TrueSystem) -> Modulation:
+def step_at_change_point(true: TrueSystem) -> Modulation:
     """Return a step at a time, or at a row if there is no time."""
     at, timed = ("at_s", True) if true.table.time is not None else ("at_row", False)
     moments = np.quantile(np.unique(true.table.t), np.linspace(0.02, 0.98, 40))
@@ -89,7 +89,7 @@ def step(true: TrueSystem) -> Modulation:
     )
 
 
-def by_run(true: TrueSystem) -> Modulation:
+def value_per_run(true: TrueSystem) -> Modulation:
     """Return a random value per run, including held-out runs, scaled by the amplitude."""
     n = true.table.n_runs
     names = [f"values[{k}]" for k in range(n)]
@@ -119,13 +119,13 @@ def wave_bank(a: float, rates: FloatArray, name: str) -> Bank:
     return [[{"a": a, name: float(r), "phase": 0.0}, {"a": a, name: float(r), "phase": 0.5 * np.pi}] for r in rates]
 
 
-def amplitude_and_phase(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
+def starting_point_of_wave(group: Sequence[dict[str, float]], amounts: FloatArray) -> dict[str, float]:
     """Return the setting of the wave that the amounts of sine and cosine add up to."""
     sine, cosine = amounts * group[0]["a"]
     return {**group[0], "a": float(np.hypot(sine, cosine)), "phase": float(np.arctan2(cosine, sine))}
 
 
-def waves(true: TrueSystem, n: int) -> Modulation:
+def sinusoid_in_time(true: TrueSystem, n: int) -> Modulation:
     """Return one sinusoid in time, up to one period in four rows; the bank has n frequencies."""
     rows = true.table
     slowest, fastest = 1.5 / rows.duration, 0.25 / rows.median_gap
@@ -134,7 +134,7 @@ def waves(true: TrueSystem, n: int) -> Modulation:
         lambda a, drawn: {"a": a, **drawn},
         lambda rng: {"hz": draw_log_uniform(rng, slowest, fastest), "phase": float(rng.uniform(0, 2 * np.pi))},
         lambda a: wave_bank(a, np.linspace(0.4 / rows.duration, 0.5 / rows.median_gap, n), "hz"),
-        amplitude_and_phase,
+        starting_point_of_wave,
         lambda a: {"a": a, "hz": 0.02 / rows.duration, "phase": 0.1},
         ("time", str(rows.time)),
         1.0,

@@ -53,18 +53,18 @@ def modulated_reading(true: TrueSystem, name: str, how: Modulation, *, gain: boo
 
 def _modulated_forms(true: TrueSystem) -> Iterator[Form]:
     timed = true.table.time is not None
-    both = {"step": modulations.step(true)}
+    both = {"step": modulations.step_at_change_point(true)}
     if timed:
-        both["drift"] = modulations.along_time(true)
+        both["drift"] = modulations.linear_drift(true)
     if true.kind.run is not None and len(true.table.rows_by_run) > 1:
-        both["per_run"] = modulations.by_run(true)
+        both["per_run"] = modulations.value_per_run(true)
     for kind, how in both.items():
         yield modulated_reading(true, f"offset_{kind}", how)
         yield modulated_reading(true, f"gain_{kind}", how, gain=True)
     for column in true.varying_columns:
-        yield modulated_reading(true, f"sensitivity:{column}", modulations.with_column(true, column))
+        yield modulated_reading(true, f"sensitivity:{column}", modulations.proportional_to_column(true, column))
     if timed:
-        yield modulated_reading(true, "interference", modulations.waves(true, _N_WAVES))
+        yield modulated_reading(true, "interference", modulations.sinusoid_in_time(true, _N_WAVES))
         yield modulated_reading(true, "settling", modulations.settling(true))
 
 

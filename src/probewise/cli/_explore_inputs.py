@@ -47,7 +47,7 @@ class Inputs:
 
     @property
     def levels(self) -> tuple[float, float]:
-        """Readings over black and over white under the sensor model."""
+        """Posterior mean readings over black and over white."""
         means = self.sensor.mean()
         return means["I_min"], means["I_max"]
 

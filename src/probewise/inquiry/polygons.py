@@ -36,7 +36,7 @@ class EdgesInFootprintSds:
 
     @classmethod
     def of(cls, region: PolygonRegion, footprint: FixedMixture) -> Self | None:
-        """Build from n_polygons convex polygons of up to eight edges under a footprint in the lab frame; None for others."""
+        """Build from n_polygons convex polygons, of up to eight edges, under a lab-frame footprint; None for others."""
         edges = region.edges_mm
         n_edges = edges.shape[1]
         along = edges[:, :, 1] - edges[:, :, 0]

@@ -345,7 +345,10 @@ class Layout:
 
     @cached_property
     def straight_batches(self) -> tuple[StraightEdges | StraightCorners, ...]:
-        """Known straight edges and corners of all patterns, batched: the common case of calibration."""
+        """Known straight edges and corners of all patterns, batched: the common case of calibration.
+
+        Empty where orientations differ between hypotheses.
+        """
         if self.poses.orientation_rad.shape[0] > 1:
             return ()
         known = [(rows, region) for rows, region in self.rows_and_regions if region.n_regions == 1]

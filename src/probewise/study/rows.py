@@ -83,7 +83,7 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Short description of the difference from the reference."""
+        """Distribution of the circles, sensor model, and what else differs from the reference, in words."""
         words = [self.population, "SSF" if self.model == "ssf" else "naive"]
         if self.method == "paper":
             words.append("the paper's method" + (" to remaining evidence" if self.nested_stop == "remaining" else ""))

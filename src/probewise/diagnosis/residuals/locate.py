@@ -62,7 +62,7 @@ class Place:
 
     @property
     def figure_name(self) -> str:
-        """Name of the figure file that shows it, "witness_COVARIATE.svg"."""
+        """Name of the figure file that shows it, "witness_COVARIATE.svg" or "witness_COVARIATE_SCAN.svg"."""
         where = self.covariate if self.scan is None else f"{self.covariate}_{self.scan}"
         return "witness_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in where) + ".svg"
 

@@ -296,7 +296,7 @@ class Searched:
 
     @property
     def likeliest_order(self) -> int:
-        """SSF order of the most probable explanation, named or not; the null is tested at this order."""
+        """The most probable SSF order, over explanations with and without a name; the null is tested at this order."""
         by_order: dict[int, float] = {}
         terms = [
             (n, fit.log_z + self.prior.log_prior_on_mean(names)) for (n, names), fit in self.evidences.fits.items()

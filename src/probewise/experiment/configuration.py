@@ -251,7 +251,7 @@ class Experiment:
 
     @cached_property
     def goal(self) -> Goal | None:
-        """The stopping rule on the sds of lengths; None for a set of shapes, whose parameters are not known in advance."""
+        """The stopping rule on sds of lengths; None for a set of shapes, whose parameters are not known in advance."""
         if isinstance(self.shape, AnyOf):
             return None
         names = zip(self.shape_columns.tolist(), self.shape.prior.names, strict=True)

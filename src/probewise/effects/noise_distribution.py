@@ -1,4 +1,4 @@
-"""The noise distribution of a reading, with all effects on the noise: its density, its variance, draws from it."""
+"""The noise distribution of a reading, with all effects on the noise: its density and its variance."""
 
 from __future__ import annotations
 
@@ -67,31 +67,3 @@ def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray,
     width = np.where(step > 0, step, 1.0)
     in_cell = log_cell_density(readings, mean, sd, width)
     return in_cell if np.all(step) else np.where(step > 0, in_cell, log_gaussian_density(readings, mean, sd))
-
-
-def draw_readings(level: NoiseLevel, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator) -> FloatArray:
-    """Draw readings, (n_samples, n_points): AR(1) noise, outliers, random walk, lost readings, then rounding.
-
-    Parameters
-    ----------
-    level
-        The noise.
-    predicted
-        Noise-free readings, (n_samples, n_points).
-    scan
-        Scan number of each reading, in the order they were taken, (n_points,).
-    rng
-        Source of randomness.
-    """
-    noise = rng.standard_normal(predicted.shape)
-    fresh = np.sqrt(1 - level.rho[:, 0] ** 2)
-    for k in range(1, len(scan)):
-        if scan[k] == scan[k - 1]:
-            noise[:, k] = level.rho[:, 0] * noise[:, k - 1] + fresh * noise[:, k]
-    noise = noise * np.where(rng.random(predicted.shape) < level.wide_share, level.wide_times, 1.0)
-    readings = predicted + level.sd * noise
-    if np.any(level.walk):
-        readings = readings + level.sd * level.walk * np.cumsum(rng.standard_normal(predicted.shape), axis=1)
-    readings = np.where(rng.random(predicted.shape) < level.lost_share, level.lost_value, readings)
-    step = np.where(level.step > 0, level.step, 1.0)
-    return np.where(level.step > 0, step * np.round(readings / step), readings)

@@ -34,13 +34,14 @@ def brick(paper_brick, clock):
 def test_counts_are_converted_as_the_firmware_does(raw, normalized, percent):
     """LEGO's firmware, types 05 and 06, in whole numbers."""
     reading = LightReading(raw)
-    assert (reading.normalized, reading.percent) == (normalized, percent)
+    assert (reading.normalized, math.floor(reading.fine_percent)) == (normalized, percent)
     assert reading.fine_percent == pytest.approx(100 * normalized / 1023)
 
 
 def test_whole_percent_are_the_fine_ones_without_their_fraction():
     readings = [LightReading(raw) for raw in range(1024)]
-    assert [math.floor(reading.fine_percent) for reading in readings] == [reading.percent for reading in readings]
+    whole = [reading.normalized * 100 // 1023 for reading in readings]
+    assert [math.floor(reading.fine_percent) for reading in readings] == whole
 
 
 def test_only_697_values_occur():
@@ -65,7 +66,7 @@ def test_a_reading_that_is_not_valid_yet_is_left_out(brick, paper_brick):
 
 
 def test_the_led_is_on_unless_it_was_switched_off(brick, paper_brick):
-    assert brick.light(1).read().percent == 56
+    assert brick.light(1).read().normalized == 582
     assert paper_brick.input[:2] == [5, 0]
 
 

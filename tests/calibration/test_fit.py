@@ -222,7 +222,7 @@ def test_the_papers_evidence_is_that_of_importance_sampling_under_the_same_prior
     paper = calibrate(recording, rng=np.random.default_rng(1), stop=EvidenceChange(1e-8), refined=False, **common)
     other = calibrate(recording, rng=np.random.default_rng(2), **common)
     (nested,), (refined,) = paper.fits, other.fits
-    assert nested.refined is None
-    assert refined.refined.sound
+    assert nested.found.refined is None
+    assert refined.found.refined.sound
     assert abs(nested.log_z - refined.log_z) < 4 * np.hypot(nested.log_z_error, refined.log_z_error)
     assert any("nested sampling alone" in note for note in paper.sensor.notes)

@@ -5,6 +5,7 @@ import signal
 
 import numpy as np
 import pytest
+from mixtures import fixed_mixture
 from PIL import Image
 
 from probewise._signals import ENDING
@@ -12,7 +13,7 @@ from probewise.calibration import FittedSensor, write_sensor
 from probewise.recordings import Instrumentation, Recording, paper_plan, write_recording
 from probewise.report import exploration
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, footprint_of, mean_ssf_field
+from probewise.sensor import Chain, FixedLevels, footprint_of, mean_ssf_field
 
 NAMES = ("a_1", "u_1", "v_1", "A_1", "B_1", "C_1", "I_min", "I_max")
 TRUTH = np.array([0.5, 0.0, 1.5, 1 / 32, 1 / 12.5, 0.0, 10.0, 60.0])
@@ -45,7 +46,7 @@ def small_recording() -> Recording:
     """Every fourth reading of the paper's plan, by the chain itself with noise of sd 0.6."""
     plan = paper_plan()
     plan = plan.take(np.arange(0, len(plan), 4))
-    chain = Chain(FixedMixture.from_parameters(TRUTH[:6]), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
+    chain = Chain(fixed_mixture(TRUTH[:6]), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
     noise = 0.6 * np.random.default_rng(1).standard_normal(len(plan))
     return Recording(plan, chain.predict(np.empty((1, 0)), plan)[0] + noise)
 

@@ -4,13 +4,14 @@ import json
 
 import numpy as np
 import pytest
+from mixtures import fixed_mixture
 
 from probewise.calibration import read_sensor
 from probewise.cli import main
 from probewise.experiment import experiment_for
 from probewise.recordings import Disc, Instrumentation, Plan, read_plan
 from probewise.scene import Circle, Field, KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor import Chain, FixedLevels
 
 CENTRE_MM, RADIUS_MM = (520.0, 240.0), 80.0
 
@@ -47,7 +48,7 @@ def journal_file(sensor_file, tmp_path):
         patterns={"field": Disc(CENTRE_MM, RADIUS_MM)},
         instrumentation=Instrumentation(),
     )
-    ssf = FixedMixture.from_parameters(sensor.samples.mean(axis=0)[:6])
+    ssf = fixed_mixture(sensor.samples.mean(axis=0)[:6])
     exact = Chain(ssf, FixedLevels(10.0, 60.0), KnownScene(plan.patterns)).predict(np.empty((1, 0)), plan)[0]
     noise = 0.5 * np.random.default_rng(6).standard_normal(n)
     readings = np.round(np.minimum(exact, 50.0) + noise)

@@ -218,7 +218,7 @@ def test_a_block_bayes_factor_is_the_integral_over_its_amplitude():
     augmented = np.concatenate([r, np.zeros(p)])
     residual = augmented - basis @ (basis.T @ augmented)
     problem = Linearised(basis, residual, white_noise(n), 1.0, n)
-    blocks = OrthonormalBlocks.of(problem, [template], ["t"])
+    blocks = OrthonormalBlocks.of(problem, [template])
     found = block_log_bayes_factors(blocks, residual[:, None], n)[0, 0]
 
     unit = problem.project(template / np.sqrt(np.mean(template**2)))[:, 0]
@@ -260,7 +260,7 @@ def test_a_bank_weighs_as_blocks_do():
     residuals = rng.normal(size=(n + p, 3))
     residuals -= basis @ (basis.T @ residuals)
     problem = Linearised(basis, residuals[:, 0], law, 1.3, n)
-    blocks = OrthonormalBlocks.of(problem, templates, [""] * 4)
+    blocks = OrthonormalBlocks.of(problem, templates)
     wanted = block_log_bayes_factors(blocks, residuals, n)
     np.testing.assert_allclose(TemplateBank.of(templates, ["a"] * 4, n).log_bayes_factors(problem, residuals), wanted)
 

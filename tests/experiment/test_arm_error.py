@@ -14,7 +14,8 @@ from probewise.arm.geometry import Accuracy
 from probewise.arm.marks import choose_mark_places
 from probewise.arm.uncertainty import FITTED, RULER_SDS, places_at_values, slopes_mm, values_of_fitted
 from probewise.errors import FileError, ParameterError
-from probewise.experiment import FittedArm, explore, found_shape, result_json, run, run_with_arm_error, samples_csv
+from probewise.experiment import FittedArm, explore, found_shape, result_json, run, samples_csv
+from probewise.experiment.arm_error import arm_error_in_posterior
 
 ARM = dataclasses.replace(read_geometry(shipped_geometry_path()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0))
 LEVELS = DARK, WHITE = 10.0, 60.0
@@ -37,6 +38,15 @@ def found(request):
     return run(small.arm(), experiment, rng=np.random.default_rng(4), max_readings=25)
 
 
+def with_arm_error(exploration, geometry):
+    """A run that has ended, with the error of a fitted arm added to its posterior."""
+    last = exploration.last
+    of = (exploration.experiment, FittedArm(geometry, LEVELS), exploration.readings, last.posterior)
+    moments = {name: getattr(last, name) for name in ("mean", "sd", "likely_shape")}
+    error = arm_error_in_posterior(*of, last.kinds.with_warier_odds, **moments, rng=np.random.default_rng(1))
+    return dataclasses.replace(exploration, steps=(*exploration.steps[:-1], dataclasses.replace(last, arm_error=error)))
+
+
 def mean_on_a_grid(exploration, off_mm, height_off_mm):
     """Infer the circle anew with every reading elsewhere and at another height, on a grid about what was found."""
     last = exploration.last
@@ -54,7 +64,7 @@ def mean_on_a_grid(exploration, off_mm, height_off_mm):
 @pytest.mark.parametrize("name", ["base home", "elbow home", "upper link", "base y", "shoulder height"])
 def test_the_shape_moves_with_the_arm_as_an_inference_anew_says(found, name):
     sd = {"shoulder height": 0.3}.get(name, float(RULER_SDS[FITTED.index(name)]) / 20)
-    claimed = run_with_arm_error(found, only(name, sd), levels=LEVELS, rng=np.random.default_rng(1))
+    claimed = with_arm_error(found, only(name, sd))
     places = np.array([(r.pose.x_mm, r.pose.y_mm) for r in found.readings])
     middle = np.array([ARM.field_mm]) / 2
     off = sd * slopes_mm(ARM, np.concatenate([places, middle]))[:, :, FITTED.index(name)]
@@ -68,20 +78,20 @@ def test_the_shape_moves_with_the_arm_as_an_inference_anew_says(found, name):
 
 
 def test_a_base_that_stands_elsewhere_moves_the_shape_and_does_not_stretch_it(found):
-    claimed = run_with_arm_error(found, only("base x", 3.0), levels=LEVELS, rng=np.random.default_rng(1))
+    claimed = with_arm_error(found, only("base x", 3.0))
     np.testing.assert_allclose(claimed.arm_error.sd, [3.0, 0.0, 0.0], atol=0.1)
     np.testing.assert_allclose(claimed.sd, np.hypot(found.last.sd, claimed.arm_error.sd))
 
 
 def test_a_height_that_the_calibration_shared_moves_nothing(found):
     """A shoulder that is higher by one amount everywhere dims the sensor as much when it is calibrated."""
-    claimed = run_with_arm_error(found, only("shoulder height", 2.0), levels=LEVELS, rng=np.random.default_rng(1))
+    claimed = with_arm_error(found, only("shoulder height", 2.0))
     np.testing.assert_allclose(claimed.arm_error.sd, 0.0, atol=1e-6)
 
 
 def test_samples_files_and_words_are_as_wide_as_readings_and_arm_together(found):
     sds = [0.001, 0.002, 0.002, 1.0, 1.0, 0.7, 0.7, 1.0, 1.0]
-    claimed = run_with_arm_error(found, known_to(sds), levels=LEVELS, rng=np.random.default_rng(1))
+    claimed = with_arm_error(found, known_to(sds))
     np.testing.assert_allclose(claimed.posterior.sd(), claimed.sd, rtol=0.05)
     np.testing.assert_allclose(claimed.posterior.mean(), found.last.mean, atol=0.1)
     of_file = {p["name"]: p for p in json.loads(result_json(claimed))["shape"]["parameters"]}
@@ -101,21 +111,18 @@ def test_samples_files_and_words_are_as_wide_as_readings_and_arm_together(found)
 
 def test_a_geometry_that_nobody_fitted_says_nothing_of_the_shape(found):
     with pytest.raises(ParameterError, match=r"\[accuracy\]"):
-        run_with_arm_error(found, ARM, levels=LEVELS, rng=np.random.default_rng(1))
+        with_arm_error(found, ARM)
     far = dataclasses.replace(known_to(RULER_SDS / 10), axis_mm=(200.0, 2000.0))
     with pytest.raises(ParameterError, match="reach"):
-        run_with_arm_error(found, far, levels=LEVELS, rng=np.random.default_rng(1))
+        with_arm_error(found, far)
 
 
 def test_light_that_falls_less_with_the_height_moves_the_shape_less(found):
     arm = only("elbow home", 0.02)
-    square = run_with_arm_error(found, arm, levels=LEVELS, rng=np.random.default_rng(1))
+    square = with_arm_error(found, arm)
     none = dataclasses.replace(arm, light_per_mm=0.0)
     same = dataclasses.replace(arm, light_per_mm=2 / ARM.read_height_mm * (WHITE - DARK) / WHITE)
-    claimed = [
-        run_with_arm_error(found, each, levels=LEVELS, rng=np.random.default_rng(1)).arm_error.sd
-        for each in (same, none)
-    ]
+    claimed = [with_arm_error(found, each).arm_error.sd for each in (same, none)]
     np.testing.assert_allclose(claimed[0], square.arm_error.sd)
     assert (claimed[1] < square.arm_error.sd).all()
 
@@ -209,7 +216,7 @@ def test_two_hundred_fitted_arms_miss_the_circle_by_what_is_claimed(found):
         seen = ndtr((TRUE[2] - np.hypot(*(stands[:-1, :2] - TRUE[:2]).T)) / 8.0)
         values = DARK + 50.0 * (14.0 / height_mm) ** 2 * seen + rng.standard_normal(len(told))
         theta, sd = circle_by(told, values)
-        arm_sd = run_with_arm_error(found, fitted, levels=LEVELS, rng=rng).arm_error.sd
+        arm_sd = with_arm_error(found, fitted).arm_error.sd
         with_arm.append((theta - TRUE) / np.hypot(sd, arm_sd))
         without.append((theta - TRUE) / sd)
     held = np.mean(np.abs(with_arm) < 1.96, axis=0)

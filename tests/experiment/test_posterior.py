@@ -1,6 +1,7 @@
 """Kinds of hypotheses weighed against each other at every reading, against sums over a lattice of all hypotheses."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -64,7 +65,7 @@ def followed(experiment, n, *, seed=0):
             experiment.problem(readings(k)).recording,
             experiment.n_particles,
             rng=random,
-            from_scratch=lambda problem: nested_sampling_from_scratch(problem, experiment.n_live, random),
+            from_scratch=partial(nested_sampling_from_scratch, n_live=experiment.n_live, rng=random),
         )
         yield now
 
@@ -131,7 +132,7 @@ def test_a_kind_that_cannot_be_is_impossible_and_the_others_go_on(small):
             experiment.problem(taken[:k]).recording,
             1500,
             rng=random,
-            from_scratch=lambda problem: nested_sampling_from_scratch(problem, experiment.n_live, random),
+            from_scratch=partial(nested_sampling_from_scratch, n_live=experiment.n_live, rng=random),
         )
     np.testing.assert_array_equal(now.probability, [0.0, 1.0])
 
@@ -146,5 +147,5 @@ def test_readings_that_no_kind_allows_are_refused(small):
             experiment.problem([Reading(200.0, Pose(150.0, 140.0), 0.0)]).recording,
             300,
             rng=random,
-            from_scratch=lambda problem: nested_sampling_from_scratch(problem, experiment.n_live, random),
+            from_scratch=partial(nested_sampling_from_scratch, n_live=experiment.n_live, rng=random),
         )

@@ -3,6 +3,7 @@
 import json
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -25,7 +26,6 @@ from probewise.experiment import (
     posterior,
     repaired_sensor,
     result_json,
-    run_with_arm_error,
     step,
 )
 from probewise.experiment.acquisition import ArmOverGrid, predict_and_rate_readings
@@ -45,7 +45,6 @@ from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
 from probewise.inquiry import Readout, prior_entropy
-from probewise.nested import run
 from probewise.recordings import Instrumentation
 from probewise.sensor import mixture_names
 from probewise.study import ConcealedTrial, arm_of, concealed_table, experiment_of, run_concealed_trial
@@ -251,29 +250,27 @@ def test_a_few_stragglers_of_a_name_promise_nothing():
 
 def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting):
     """Kinds of hypotheses weigh as they do in the posterior that is reported, not by the odds of their names."""
-    rng = np.random.default_rng(3)
-    with arm_of(Trial(REFERENCE, 0)) as simulated:
-        field = ArmOverGrid.from_instrument(simulated, doubting.grid)
-    state, found = begin(doubting, field, rng=rng), []
-    for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
-        reading = Reading(value, Pose(x, y), 8.0 * k)
-        state, last = step(state, reading, doubting, field, prior_bits=20.0, rng=rng, max_readings=3)
-        found.append(last)
     covariance = np.diag([0.2**2 if name == "base x" else 0.0 for name in FITTED])
     accuracy = Accuracy(8, 1.0, 1.0, 0.001, tuple(map(tuple, covariance.tolist())))
     geometry = replace(
         read_geometry(shipped_geometry_path()), field_mm=(400.0, 300.0), axis_mm=(200.0, 360.0), accuracy=accuracy
     )
+    fitted, rng = FittedArm(geometry, (10.0, 60.0)), np.random.default_rng(3)
+    experiment = replace(doubting, fitted_arm=fitted)
+    with arm_of(Trial(REFERENCE, 0)) as simulated:
+        field = ArmOverGrid.from_instrument(simulated, experiment.grid)
+    state = begin(experiment, field, rng=rng)
+    for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
+        reading = Reading(value, Pose(x, y), 8.0 * k)
+        state, last = step(state, reading, experiment, field, prior_bits=20.0, rng=rng, max_readings=3)
 
     def slopes(kinds):
-        of = (doubting, FittedArm(geometry, (10.0, 60.0)), state.readings, last.posterior, kinds)
+        of = (experiment, fitted, state.readings, last.posterior, kinds)
         named = {"mean": last.mean, "sd": last.sd, "likely_shape": ""}
         return arm_error_in_posterior(*of, **named, rng=np.random.default_rng(1)).slopes
 
-    run = Exploration(doubting, tuple(found))
-    claimed = run_with_arm_error(run, geometry, levels=(10.0, 60.0), rng=np.random.default_rng(1)).arm.slopes
-    np.testing.assert_allclose(claimed, slopes(last.kinds.with_warier_odds))
-    assert not np.allclose(claimed, slopes(last.kinds))
+    np.testing.assert_allclose(last.arm.slopes, slopes(last.kinds.with_warier_odds))
+    assert not np.allclose(last.arm.slopes, slopes(last.kinds))
 
 
 @pytest.mark.parametrize(("angles_deg", "asked_deg"), [((0, 20, 40), 200), ((0, 120, 240), None), ((0, 180), None)])
@@ -451,20 +448,8 @@ def played(experiment, kind, width_mm):
     return experiment.problem(read).recording
 
 
-def solver(n_live, rng):
-    """Nested sampling from scratch, with as many live points whether quick or not."""
-
-    def solve(problem, *, quick=False):
-        return nested_sampling_from_scratch(problem, n_live, rng)
-
-    return solve
-
-
 def test_a_mode_that_samples_and_fits_have_lost_is_found_by_a_search_from_scratch(doubting):
-    """The leading rival's samples followed the readings in a false mode: a periodic error of another period.
-
-    Two routes to its evidence: the search within the mixture, and slice sampling of the kind alone.
-    """
+    """The leading rival's samples followed the readings in a false mode: a periodic error of another period."""
     rng = np.random.default_rng(4)
     kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "periodic_position_error")]
     kind = kinds[1]
@@ -496,10 +481,12 @@ def test_a_mode_that_samples_and_fits_have_lost_is_found_by_a_search_from_scratc
     )
     plain = replace(start.particles[0], weighted=replace(start.particles[0].weighted, log_z=float(likelihood.mean())))
     now = replace(start, particles=(plain, lost))
-    found = with_rivals_sampled_again(now, recording, 600, rng=rng, from_scratch=solver(100, rng)).particles[1]
-    right = run(problem, rng=rng, n_live=400, max_cost=1.0)
+    solve = partial(nested_sampling_from_scratch, n_live=200, rng=rng)
+    found = with_rivals_sampled_again(now, recording, 600, rng=rng, from_scratch=solve).particles[1]
     assert found.log_z > lost.log_z + 20.0
-    assert found.log_z == pytest.approx(right.log_z, abs=4 * math.hypot(found.log_z_error, right.log_z_error))
+    # Nine of ten samples of a posterior of six parameters are less than 5.4 nats below its top (chi-square, 6 degrees).
+    at_truth = problem.log_likelihood(true)[0]
+    assert np.quantile(found.weighted.log_likelihood, 0.2) > at_truth - 5.4
     mean, sd = found.weighted.mean(), found.weighted.sd()
     assert np.abs(mean[:3] - true[0, :3]).max() < 4 * sd[:3].max()
 
@@ -510,7 +497,7 @@ def test_a_rival_whose_samples_went_astray_is_found_from_what_others_believe(dou
     rng = np.random.default_rng(seed)
     kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
     problem = kind.problem(played(doubting, kind, 6.0))
-    right = nested_sampling_from_scratch(problem, 200, rng)
+    right = nested_sampling_from_scratch(problem, n_live=200, rng=rng)
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     lost = replace(prior_posterior([kind], 500, rng=rng).particles[0].weighted, log_z=-1000.0)
@@ -525,7 +512,7 @@ def test_what_fits_promise_is_the_evidence(doubting):
     """Two routes: Gaussians about fits, and nested sampling. Gear play of 6 mm is known to a few tenths."""
     kind = next(kind for kind in doubting.kinds if kind.left_out == "backlash")
     problem, rng = kind.problem(played(doubting, kind, 6.0)), np.random.default_rng(5)
-    right = nested_sampling_from_scratch(problem, 200, rng)
+    right = nested_sampling_from_scratch(problem, n_live=200, rng=rng)
     plain = prior_posterior(doubting.kinds[:1], 600, rng=rng).particles[0].weighted
     donor = replace(plain, theta=np.array([915.0, 235.0, 72.0]) + 4.0 * rng.standard_normal((600, 3)))
     assert fit_kind(kind, problem, [donor], noise_sd=1.0, rng=rng).highest_log_z == pytest.approx(right.log_z, abs=3.0)
@@ -536,7 +523,7 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
     kinds = [kind for kind in doubting.kinds if kind.left_out in ("", "backlash", "nonlinearity")]
     recording, rng = played(doubting, kinds[-1], 12.0), np.random.default_rng(1)
     now = prior_posterior(kinds, 3000, rng=rng)
-    solved = solver(100, rng)
+    solved = partial(nested_sampling_from_scratch, n_live=100, rng=rng)
     for n in range(1, len(recording) + 1):
         now = updated(now, recording.take(np.arange(n)), 3000, rng=rng, from_scratch=solved)
     once = with_rivals_sampled_again(now, recording, 3000, rng=rng, from_scratch=solved)
@@ -565,7 +552,7 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
 
     def from_nothing(problem, *, quick=False):
         solved.append(problem)
-        return nested_sampling_from_scratch(problem, 100, rng)
+        return nested_sampling_from_scratch(problem, n_live=100, rng=rng)
 
     def by_few(found, kind, problem, own, *, n_draws, with_own, rng):
         weighted = sampled_about_fits(found, kind, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
@@ -641,7 +628,7 @@ def test_a_step_of_the_light_is_not_lost_when_it_begins(seed):
     for k in range(1, len(read) + 1):
         recording = experiment.problem(read[:k]).recording
         now = updated(
-            now, recording, 3000, rng=rng, from_scratch=lambda problem: nested_sampling_from_scratch(problem, 100, rng)
+            now, recording, 3000, rng=rng, from_scratch=partial(nested_sampling_from_scratch, n_live=100, rng=rng)
         )
     assert now.left_out["ambient_step"] > 0.97
 
@@ -663,10 +650,12 @@ def test_a_rival_that_leaves_the_shape_open_has_the_evidence_of_nested_sampling(
     kinds = {kind.left_out: kind for kind in doubting.kinds}
     rng = np.random.default_rng(12)
     saturated, stepped_light = kinds["saturation"], kinds["ambient_step"]
-    donor = nested_sampling_from_scratch(saturated.problem(recording), 200, rng)
-    before = nested_sampling_from_scratch(stepped_light.problem(doubting.problem(readings[:9]).recording), 200, rng)
+    donor = nested_sampling_from_scratch(saturated.problem(recording), n_live=200, rng=rng)
+    before = nested_sampling_from_scratch(
+        stepped_light.problem(doubting.problem(readings[:9]).recording), n_live=200, rng=rng
+    )
     problem = stepped_light.problem(recording)
-    truth = nested_sampling_from_scratch(problem, 400, rng)
+    truth = nested_sampling_from_scratch(problem, n_live=400, rng=rng)
     fits = fit_kind(stepped_light, problem, [donor, before], noise_sd=1.0, rng=rng)
     found = sampled_about_fits(fits, stepped_light, problem, before, n_draws=2000, with_own=False, rng=rng)
     assert truth.log_z > donor.log_z + 1.0

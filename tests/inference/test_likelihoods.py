@@ -12,10 +12,8 @@ from scipy.stats import norm
 
 from probewise.errors import ParameterError, ShapeError
 from probewise.inference import (
-    GaussianInferred,
     GaussianKnown,
     Naive,
-    PooledSigma,
     SensorProblem,
     StudentT,
     log_sigma_integral,
@@ -24,8 +22,7 @@ from probewise.inference import (
     sd_floor,
     student_t_of,
 )
-from probewise.inference.gaussian import log_prob_gaussian
-from probewise.priors import LogUniform, Product, Uniform
+from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Instrumentation, Plan, Recording
 
 
@@ -122,30 +119,6 @@ def test_student_t_with_many_readings_ranks_as_the_paper_does() -> None:
     assert got[0] - got[1] == pytest.approx(25 * math.log(4.0), abs=1e-9)
 
 
-def test_the_pooled_sigma_predicts_what_integrating_over_it_gives() -> None:
-    """Predictive density of a new reading, by quadrature over sigma."""
-    residual = np.array([0.3, -0.5, 0.2, 0.9, -0.1])
-    pooled = StudentT(np.array([0, 0, 1, 1, 2]), 0.05, 5.0).pooled(residual, np.zeros((1, 5)))
-    new = np.array([0.7, -2.0])
-    sigma = np.geomspace(0.05, 5.0, 200_001)
-    weight = sigma ** (-5.0) * np.exp(-0.5 * (residual**2).sum() / sigma**2)
-    weight /= weight.sum()
-    by_hand = [math.log(weight @ norm.pdf(x, 0, sigma)) for x in new]
-    assert pooled.log_density(new, np.zeros((1, 2)))[0] == pytest.approx(by_hand, abs=1e-4)
-    joint = math.log(weight @ (norm.pdf(new[0], 0, sigma) * norm.pdf(new[1], 0, sigma)))
-    assert pooled.log_prob(new, np.zeros((1, 2)))[0] == pytest.approx(joint, abs=1e-4)
-    assert pooled.noise_sd()[0] == pytest.approx(math.sqrt(weight @ sigma**2), rel=1e-4)
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, 3])
-def test_the_pooled_sigma_of_few_readings_has_an_sd(n: int) -> None:
-    sigma = np.geomspace(0.1, 10.0, 400_001)
-    weight = sigma ** (-float(n)) * np.exp(-0.5 * 0.4 / sigma**2) if n else np.ones_like(sigma)
-    square = np.array([0.4 if n else 0.0])
-    expected = math.sqrt((weight @ sigma**2) / weight.sum())
-    assert PooledSigma(square, n, 0.1, 10.0).noise_sd()[0] == pytest.approx(expected, rel=1e-3)
-
-
 def test_gaussian_likelihoods_add_up_normal_densities() -> None:
     rng = np.random.default_rng(2)
     readings, predicted = rng.normal(size=6), rng.normal(size=(4, 6))
@@ -155,23 +128,6 @@ def test_gaussian_likelihoods_add_up_normal_densities() -> None:
     assert GaussianKnown(0.7).log_prob(readings, predicted) == pytest.approx(
         norm.logpdf(readings, predicted, 0.7).sum(axis=1)
     )
-    each = rng.uniform(0.5, 2, 4)
-    assert log_prob_gaussian(readings, predicted, each) == pytest.approx(
-        norm.logpdf(readings, predicted, each[:, None]).sum(axis=1)
-    )
-
-
-def test_an_inferred_sd_is_one_more_column() -> None:
-    """The wrapper agrees with the known-sd problem at each sd, and leaves unusable rows out."""
-    rec = recording([0.1, 1.2, float("nan"), 2.9])
-    sensor = Product({"slope": Uniform(0, 2), "start": Uniform(-1, 1)})
-    problem = GaussianInferred(sensor, Line(), rec, LogUniform(0.01, 10))
-    assert problem.prior.names == ("slope", "start", "noise.sd")
-    got = problem.log_likelihood(np.array([[1.0, 0.0, 0.3], [0.9, 0.1, 2.0]]))
-    for row, sd in ((0, 0.3), (1, 2.0)):
-        known = SensorProblem(sensor, Line(), GaussianKnown(sd), rec)
-        assert got[row] == pytest.approx(known.log_likelihood(np.array([[1.0, 0.0], [0.9, 0.1]]))[row])
-    assert problem.prior.from_unit_cube(np.full((1, 3), 0.5))[0] == pytest.approx([1.0, 0.0, math.sqrt(0.1)])
 
 
 def test_a_few_hypotheses_at_a_time_are_weighed_as_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,6 @@ from scipy.stats import norm
 from probewise.errors import ParameterError, ShapeError
 from probewise.inquiry import (
     Finishing,
-    FunctionValue,
     Goal,
     Grid,
     InformationAbout,
@@ -79,7 +78,7 @@ def test_repeats_tell_more_and_never_more_than_all_there_is(made):
 
 def test_information_about_a_label_leaves_the_rest_out(made):
     """Rows 0, 1 | 2, 3: the second place tells rows of one label apart, the third also the labels."""
-    label = FunctionValue(lambda theta: theta[:, 0], n_bins=2)
+    label = ParameterValue("row", n_bins=2)
     np.testing.assert_allclose(InformationAbout(label)(made.listed(APART)), [0.0, 0.0, 1.0], atol=1e-3)
 
 

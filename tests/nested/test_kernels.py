@@ -6,7 +6,7 @@ from scipy.stats import kstest, multivariate_normal
 
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Bound, Evaluator
-from probewise.nested.kernels import KernelMove, Kernels, diversify_by_kernels
+from probewise.nested.kernels import KernelMove, Kernels
 from probewise.nested.run import run
 from probewise.priors import Product, Uniform
 
@@ -90,25 +90,6 @@ def test_nested_sampling_by_kernels_finds_the_evidence_of_two_unequal_modes():
     share = result.weight[result.theta[:, 0] > 0].sum()
     assert share == pytest.approx(0.75, abs=0.25)
     assert result.insertion_p_value > 1e-4
-
-
-def test_replications_become_samples_of_the_posterior():
-    """50 copies of two points, 1000 steps each: moments within five standard errors."""
-
-    class Normals:
-        prior = Product({"a": Uniform(-50.0, 50.0), "b": Uniform(-50.0, 50.0)})
-
-        def log_likelihood(self, theta):
-            return -0.5 * ((theta[:, 0] - 3.0) ** 2 + ((theta[:, 1] + 1.0) / 4.0) ** 2)
-
-    rng = np.random.default_rng(6)
-    start = np.repeat([[3.5, 2.0], [2.0, -3.0]], 25, axis=0)
-    around = rng.normal([3.0, -1.0], [1.0, 4.0], (200, 2))
-    theta, tally = diversify_by_kernels(start, around, Normals(), rng=rng, n_steps=1000)
-    assert tally.n_distinct == 50
-    assert tally.acceptance > 0.2
-    assert (np.abs(theta.mean(axis=0) - [3.0, -1.0]) < 5 * np.array([1.0, 4.0]) / np.sqrt(50)).all()
-    assert (np.abs(np.log(theta.std(axis=0) / [1.0, 4.0])) < 5 / np.sqrt(100)).all()
 
 
 def test_where_kernels_are_wasteful_chains_take_over():

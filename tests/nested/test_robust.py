@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from probewise.errors import NotConvergedError, ParameterError
-from probewise.nested import RemainingEvidence, diversify, diversify_by_kernels, refine, repartitioned, run
+from probewise.nested import RemainingEvidence, diversify, refine, repartitioned, run
 from probewise.priors import Product, Uniform
 
 SQUARE = Product({"a": Uniform(-3.0, 3.0), "b": Uniform(-3.0, 3.0)})
@@ -116,6 +116,4 @@ def test_a_prior_without_its_inverse_runs_and_is_refused_where_the_inverse_is_ne
         repartitioned(problem, result.theta)  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match="a prior with log_prob"):
         diversify(result.theta[:5], problem, rng=seeded())  # type: ignore[arg-type]
-    with pytest.raises(ParameterError, match="a prior with log_prob"):
-        diversify_by_kernels(result.theta[:5], result.theta, problem, rng=seeded())  # type: ignore[arg-type]
     assert n_asked == 0

@@ -6,6 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from mixtures import fixed_mixture
 
 from probewise.diagnosis import ParameterFound, Place, audit_recorded, diagnose
 from probewise.recordings import Recording, paper_plan, read_plan, shipped
@@ -18,7 +19,7 @@ from probewise.report.plots import gain_by_scan, scan_with_residuals
 from probewise.report.residual_means import mean_residuals
 from probewise.report.words import typeset
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor import Chain, FixedLevels
 
 SPOT = np.array([1.0, 0.0, 1.5, 1 / 72, 1 / 128, 0.0])
 
@@ -28,7 +29,7 @@ def saturated():
     """A diagnosis of a third of the paper's plan, by electronics that give no more than 50 of 60."""
     plan = paper_plan()
     plan = plan.take(np.arange(0, len(plan), 3))
-    exact = Chain(FixedMixture.from_parameters(SPOT), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
+    exact = Chain(fixed_mixture(SPOT), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
     noise = 0.5 * np.random.default_rng(3).standard_normal(len(plan))
     readings = np.minimum(exact.predict(np.empty((1, 0)), plan)[0], 50.0) + noise
     return diagnose(Recording(plan, readings), rng=np.random.default_rng(1))

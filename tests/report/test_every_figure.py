@@ -90,7 +90,6 @@ FIGURES = {
     "ssf_by_order": lambda s: plots.ssf_by_order(
         dict.fromkeys((1, 2, 3), blob()), {1: -389.8, 2: -394.0, 3: -397.7}, {1: 0.02, 2: 0.5, 3: 0.6}
     ),
-    "log_evidences": lambda s: plots.log_evidences([1, 2], [-3.0, -5.0], [0.1, 0.2]),
     "effect_probabilities_by_reading": lambda s: plots.effect_probabilities_by_reading(DOUBT),
     "posterior_widths": lambda s: plots.posterior_widths(WIDTHS),
     "information_gained": lambda s: plots.information_gained({k: np.arange(16.0) for k in WIDTHS}),

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mixtures import fixed_mixture
 from scipy.special import ndtr
 
 from probewise.effects import HeightGradient, PositionScale
@@ -68,7 +69,7 @@ CHAINS = {
     "one_free": (Chain(FreeMixture(1), FreeLevels(), KnownScene(PATTERNS)), lambda n: thetas(n, 1)),
     "two_free": (Chain(FreeMixture(2), FreeLevels(), KnownScene(PATTERNS)), lambda n: thetas(n, 2)),
     "known_sensor": (
-        Chain(FixedMixture.from_parameters(TWO), FixedLevels(10, 50), HypothesisScene(Circle())),
+        Chain(fixed_mixture(TWO), FixedLevels(10, 50), HypothesisScene(Circle())),
         lambda n: np.random.default_rng(2).uniform([-5, -5, 5], [5, 5, 12], (n, 3)),
     ),
     "field": (
@@ -179,7 +180,7 @@ def test_the_field_route_agrees_with_the_closed_forms():
     field = DiscreteSSF(mean_ssf_field(footprint_of(TWO[None], 2), u_mm=u, v_mm=u))
     plan = plan_of(20)
     scene, levels = KnownScene(PATTERNS), FixedLevels(10, 50)
-    closed = Chain(FixedMixture.from_parameters(TWO), levels, scene).predict(np.zeros((1, 0)), plan)
+    closed = Chain(fixed_mixture(TWO), levels, scene).predict(np.zeros((1, 0)), plan)
     summed = Chain(field, levels, scene).predict(np.zeros((1, 0)), plan)
     assert np.abs(summed - closed).max() < 0.04
 
@@ -201,7 +202,7 @@ def test_few_nodes_are_enough_for_the_robot(shape):
 
 def test_a_set_of_shapes_goes_through_the_chain():
     shape = AnyOf({"circle": Circle(), "rectangle": Rectangle()})
-    ssf, levels = FixedMixture.from_parameters(TWO), FixedLevels(10, 50)
+    ssf, levels = fixed_mixture(TWO), FixedLevels(10, 50)
     theta = shape.prior.from_unit_cube(np.random.default_rng(0).random((30, 7)))
     plan = replace(plan_of(50), x_mm=np.linspace(0, 1048, 50), y_mm=np.linspace(0, 520, 50)[::-1])
     found = Chain(ssf, levels, HypothesisScene(shape)).predict(theta, plan)
@@ -329,7 +330,7 @@ def test_a_known_width_with_a_place_of_each_hypothesis_equals_one_by_one():
         return SceneView({**view.regions, "disc": disc_region(np.repeat([[3.0, 1.0]], len(t), axis=0), 8.0 + t[:, 0])})
 
     plan = plan_of()
-    chain = Chain(FixedMixture.from_parameters(TWO), FixedLevels(10, 50), KnownScene(PATTERNS))
+    chain = Chain(fixed_mixture(TWO), FixedLevels(10, 50), KnownScene(PATTERNS))
     for effect in (Doer("move", Stage.FOOTPRINT, move), Doer("grow", Stage.SCENE, grow)):
         model = chain.with_effects(effect)
         theta = np.array([[0.0], [1.5], [3.0]])

@@ -26,7 +26,7 @@ from probewise.calibration.sensor_file import FittedSensor, OrderEvidence
 from probewise.calibration.smc import SMCResult
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.inference import SensorProblem, sd_ceiling, sd_floor
-from probewise.nested import NestedResult, StopRule, Weighted
+from probewise.nested import NestedResult, StopRule
 from probewise.recordings import Recording, fingerprint
 from probewise.recordings.plan import require_described, require_recording
 from probewise.sensor import SSFField
@@ -49,11 +49,6 @@ class OrderFit:
     def result(self) -> NestedResult | SMCResult:
         """The posterior samples: of a nested sampling run, or of the SMC run (climb) of a quick calibration."""
         return self.found.result
-
-    @property
-    def refined(self) -> Weighted | None:
-        """The evidence of a nested sampling run refined by importance sampling; None where that was not done."""
-        return self.found.refined
 
     @property
     def log_z(self) -> float:

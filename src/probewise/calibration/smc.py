@@ -106,7 +106,7 @@ class SMCResult(ShowsItself):
 
     @property
     def log_z_error(self) -> float:
-        """Standard error of log Z: `start_error`, and the scatter of the clouds, as of Student's t since they are few."""
+        """Standard error of log Z: `start_error`, and the scatter of the clouds, as of Student's t, as they are few."""
         relative = np.exp(self.log_z_of_clouds - self.log_z)
         n = len(relative)
         return math.hypot(float(relative.std(ddof=1)) * math.sqrt((n - 1) / (n - 3) / n), self.start_error)

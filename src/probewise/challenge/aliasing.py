@@ -109,7 +109,7 @@ def _templates_and_explained_squares(
 ) -> tuple[EffectTemplates, FloatArray]:
     """Build an effect's template bank, and the sum of squares that each entry explains, (n_entries,)."""
     templates = templates_of_effect(found, effect, usable)
-    blocks = OrthonormalBlocks.of(problem, templates.columns, [effect.name] * len(templates.columns))
+    blocks = OrthonormalBlocks.of(problem, templates.columns)
     return templates, np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
 
 

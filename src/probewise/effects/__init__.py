@@ -23,7 +23,7 @@ from probewise.effects.lattice import Quantisation, lattice_step, lattice_step_s
 from probewise.effects.misplacement import EdgeMisplacement, ScanMisplacement
 from probewise.effects.motion import scan_indicator, sign_of_motion
 from probewise.effects.noise import CorrelatedNoise, DriftingNoise, NoisePerRun, RandomWalk, SignalDependentNoise
-from probewise.effects.noise_distribution import FittedReadings, draw_readings, log_density, variance
+from probewise.effects.noise_distribution import FittedReadings, log_density, variance
 from probewise.effects.offsets import AmbientGradient, AmbientStep, OffsetDrift
 from probewise.effects.pose import Backlash, PositionScale
 from probewise.effects.predictive_mixture import PredictiveMixture
@@ -197,7 +197,6 @@ __all__ = [
     "SlowSinking",
     "SlowTurn",
     "StickSlip",
-    "draw_readings",
     "is_out_of_vocabulary",
     "lattice_step",
     "lattice_step_sd",

@@ -1,4 +1,4 @@
-"""The noise distribution of a reading, with all effects on the noise: its density, its variance, draws from it."""
+"""The noise distribution of a reading, with all effects on the noise: its density and its variance."""
 
 from __future__ import annotations
 
@@ -70,34 +70,3 @@ def _log_density_rounded(readings: FloatArray, mean: FloatArray, sd: FloatArray,
     width = np.where(step > 0, step, 1.0)
     in_cell = log_cell_density(readings, mean, sd, width)
     return in_cell if np.all(step) else np.where(step > 0, in_cell, log_gaussian_density(readings, mean, sd))
-
-
-@renamed_arguments(level="noise")
-def draw_readings(
-    noise: NoiseParameters, predicted: FloatArray, scan: IntArray, *, rng: np.random.Generator
-) -> FloatArray:
-    """Draw readings, (n_samples, n_points): AR(1) noise, outliers, random walk, lost readings, then rounding.
-
-    Parameters
-    ----------
-    noise
-        The noise.
-    predicted
-        Noise-free readings, (n_samples, n_points).
-    scan
-        Scan number of each reading, in the order they were taken, (n_points,).
-    rng
-        Source of randomness.
-    """
-    errors = rng.standard_normal(predicted.shape)
-    fresh = np.sqrt(1 - noise.rho[:, 0] ** 2)
-    for k in range(1, len(scan)):
-        if scan[k] == scan[k - 1]:
-            errors[:, k] = noise.rho[:, 0] * errors[:, k - 1] + fresh * errors[:, k]
-    errors = errors * np.where(rng.random(predicted.shape) < noise.wide_share, noise.wide_times, 1.0)
-    readings = predicted + noise.sd * errors
-    if np.any(noise.walk):
-        readings = readings + noise.sd * noise.walk * np.cumsum(rng.standard_normal(predicted.shape), axis=1)
-    readings = np.where(rng.random(predicted.shape) < noise.lost_share, noise.lost_value, readings)
-    step = np.where(noise.step > 0, noise.step, 1.0)
-    return np.where(noise.step > 0, step * np.round(readings / step), readings)

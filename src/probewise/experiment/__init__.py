@@ -1,7 +1,6 @@
 """The autonomous experiment: measure, infer, inquire, with a journal of measurements (paper, sections 2.2, 2.3)."""
 
 from probewise.experiment.acquisition import ArmOverGrid
-from probewise.experiment.arm_error import run_with_arm_error
 from probewise.experiment.configuration import Experiment, OneScan
 from probewise.experiment.digest import value_digest
 from probewise.experiment.fitted_arm import FittedArm
@@ -100,7 +99,6 @@ __all__ = [
     "result_json",
     "run",
     "run_from_place",
-    "run_with_arm_error",
     "samples_csv",
     "scale_of",
     "sensor_entry",
@@ -130,9 +128,6 @@ Belief = PosteriorSummary
 
 Hidden = HiddenShape
 """The old name of `HiddenShape`."""
-
-with_arm_error = run_with_arm_error
-"""The old name of `run_with_arm_error`."""
 
 members_of = possible_shapes_by_name
 """The old name of `possible_shapes_by_name`."""

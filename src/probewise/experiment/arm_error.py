@@ -26,7 +26,7 @@ from probewise.experiment.configuration import Experiment
 from probewise.experiment.fitted_arm import FittedArm
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.state import ArmError, Exploration
+from probewise.experiment.state import ArmError
 from probewise.inference.problem import checked_log_prob
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
@@ -35,51 +35,6 @@ from probewise.scene.shapes import AnyOf
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
 _STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are
 _LEAST = 1e-3  # probability of a kind of hypotheses that is asked
-
-
-def run_with_arm_error(
-    run: Exploration,
-    geometry: Geometry,
-    *,
-    levels: tuple[float, float],
-    calibrated_mm: tuple[float, float] | None = None,
-    rng: np.random.Generator,
-) -> Exploration:
-    """Return a run that has ended, with the error of the arm's geometry added to its posterior.
-
-    If the run's experiment has a `fitted_arm`, its posterior and stopping rule include that error already.
-
-    Parameters
-    ----------
-    run
-        The run; its readings hold the places that the arm reported.
-    geometry, levels, calibrated_mm
-        See `FittedArm`.
-    rng
-        Source of the errors, drawn for each posterior sample.
-
-    Returns
-    -------
-    The run with `posterior` and `sd` of readings and arm together.
-
-    Raises
-    ------
-    ParameterError
-        If the geometry has no accuracy, or does not reach a place of a reading.
-    """
-    last, arm = run.last, FittedArm(geometry, levels, calibrated_mm)
-    found = arm_error_in_posterior(
-        run.experiment,
-        arm,
-        run.readings,
-        last.posterior,
-        last.kinds.with_warier_odds,
-        mean=last.mean,
-        sd=last.sd,
-        likely_shape=last.likely_shape,
-        rng=rng,
-    )
-    return replace(run, steps=(*run.steps[:-1], replace(last, arm_error=found)))
 
 
 def arm_error_in_posterior(

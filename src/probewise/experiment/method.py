@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -87,12 +88,8 @@ class SequentialMonteCarlo:
         )
 
     def _solver_from_scratch(self, rng: np.random.Generator) -> FromScratch:
-        """Return the function that solves a problem by nested sampling, with half the live points if it is quick."""
-
-        def solve(problem: SensorProblem, *, quick: bool = False) -> NestedResult:
-            return nested_sampling_from_scratch(problem, self.n_live // 2 if quick else self.n_live, rng)
-
-        return solve
+        """Return the function that solves a problem by nested sampling."""
+        return partial(nested_sampling_from_scratch, n_live=self.n_live, rng=rng)
 
     def drawn(
         self, posterior: Posterior, joined: Weighted, recording: Recording, n: int, *, rng: np.random.Generator
@@ -101,12 +98,14 @@ class SequentialMonteCarlo:
         return joined.samples(n, rng=rng)
 
 
-def nested_sampling_from_scratch(problem: SensorProblem, n_live: int, rng: np.random.Generator) -> NestedResult:
+def nested_sampling_from_scratch(
+    problem: SensorProblem, *, n_live: int, rng: np.random.Generator, quick: bool = False
+) -> NestedResult:
     """Infer from all readings at once by nested sampling, when the samples cannot be updated."""
     return run(
         problem,
         rng=rng,
-        n_live=max(n_live, LIVE_PER_PARAM * len(problem.prior.names)),
+        n_live=max(n_live // 2 if quick else n_live, LIVE_PER_PARAM * len(problem.prior.names)),
         move=KernelMove(),
         stop=RemainingEvidence(_DLOGZ),
         max_cost=1.0,  # speed matters, since the robot waits

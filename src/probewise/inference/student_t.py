@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammainc, gammaincc, gammaln, logsumexp
+from scipy.special import gammainc, gammaincc, gammaln
 
-from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
+from probewise._arrays import FloatArray, IntArray, frozen_int
 from probewise.errors import ParameterError, ShapeError
 from probewise.inference._residuals import residuals
 
@@ -187,73 +187,6 @@ class StudentT:
         variance = self.sums_by_group(np.square(residual)) / self.sizes
         per_set = 1.0 / variance.clip(self.sd_floor**2, self.sd_ceiling**2)
         return np.asarray(per_set[:, np.unique(self.groups, return_inverse=True)[1]])
-
-    def pooled(self, readings: FloatArray, predicted: FloatArray) -> PooledSigma:
-        """Return the posterior of one sigma that all data sets share, for predicting a new data set.
-
-        It is from readings (n_points,) and each hypothesis' predictions (n_samples, n_points).
-        """
-        residual = residuals(readings, predicted)
-        return PooledSigma((residual**2).sum(axis=1), residual.shape[1], self.sd_floor, self.sd_ceiling)
-
-
-@dataclass(frozen=True, eq=False)
-class PooledSigma:
-    """Posterior of the noise sd, sigma, of each hypothesis, given all its residuals, for predicting new readings.
-
-    Parameters
-    ----------
-    square
-        Sum of squared residuals of each hypothesis, (n_samples,).
-    n
-        Number of residuals.
-    sd_floor, sd_ceiling
-        Bounds of sigma's prior, 1/sigma between them.
-    """
-
-    square: FloatArray
-    n: int
-    sd_floor: float
-    sd_ceiling: float
-
-    def __post_init__(self) -> None:
-        _require_ordered_bounds(self.sd_floor, self.sd_ceiling)
-        object.__setattr__(self, "square", frozen(self.square))
-
-    def log_density(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the marginal log density of each new reading.
-
-        (n_points,), (n_samples, n_points) -> (n_samples, n_points)
-        """
-        square = self.square[:, None]
-        more = log_sigma_integral(
-            square + residuals(readings, predicted) ** 2, self.n + 1, self.sd_floor, self.sd_ceiling
-        )
-        return np.asarray(more - self._log_norm()[:, None] - 0.5 * _LOG_2PI)
-
-    def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
-        """Return the joint log density of new readings, (n_points,), (n_samples, n_points) -> (n_samples,)."""
-        residual = residuals(readings, predicted)
-        n_new = residual.shape[1]
-        square = self.square + (residual**2).sum(axis=1)
-        more = log_sigma_integral(square, self.n + n_new, self.sd_floor, self.sd_ceiling)
-        return np.asarray(more - self._log_norm() - 0.5 * n_new * _LOG_2PI)
-
-    def noise_sd(self) -> FloatArray:
-        """Return the predictive noise sd: the root of the posterior mean of sigma^2, (n_samples,)."""
-        if self.n > 2:
-            fewer = log_sigma_integral(self.square, self.n - 2, self.sd_floor, self.sd_ceiling)
-            return np.asarray(np.exp(0.5 * (fewer - self._log_norm())))
-        grid = np.linspace(math.log(self.sd_floor), math.log(self.sd_ceiling), 4001)
-        height = -self.n * grid - self.square[:, None] / 2.0 * np.exp(-2.0 * grid)
-        return np.asarray(np.exp(0.5 * (logsumexp(height + 2.0 * grid, axis=1) - logsumexp(height, axis=1))))
-
-    sd = noise_sd  # its old name
-
-    def _log_norm(self) -> FloatArray:
-        if self.n == 0:
-            return np.full(self.square.shape, math.log(math.log(self.sd_ceiling / self.sd_floor)))
-        return log_sigma_integral(self.square, self.n, self.sd_floor, self.sd_ceiling)
 
 
 def _require_ordered_bounds(sd_floor: float, sd_ceiling: float) -> None:

@@ -18,13 +18,12 @@ from probewise.inquiry.discs import DiscTable
 from probewise.inquiry.finishing import Finishing
 from probewise.inquiry.forecast import DirectForecast, Forecast, PredictiveDistributions
 from probewise.inquiry.grid import Grid
-from probewise.inquiry.information import bits_gained, gaussian_entropy, neighbour_entropy, prior_entropy
-from probewise.inquiry.labels import FunctionValue, Label, ParameterValue, WhichShape
+from probewise.inquiry.information import bits_gained, neighbour_entropy, prior_entropy
+from probewise.inquiry.labels import Label, ParameterValue, WhichShape
 from probewise.inquiry.named import UTILITY_NAMES, utility_named
 from probewise.inquiry.readout import Readout, entropy_bits
 from probewise.inquiry.tabulated import DiscForecast, TabulatedForecast, forecast_of
 from probewise.inquiry.tabulated_effects import TabulatedChain
-from probewise.inquiry.telling_apart import Rival, information_about_rivals
 from probewise.inquiry.utility import (
     InformationAbout,
     InformationGain,
@@ -47,7 +46,6 @@ __all__ = [
     "DiscTable",
     "Finishing",
     "Forecast",
-    "FunctionValue",
     "Goal",
     "Grid",
     "InformationAbout",
@@ -61,7 +59,6 @@ __all__ = [
     "ReadingEntropy",
     "ReadingNoise",
     "Readout",
-    "Rival",
     "TabulatedChain",
     "TabulatedForecast",
     "Utility",
@@ -78,8 +75,6 @@ __all__ = [
     "entropy_map",
     "fewest_readings",
     "forecast_of",
-    "gaussian_entropy",
-    "information_about_rivals",
     "label_entropy",
     "neighbour_entropy",
     "prior_entropy",
@@ -106,6 +101,3 @@ Prospect = UtilityInput
 
 best_places = best_places_mask
 """The old name of `best_places_mask`."""
-
-tell_apart = information_about_rivals
-"""The old name of `information_about_rivals`."""

@@ -45,16 +45,6 @@ def prior_entropy(prior: Prior, *, rng: np.random.Generator, n_samples: int = 20
     return -float(np.mean(prior.log_prob(theta))) / math.log(2)
 
 
-def gaussian_entropy(theta: FloatArray) -> float:
-    """Return the entropy in bits of a Gaussian with the samples' covariance, theta (n_samples, n_params)."""
-    n_samples, n_params = theta.shape
-    if n_samples <= n_params:
-        raise ParameterError("n_samples", n_samples, f"more than the {n_params} parameters")
-    covariance = np.atleast_2d(np.cov(theta, rowvar=False))
-    log_det = float(np.linalg.slogdet(covariance)[1])
-    return float(0.5 * (n_params * math.log(2 * math.pi * math.e) + log_det) / math.log(2))
-
-
 def neighbour_entropy(theta: FloatArray, *, neighbour: int = 4) -> float:
     """Return the differential entropy in bits from distances to the k-th neighbour, theta (n_samples, n_params).
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -38,24 +37,6 @@ class ParameterValue:
         if self.name not in names:
             raise ParameterError("parameter", self.name, f"one of {', '.join(names)}")
         return _bins_of_equal_weight(theta[:, names.index(self.name)], weight, self.n_bins)
-
-
-@dataclass(frozen=True)
-class FunctionValue:
-    """Labels by the value of a function of the parameters, (n_samples, n_params) -> (n_samples,)."""
-
-    function: Callable[[FloatArray], FloatArray]
-    n_bins: int = 16
-
-    def __post_init__(self) -> None:
-        _require_enough_bins(self.n_bins)
-
-    def __str__(self) -> str:
-        return "a function of the parameters"
-
-    def __call__(self, names: tuple[str, ...], theta: FloatArray, weight: FloatArray) -> IntArray:
-        """Return the bin of the function's value at each hypothesis, (n_samples,)."""
-        return _bins_of_equal_weight(np.asarray(self.function(theta)), weight, self.n_bins)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
 from probewise.nested.function_problem import FunctionProblem, Posed, make_problem, pose
 from probewise.nested.genealogy import chain_memory, relative_lineage_variance
 from probewise.nested.importance import Weighted, pareto_k, update
-from probewise.nested.kernels import KernelMove, diversify_by_kernels
+from probewise.nested.kernels import KernelMove
 from probewise.nested.merging import agreement_of, alive_at_death, merge, n_alive_at_death
 from probewise.nested.moves import Move, PriorRejection, SliceMove, Tally
 from probewise.nested.refine import refine
@@ -65,7 +65,6 @@ __all__ = [
     "alive_at_death",
     "chain_memory",
     "diversify",
-    "diversify_by_kernels",
     "intensified",
     "least_live",
     "make_problem",

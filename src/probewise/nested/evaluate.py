@@ -76,11 +76,6 @@ class Points:
     order = rows_by_rising_likelihood  # its earlier name
 
     @staticmethod
-    def empty(n_params: int) -> Points:
-        """Return no points."""
-        return Points(np.empty((0, n_params)), np.empty((0, n_params)), np.empty(0), np.empty(0), np.empty(0))
-
-    @staticmethod
     def join(*parts: Points) -> Points:
         """Concatenate points."""
         return Points(

@@ -13,11 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from probewise._arrays import BoolArray, FloatArray
-from probewise.errors import ParameterError, ShapeError
-from probewise.nested.diversify import DiversifyTally
-from probewise.nested.evaluate import Bound, Evaluator, Points, Samplable
+from probewise.errors import ParameterError
+from probewise.nested.evaluate import Bound, Evaluator, Points
 from probewise.nested.moves import SliceMove, Tally
-from probewise.priors import require_prior
 
 _BLOCK = 4096  # proposals evaluated at a time: their predictions stay in the cache
 _DENSITY_BLOCK = 1024
@@ -176,81 +174,3 @@ def _accept_in_turn(
         index[accept] = k * n_chains + np.flatnonzero(accept)
         n_accepted += int(accept.sum())
     return _LastAcceptedProposals(index, n_accepted)
-
-
-def diversify_by_kernels(
-    theta: FloatArray,
-    cloud: FloatArray,
-    problem: Samplable,
-    *,
-    rng: np.random.Generator,
-    n_steps: int = 1000,
-) -> tuple[FloatArray, DiversifyTally]:
-    """Replace repeated posterior samples by distinct ones, with independent Metropolis-Hastings proposals.
-
-    As `diversify`, but proposals come from kernels about `cloud`, so that the likelihoods of many
-    steps are evaluated together and a sample moves between modes as easily as within one.
-
-    Parameters
-    ----------
-    theta
-        Posterior samples, possibly repeated, (n_samples, n_params).
-    cloud
-        Equally weighted posterior samples at which the kernels are placed, (n_cloud, n_params).
-    problem
-        Prior and likelihood.
-    rng
-        Source of randomness.
-    n_steps
-        Steps per sample; the paper takes about 1000.
-
-    Returns
-    -------
-    theta, tally
-        The samples after their steps, (n_samples, n_params), and statistics of the steps.
-    """
-    start = np.array(theta, dtype=np.float64)
-    evaluate = Evaluator(problem)
-    require_prior("problem.prior", problem.prior, "log_prob")
-    if (
-        start.ndim != 2
-        or start.shape[1] != len(evaluate.names)
-        or len(start) == 0
-        or cloud.shape[1:] != start.shape[1:]
-    ):
-        raise ShapeError(
-            f"theta {start.shape}, cloud {cloud.shape}; allowed: (n, {len(evaluate.names)}), one row or more"
-        )
-    if n_steps < 0:
-        raise ParameterError("n_steps", n_steps, "0 or more")
-    if n_steps == 0:
-        return start, DiversifyTally(0, 0, 0.0, len(np.unique(start, axis=0)), 0.0)
-    n_samples = len(start)
-    kernels = Kernels.at_points(cloud, rng=rng)
-    now = start.copy()
-    log_now = problem.prior.log_prob(now) + evaluate.log_likelihood(now) - kernels.log_density(now)
-    if not np.isfinite(log_now).all():
-        at = int(np.flatnonzero(~np.isfinite(log_now))[0])
-        raise ParameterError(f"theta[{at}]", start[at].tolist(), "a sample with posterior density above zero")
-    n_accepted, n_done = 0, 0
-    while n_done < n_steps:
-        n = min(max(1, _BLOCK // n_samples), n_steps - n_done)
-        proposed = kernels.draw(n * n_samples, rng=rng)
-        log_target = problem.prior.log_prob(proposed)
-        possible = np.isfinite(log_target)
-        # The likelihood is not evaluated outside the prior, where a model may be undefined.
-        if possible.any():
-            log_target[possible] += evaluate.log_likelihood(proposed[possible]) - kernels.log_density(
-                proposed[possible]
-            )
-        decided = _accept_in_turn(possible, log_target, log_now, np.log(rng.random((n, n_samples))))
-        taken = decided.index >= 0
-        now[taken] = proposed[decided.index[taken]]
-        log_now[taken] = log_target[decided.index[taken]]
-        n_accepted += decided.n_accepted
-        n_done += n
-    spread = now.var(axis=0) + start.var(axis=0) + (now.mean(axis=0) - start.mean(axis=0)) ** 2
-    moved = ((now - start) ** 2).mean(axis=0)
-    mixing = float(np.mean(np.divide(moved, spread, out=np.zeros(len(spread)), where=spread > 0)))
-    share = n_accepted / (n_steps * n_samples)
-    return now, DiversifyTally(n_steps, evaluate.n_calls, share, len(np.unique(now, axis=0)), mixing)

@@ -21,7 +21,6 @@ from probewise.sensor.ssf import (
     merged_mean_mixture,
     mixture_names,
     mixture_of_field,
-    total_variation,
 )
 from probewise.sensor.stages import (
     AnyEffect,
@@ -75,7 +74,6 @@ __all__ = [
     "response",
     "seen",
     "seen_discrete",
-    "total_variation",
 ]
 
 footprint_at_height = footprint_at_height_ratio

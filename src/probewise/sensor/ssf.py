@@ -122,20 +122,6 @@ class FixedMixture:
         if not (np.linalg.eigvalsh(self.covs_mm2) > 0).all():
             raise ParameterError("covs_mm2", self.covs_mm2.tolist(), "positive definite matrices")
 
-    @classmethod
-    def from_parameters(cls, theta: FloatArray) -> FixedMixture:
-        """Build from one row of the paper's parameters a_1 to C_N, shape (6 n_gaussians,).
-
-        Raises ShapeError for another shape, ParameterError if a Gaussian or the mass is not positive.
-        """
-        theta = np.asarray(theta, dtype=np.float64)
-        if theta.ndim != 1 or theta.size == 0 or theta.size % 6:
-            raise ShapeError(f"SSF parameters have shape {theta.shape}; allowed: (6 n_gaussians,)")
-        foot = footprint_of(theta[None], theta.size // 6)
-        means = np.stack([foot.u_mm[0, 0], foot.v_mm[0, 0]], axis=-1)
-        rows = np.stack([foot.var_u, foot.cov_uv, foot.cov_uv, foot.var_v], axis=-1)[0, 0]
-        return cls(foot.weight[0, 0], means, rows.reshape(-1, 2, 2))
-
     @property
     def names(self) -> tuple[str, ...]:
         """No free parameters."""
@@ -317,31 +303,12 @@ def merged_mean_mixture(
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    Negative values of the field count as 0. `total_variation` of the two bounds the error of any response.
+    Negative values of the field count as 0.
     """
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()
     covs = np.zeros((int(kept.sum()), 2, 2))
     return _merge_gaussians(values[kept], field.centers_mm[kept], covs, n_gaussians)
-
-
-def total_variation(mixture: FixedMixture, field: SSFField) -> float:
-    """Return the total variation distance of a mixture and a field: the largest difference of any response.
-
-    Both are compared on the field's pixels; the mixture's mass outside them counts in full.
-    """
-    sampled = _mixture_density(mixture, field.centers_mm) * field.pixel_mm**2
-    missing = max(0.0, 1.0 - float(sampled.sum()))
-    return 0.5 * (float(np.abs(sampled - field.values.ravel()).sum()) + missing)
-
-
-def _mixture_density(mixture: FixedMixture, points: FloatArray) -> FloatArray:
-    total = np.zeros(len(points))
-    for w, mean, cov in zip(mixture.weights, mixture.means_mm, mixture.covs_mm2, strict=True):
-        off = points - mean
-        quadratic = _quadratic_form(off, np.linalg.inv(cov))
-        total += w * np.exp(-0.5 * quadratic) / (2 * np.pi * np.sqrt(np.linalg.det(cov)))
-    return total
 
 
 def _quadratic_form(off: FloatArray, matrix: FloatArray) -> FloatArray:

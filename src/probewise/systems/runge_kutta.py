@@ -25,11 +25,6 @@ class RungeKutta:
     b: tuple[float, ...]
     c: tuple[float, ...]
 
-    @property
-    def n_stages(self) -> int:
-        """Evaluations of the rates per step."""
-        return len(self.b)
-
     @cached_property
     def stages(self) -> tuple[Terms, ...]:
         """For each stage, the numbers and weights of the earlier rates that lead to it."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from mixtures import fixed_mixture
 from scipy.stats import multivariate_normal
 
 from probewise.diagnosis.advice.next_scans import (
@@ -26,9 +27,9 @@ from probewise.diagnosis.scheduling import MOST_READINGS, rows_by_command
 from probewise.effects import VOCABULARY, Extent
 from probewise.recordings import HalfPlane, Plan, Uniform, paper_plan, read_plan, write_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor import Chain, FixedLevels
 
-SPOT = FixedMixture.from_parameters(np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0]))  # a Gaussian of sd 5 mm
+SPOT = fixed_mixture(np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0]))  # a Gaussian of sd 5 mm
 
 
 def predictives(seed: int, apart: float) -> list[PredictiveNormal]:

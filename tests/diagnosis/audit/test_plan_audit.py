@@ -5,6 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mixtures import fixed_mixture
 
 from probewise.diagnosis import audit_plan, join
 from probewise.diagnosis.audit.detectability import ExpectedSensor, PlanTemplates, ProjectedTemplates
@@ -17,7 +18,7 @@ from probewise.errors import ParameterError
 from probewise.recordings import Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plan import Plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture, FreeLevels, FreeMixture
+from probewise.sensor import Chain, FixedLevels, FreeLevels, FreeMixture
 
 SPOT = np.array([1.0, 0.0, 0.0, 0.02, 0.02, 0.0])  # a Gaussian of sd 5 mm
 TWO = {"backlash": Backlash, "edge_misplacement": EdgeMisplacement}
@@ -143,7 +144,7 @@ def test_a_commanded_height_widens_the_footprint_and_dims_the_signal():
     """Far from the edge the signal falls with the square of the height; across it the slope does with its cube."""
     plan = paper_plan().take(np.arange(101))
     high = replace(plan, covariates={"height_mm": np.full(101, 28.0)})
-    chain = Chain(FixedMixture.from_parameters(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
+    chain = Chain(fixed_mixture(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
     usual, raised = (chain.predict(np.empty((1, 0)), p)[0] - 10.0 for p in (plan, high))
     assert raised[-1] == pytest.approx(usual[-1] / 4)
     middle = slice(49, 52)
@@ -153,7 +154,7 @@ def test_a_commanded_height_widens_the_footprint_and_dims_the_signal():
 def test_without_the_led_only_what_is_no_signal_is_read():
     plan = paper_plan().take(np.arange(101))
     dark = replace(plan, covariates={"led": np.r_[np.zeros(50), np.full(51, np.nan)]})
-    chain = Chain(FixedMixture.from_parameters(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
+    chain = Chain(fixed_mixture(SPOT), FixedLevels(10.0, 50.0), KnownScene(plan.patterns))
     usual, unlit = (chain.predict(np.empty((1, 0)), p)[0] for p in (plan, dark))
     assert (unlit[:50] == 10.0).all()
     np.testing.assert_array_equal(unlit[50:], usual[50:])

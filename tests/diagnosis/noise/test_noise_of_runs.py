@@ -8,7 +8,7 @@ import pytest
 from scipy.special import gammaln, logsumexp
 
 from probewise.diagnosis.noise.law import NoiseLaw, white_noise
-from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, draw_readings, variance
+from probewise.effects import FittedReadings, NoisePerRun, RandomWalk, variance
 from probewise.sensor import NoiseParameters
 
 
@@ -43,12 +43,8 @@ def test_draws_of_a_walk_scatter_as_it_says():
             NoiseParameters(np.array([[2.0]]), np.zeros((1, 1))), np.array([[0.3]]), range(50)
         ),
     )
-    draws = np.concatenate(
-        [
-            draw_readings(level, np.zeros((1, 50)), np.zeros(50, int), rng=rng)
-            for rng in np.random.default_rng(3).spawn(2000)
-        ]
-    )
+    white, steps = np.random.default_rng(3).standard_normal((2, 2000, 50))
+    draws = level.sd * (white + level.walk * np.cumsum(steps, axis=1))
     np.testing.assert_allclose(draws.var(axis=0), variance(level)[0], rtol=5 * math.sqrt(2 / 2000))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from mixtures import total_variation
 
 from probewise.calibration import FittedSensor
 from probewise.diagnosis.evidence.laplace import laplace_evidence
@@ -15,7 +16,6 @@ from probewise.diagnosis.noise.models import NoiseModel
 from probewise.diagnosis.repair.samples import ModelSamples, sample_model
 from probewise.effects import Extent
 from probewise.recordings import Recording, two_way_plan
-from probewise.sensor import total_variation
 
 PLAN = two_way_plan()
 

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from mixtures import fixed_mixture
 
 from probewise import nested
 from probewise.diagnosis import OwnModel, diagnose, diagnosis_json, weigh_thoroughly
@@ -18,7 +19,7 @@ from probewise.effects import VOCABULARY, Extent
 from probewise.priors import Normal, Product
 from probewise.recordings import Plan, Recording, paper_plan
 from probewise.scene import KnownScene
-from probewise.sensor import Chain, FixedLevels, FixedMixture
+from probewise.sensor import Chain, FixedLevels
 
 LINE = OwnModel(lambda p, plan: p["a"] + p["b"] * plan.time_s, Product({"a": Normal(0, 2), "b": Normal(0, 0.2)}))
 
@@ -216,7 +217,7 @@ def test_a_recording_is_weighed_alike_both_ways():
     plan = paper_plan()
     plan = plan.take(np.arange(0, len(plan), 3))
     spot = np.array([1.0, 0.0, 1.5, 1 / 72, 1 / 128, 0.0])
-    exact = Chain(FixedMixture.from_parameters(spot), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
+    exact = Chain(fixed_mixture(spot), FixedLevels(10.0, 60.0), KnownScene(plan.patterns))
     noise = 0.5 * np.random.default_rng(3).standard_normal(len(plan))
     lamp = 1.0 * (plan.time_s > np.median(plan.time_s))
     recording = Recording(plan, exact.predict(np.empty((1, 0)), plan)[0] + lamp + noise)

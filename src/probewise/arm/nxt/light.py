@@ -50,11 +50,6 @@ class LightReading:
         return normalized_from_counts(self.raw_counts)
 
     @property
-    def percent(self) -> int:
-        """Whole percent from 0 to 100, as the brick shows it; LEGO units are the same, but at least 1."""
-        return self.normalized * 100 // AD_MAX
-
-    @property
     def fine_percent(self) -> float:
         """Percent from 0 to 100 at the converter's resolution, about seven steps per percent."""
         return self.normalized * 100 / AD_MAX

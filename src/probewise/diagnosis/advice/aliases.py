@@ -94,7 +94,7 @@ def aliases_with_separating_plans(searched: Searched, problem: Linearised, found
         ):
             continue
         templates = misfit_templates.templates.templates_of(misfit_templates.about, effect.with_fewer_variants())
-        blocks = OrthonormalBlocks.of(problem, templates.columns, [name] * len(templates.columns))
+        blocks = OrthonormalBlocks.of(problem, templates.columns)
         scores = np.add.reduceat((blocks.u.T @ problem.residual) ** 2, blocks.starts)
         best = int(np.argmax(scores))
         telling[name], chosen[name] = templates.columns[best], templates.variant_of_entry(best)

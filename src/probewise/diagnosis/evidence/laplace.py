@@ -248,32 +248,27 @@ class OrthonormalBlocks:
     """Orthonormalised templates: columns `u` (n_rows, n_columns) in blocks, with squared lengths `gain`.
 
     `gain` (n_columns,) is the squared length of the projection of a template of unit rms (times n_points); `starts`
-    (n_blocks,) is the first column of each block; `labels` name the blocks.
+    (n_blocks,) is the first column of each block.
     """
 
     u: FloatArray
     gain: FloatArray
     starts: IntArray
-    labels: tuple[str, ...]
-    share: FloatArray  # surviving share of each block's norm, (n_blocks,)
 
     @classmethod
-    def of(cls, problem: Linearised, templates: Sequence[FloatArray], labels: Sequence[str]) -> OrthonormalBlocks:
+    def of(cls, problem: Linearised, templates: Sequence[FloatArray]) -> OrthonormalBlocks:
         """Whiten, scale to unit rms, project, and orthonormalise each template (n_points, k) by itself."""
-        return cls.of_projected(scale_and_project(problem, templates), [t.shape[1] for t in templates], labels, problem)
+        return cls.of_projected(scale_and_project(problem, templates), [t.shape[1] for t in templates])
 
     @classmethod
-    def of_projected(
-        cls, projected: FloatArray, widths: Sequence[int], labels: Sequence[str], problem: Linearised
-    ) -> OrthonormalBlocks:
+    def of_projected(cls, projected: FloatArray, widths: Sequence[int]) -> OrthonormalBlocks:
         """Orthonormalise each of the concatenated templates from `scale_and_project`, (n_rows, n_columns)."""
         starts = np.concatenate([[0], np.cumsum(widths)[:-1]]).astype(np.int64)
         u, gain = np.empty_like(projected), np.empty(projected.shape[1])
         for width in set(widths):  # all templates of one width at a time
             columns = (starts[np.array(widths) == width, None] + np.arange(width)).ravel()
             u[:, columns], gain[columns] = orthonormalise_groups(projected[:, columns], width)
-        shares = np.sqrt(np.add.reduceat(gain, starts) / problem.n_points)
-        return cls(u, gain, starts, tuple(labels), shares)
+        return cls(u, gain, starts)
 
 
 def scale_and_project(problem: Linearised, templates: Sequence[FloatArray]) -> FloatArray:

@@ -86,8 +86,8 @@ def bases_unlike_named(bases: TemplateBank, named: TemplateBank, problem: Linear
     if single.size == 0 or named.widths.size == 0:
         return bases
     alone = bases.take(single).columns
-    own = OrthonormalBlocks.of(problem, list(alone.T[:, :, None]), [""] * len(single)).u
-    blocks = OrthonormalBlocks.of(problem, [named[k] for k in range(len(named.widths))], named.labels)
+    own = OrthonormalBlocks.of(problem, list(alone.T[:, :, None])).u
+    blocks = OrthonormalBlocks.of(problem, [named[k] for k in range(len(named.widths))])
     cosines = np.sqrt(np.add.reduceat((blocks.u.T @ own) ** 2, blocks.starts, axis=0))
     like = single[cosines.max(axis=0, initial=0.0) >= _LIKE]
     return bases.take(np.setdiff1d(np.arange(len(bases.widths)), like))

@@ -20,7 +20,7 @@ from probewise._arrays import FloatArray
 from probewise._kinds import require_rng
 from probewise.diagnosis.evidence.folded import fold_problem
 from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem
-from probewise.diagnosis.evidence.laplace import NoiseEvidence, covariance_root
+from probewise.diagnosis.evidence.laplace import covariance_root
 from probewise.diagnosis.fitting.coordinates import FARTHEST
 from probewise.diagnosis.names import Names
 from probewise.diagnosis.search.searched import Searched
@@ -156,7 +156,7 @@ def _weigh_by_nested_sampling(
 
         told = weigh_near(explored.samples(_N_SAMPLES, rng=rng))
         if told.gap < 0 and not told.agree:  # the run may have lost the mode that the fit has found
-            told = max(told, weigh_near(_draw_from_laplace(candidate, evidence, rng)), key=lambda own: own.nested)
+            told = max(told, weigh_near(_draw_from_laplace(candidate, rng)), key=lambda own: own.nested)
     more = explored.log_z + candidate.log_prior_factor - told.nested
     apart = more / math.hypot(explored.log_z_error, told.error)
     if apart < _APART:
@@ -237,7 +237,7 @@ def _evidence_near_posterior(
         theta = found.samples(_N_SAMPLES, rng=rng)
 
 
-def _draw_from_laplace(candidate: WeighedFit, evidence: NoiseEvidence, rng: np.random.Generator) -> FloatArray:
+def _draw_from_laplace(candidate: WeighedFit, rng: np.random.Generator) -> FloatArray:
     """Draw coordinates from Laplace's approximation, (_N_SAMPLES, n_params)."""
     found = candidate.found
     root = covariance_root(candidate.law(found.slopes), found.sd**2 / candidate.law.information)

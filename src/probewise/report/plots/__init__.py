@@ -38,7 +38,7 @@ from probewise.report.plots.residuals import (
 )
 from probewise.report.plots.scans import before_and_after, residuals_by_scan
 from probewise.report.plots.scene import field_legend, playing_field
-from probewise.report.plots.ssf import log_evidences, spatial_sensitivity, ssf_by_order
+from probewise.report.plots.ssf import spatial_sensitivity, ssf_by_order
 from probewise.report.plots.study import posterior_widths_of_runs, readings_needed
 from probewise.report.plots.verdict import hypothesis_probabilities, probabilities_by_round
 
@@ -60,7 +60,6 @@ __all__ = [
     "hypothesis_probabilities",
     "information_gained",
     "insertion_plot",
-    "log_evidences",
     "lost_readings",
     "mean_residuals_along",
     "playing_field",

@@ -1,8 +1,8 @@
-"""The spatial sensitivity function (SSF) seen from above, and the evidence for each number of Gaussians."""
+"""The spatial sensitivity function (SSF) seen from above, also for each number of Gaussians with its evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib import colormaps
@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 
 from probewise._arrays import FloatArray
 from probewise._kinds import require_kind
-from probewise.report.plots.canvas import BLACK, BLUE, GREY, AxesGrid, axes_or_grid, axes_or_new, label_axes
+from probewise.report.plots.canvas import AxesGrid, axes_or_grid, axes_or_new, label_axes
 from probewise.report.plots.scene import add_colour_bar
 from probewise.report.words import with_error
 from probewise.sensor import SSFField
@@ -104,17 +104,3 @@ def ssf_by_order(
         ax.set_xlim(-widest, widest)
         ax.set_ylim(-widest, widest)
     return axes
-
-
-def log_evidences(
-    orders: Sequence[int], log_z: Sequence[float], log_z_error: Sequence[float], *, ax: Axes | None = None
-) -> Axes:
-    """Draw the log evidence relative to the best model, with its error, for each number of Gaussians."""
-    ax = axes_or_new(ax, size_in=(4.6, 3.4))
-    below = np.asarray(log_z) - np.max(log_z)
-    colours = [BLUE if b == 0 else GREY for b in below]
-    ax.bar(np.arange(len(orders)), below, color=colours, width=0.6)
-    ax.errorbar(np.arange(len(orders)), below, yerr=log_z_error, linestyle="none", color=BLACK, capsize=4)
-    ax.axhline(0, color=BLACK, linewidth=0.8)
-    ax.set_xticks(np.arange(len(orders)), [str(n) for n in orders])
-    return label_axes(ax, x="number of Gaussians", y="ln Z below the best")

@@ -35,7 +35,6 @@ class _ScaledVariable:
     name: str
     middle: float
     scale: float
-    unit: str
 
     def scaled(self, values: Any) -> Any:
         return (values - self.middle) / self.scale
@@ -102,9 +101,9 @@ def _varying_covariates(about: ReferenceFit) -> dict[str, FloatArray]:
     return {c: v for c, v in kept.items() if np.isfinite(v).all() and np.ptp(v) > 0}
 
 
-def _scaled_variable(name: str, values: FloatArray, unit: str, *, centred: bool) -> _ScaledVariable:
+def _scaled_variable(name: str, values: FloatArray, *, centred: bool) -> _ScaledVariable:
     middle = float(f"{np.mean(values):.6g}") if centred else 0.0
-    return _ScaledVariable(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0, unit)
+    return _ScaledVariable(name, middle, float(np.sqrt(np.mean((values - middle) ** 2))) or 1.0)
 
 
 def _reading_proposals(about: ReferenceFit) -> Iterator[Form]:
@@ -112,8 +111,8 @@ def _reading_proposals(about: ReferenceFit) -> Iterator[Form]:
     columns = _varying_covariates(about)
     if about.table.has_varying_time and about.table.time is not None:
         columns[about.table.time] = about.table.time_s
-    variables = [_scaled_variable(name, values, name, centred=True) for name, values in columns.items()]
-    level = _scaled_variable(own.reading, about.predicted, own.unit, centred=True)
+    variables = [_scaled_variable(name, values, centred=True) for name, values in columns.items()]
+    level = _scaled_variable(own.reading, about.predicted, centred=True)
     known: list[FloatArray] = []
     for term in _terms_of_variables([*variables, level]):
 
@@ -199,12 +198,8 @@ def _one_sided_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
 
 def _rate_proposals(about: ReferenceFit, state: str) -> Iterator[Form]:
     states = about.states
-    variables = [
-        _scaled_variable(name, values, name, centred=False) for name, values in states.items() if np.ptp(values) > 0
-    ]
-    variables += [
-        _scaled_variable(name, values, name, centred=True) for name, values in _varying_covariates(about).items()
-    ]
+    variables = [_scaled_variable(name, values, centred=False) for name, values in states.items() if np.ptp(values) > 0]
+    variables += [_scaled_variable(name, values, centred=True) for name, values in _varying_covariates(about).items()]
     known: list[FloatArray] = []
     for term in _terms_of_variables(variables):
         if term.text == f"sign({state})":

@@ -53,7 +53,7 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
         if not kind.restarts_time:
             t = t + clock
             clock = float(t[-1]) + _PAUSE * float(t[-1] - t[0]) * rng.uniform(0.5, 1.5) + float(t[1] - t[0])
-        whole = {**own, **_irrelevant_columns(kind, n, k, regime, rng)}
+        whole = {**own, **_irrelevant_columns(kind, n, regime, rng)}
         if kind.time is not None:
             whole[kind.time] = t
         for name, values in whole.items():
@@ -64,7 +64,7 @@ def design_runs(kind: SystemKind, *, rng: np.random.Generator) -> SystemTable:
     return SystemTable(joined, np.concatenate(run).astype(np.int64), kind.time, n_runs)
 
 
-def _irrelevant_columns(kind: SystemKind, n: int, k: int, regime: float, rng: np.random.Generator) -> Columns:
+def _irrelevant_columns(kind: SystemKind, n: int, regime: float, rng: np.random.Generator) -> Columns:
     out = {}
     for column in kind.logged:
         walk = np.cumsum(rng.standard_normal(n)) / np.sqrt(n) + rng.standard_normal()

@@ -10,7 +10,8 @@ from scipy.special import logsumexp
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import NotConvergedError
 from probewise.experiment.method import nested_sampling_from_scratch
-from probewise.experiment.posterior import prior_posterior, updated
+from probewise.experiment.posterior import prior_posterior
+from probewise.experiment.posterior_update import updated
 from probewise.scene import AnyOf
 
 # The lead changes four times.

@@ -23,9 +23,9 @@ from probewise.experiment import (
     begin,
     experiment_for,
     left_out_after_step,
-    posterior,
     repaired_sensor,
     result_json,
+    sampled_anew,
     step,
 )
 from probewise.experiment.acquisition import ArmOverGrid, predict_and_rate_readings
@@ -40,7 +40,8 @@ from probewise.experiment.noise_rivals import (
     OutlierLikelihood,
     SignalDependentLikelihood,
 )
-from probewise.experiment.posterior import prior_posterior, updated, with_rivals_sampled_again
+from probewise.experiment.posterior import prior_posterior
+from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
 from probewise.experiment.rivals import rivals_of
 from probewise.inference import Rounded
@@ -539,7 +540,7 @@ def test_rivals_that_were_asked_before_are_not_asked_again(doubting, monkeypatch
         assert kind not in ruled_out
         return fit_kind(kind, *args, **options)
 
-    monkeypatch.setattr(posterior, "fit_kind", fitted)
+    monkeypatch.setattr(sampled_anew, "fit_kind", fitted)
     with_rivals_sampled_again(once, recording, 3000, rng=rng, from_scratch=solved)
 
 
@@ -558,7 +559,7 @@ def test_a_rival_of_few_draws_that_has_a_say_in_the_shape_is_solved_from_scratch
         weighted = sampled_about_fits(found, kind, problem, own, n_draws=n_draws, with_own=with_own, rng=rng)
         return replace(weighted, n_eff=7.0)
 
-    monkeypatch.setattr(posterior, "sampled_about_fits", by_few)
+    monkeypatch.setattr(sampled_anew, "sampled_about_fits", by_few)
     plain, lost = (replace(p, weighted=replace(p.weighted, log_z=-1000.0)) for p in now.particles)
     now = replace(now, particles=(plain, lost))
     found = with_rivals_sampled_again(now, recording, 3000, rng=rng, from_scratch=from_nothing)

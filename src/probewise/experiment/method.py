@@ -9,7 +9,9 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.experiment.posterior import FromScratch, Posterior, updated, with_rivals_sampled_again
+from probewise.experiment.posterior import Posterior
+from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
+from probewise.experiment.sampled_anew import FromScratch
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.kernels import KernelMove

@@ -1,0 +1,156 @@
+"""Samples of one kind of hypotheses taken anew from all readings: near other kinds' samples, or by nested sampling."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from probewise._arrays import FloatArray
+from probewise.errors import DoubtfulResultWarning, NotConvergedError
+from probewise.experiment.evidence import BridgedEvidence, posterior_sampled_about_points
+from probewise.experiment.kinds import HypothesisKind
+from probewise.experiment.particles import Particles
+from probewise.experiment.refitted import fit_kind, sampled_about_fits
+from probewise.experiment.rivals import declared_noise
+from probewise.inference.problem import SensorProblem
+from probewise.nested.importance import Weighted
+from probewise.nested.result import NestedResult
+
+_REPRODUCED = 5  # of the starts, which must lead to fits as good as the best: otherwise better ones may be missed
+WELL_FOUND = 100.0  # effective draws from which on samples need not be taken anew until a reading strains them
+
+
+class FromScratch(Protocol):
+    """Solves a kind's whole problem by nested sampling; with fewer live points if `quick`."""
+
+    def __call__(self, problem: SensorProblem, *, quick: bool = False) -> NestedResult:
+        """Return the result; raise NotConvergedError if no hypothesis could have given the readings."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SamplesAnew:
+    """Samples of a kind taken anew.
+
+    Attributes
+    ----------
+    samples
+        None if none was found.
+    highest_log_z
+        The largest log evidence by fits or by a search from scratch; infinite without either.
+    is_reproduced
+        Whether several starts led to the best fit, or a search from scratch to the samples.
+    is_searched
+        Whether a search from scratch led to them.
+    """
+
+    samples: Weighted | None
+    highest_log_z: float = math.inf
+    is_reproduced: bool = True
+    is_searched: bool = False
+
+    @property
+    def n_eff(self) -> float:
+        """Effective number of the samples; 0 without any."""
+        return 0.0 if self.samples is None else self.samples.n_eff
+
+
+def sample_near_other_kinds(
+    kind: HypothesisKind,
+    problem: SensorProblem,
+    own: Weighted,
+    donors: list[Weighted],
+    n: int,
+    hopeless: float,
+    rng: np.random.Generator,
+) -> SamplesAnew:
+    """Sample a kind's posterior from samples of other kinds: by refits or, for a noise model, from these directly.
+
+    No samples are drawn if the largest log evidence by fits is below `hopeless`.
+    """
+    noise = declared_noise(kind.likelihood)
+    if kind.effect is not None:
+        if noise is None:
+            return SamplesAnew(None)
+        sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
+        found = fit_kind(kind, problem, donors, noise_sd=sd, rng=rng)
+        is_reproduced = found.n_as_good_as_best >= _REPRODUCED
+        if found.highest_log_z < hopeless:
+            return SamplesAnew(None, found.highest_log_z, is_reproduced)
+        with_own = own.log_z > hopeless
+        return SamplesAnew(
+            sampled_about_fits(found, kind, problem, own, n_draws=2 * n, with_own=with_own, rng=rng),
+            found.highest_log_z,
+            is_reproduced,
+        )
+    n_own = len(kind.prior.names)
+    points = [donor.samples(n // 2, rng=rng)[:, :n_own] for donor in donors]
+    if own.log_z > hopeless:
+        points.append(own.samples(n // 2, rng=rng))
+    return SamplesAnew(_importance_sampled_if_possible(np.concatenate(points), problem, n, rng))
+
+
+def search_from_scratch(
+    problem: SensorProblem,
+    own: Weighted,
+    n: int,
+    hopeless: float,
+    rng: np.random.Generator,
+    from_scratch: FromScratch,
+) -> SamplesAnew:
+    """Sample a kind's posterior by a quick run of nested sampling."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DoubtfulResultWarning)  # its samples are only where draws are made
+            run = from_scratch(problem, quick=True)
+    except NotConvergedError:
+        return SamplesAnew(None, -math.inf, is_searched=True)
+    samples = samples_from_run(run, own, problem, n, rng, with_own=own.log_z > hopeless)
+    return SamplesAnew(samples, run.log_z, is_searched=True)
+
+
+def samples_from_run(
+    run: NestedResult, own: Weighted, problem: SensorProblem, n: int, rng: np.random.Generator, *, with_own: bool
+) -> Weighted:
+    """Return samples of a kind from a run of nested sampling, and from the kind's own samples if `with_own`.
+
+    Importance sampling about both weighs them. Where modes are too many or too bent for it, few draws would hold all of
+    the weight: then the run's samples are returned as they are, with its evidence.
+    """
+    points = run.samples(n, rng=rng)
+    about = np.concatenate([points, own.samples(n // 2, rng=rng)]) if with_own else points
+    drawn = _importance_sampled_if_possible(about, problem, 2 * n, rng)
+    if drawn is None or drawn.n_eff < WELL_FOUND:
+        even = np.full(n, -math.log(n))
+        likelihood = problem.log_likelihood(points)
+        drawn = Weighted(
+            problem.prior.names, points, likelihood, even, run.log_z, run.log_z_error, float(n), n, -math.inf
+        )
+    return replace(drawn, n_calls=own.n_calls + run.n_calls + drawn.n_calls)
+
+
+def _importance_sampled_if_possible(
+    points: FloatArray, problem: SensorProblem, n_draws: int, rng: np.random.Generator
+) -> Weighted | None:
+    """Sample by importance sampling about points; None if no draw could have given the readings."""
+    try:
+        return posterior_sampled_about_points(points, problem, rng=rng, n_draws=n_draws)
+    except NotConvergedError:
+        return None
+
+
+def independent_start_with_evidence(particles: Particles, found: BridgedEvidence) -> Particles:
+    """Give the samples a new evidence, and make them an independent start: each is its own ancestor."""
+    had = particles.weighted
+    weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
+    start = Particles(weighted, np.arange(len(had.theta)), found.error**2)
+    return replace(
+        start,
+        refitted=particles.refitted,
+        log_z_limit=particles.log_z_limit,
+        limit_is_searched=particles.limit_is_searched,
+    )

@@ -103,6 +103,13 @@ class Timing:
             if not getattr(self, name) >= 0:
                 raise ParameterError(name, getattr(self, name), "0 or more")
 
+    @property
+    def longest_s(self) -> float:
+        """Longest duration of a question, with its repeats and fences, on a stream that is never silent."""
+        draining_s = self.answer_s + self.silence_s
+        waiting_s = 2 * self.turn_s + self.answer_s
+        return (1 + self.n_repeats) * (waiting_s + draining_s + len(FENCES) * (waiting_s + draining_s))
+
 
 class NoAnswerError(LinkError):
     """Raised if the brick did not answer a command in time; it may or may not have executed it."""

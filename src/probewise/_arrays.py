@@ -41,7 +41,7 @@ def floats(values: ArrayLike, name: str = "values") -> FloatArray:
         raise ParameterError(name, values, allowed) from error
 
 
-def frozen(values: ArrayLike, name: str = "values") -> FloatArray:
+def read_only_floats(values: ArrayLike, name: str = "values") -> FloatArray:
     """Copy to a read-only array of floats."""
     array = np.array(floats(values, name))
     array.flags.writeable = False

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, frozen, require_finite
+from probewise._arrays import BoolArray, FloatArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise.errors import ParameterError, ShapeError
 
@@ -57,7 +57,7 @@ def checked_samples(samples: FloatArray, noise_sd: FloatArray, names: tuple[str,
     ShapeError, ParameterError
         If the shapes do not fit, there are too few samples, a value is not finite, or an sd is not positive.
     """
-    samples, noise_sd = frozen(samples), frozen(noise_sd)
+    samples, noise_sd = read_only_floats(samples), read_only_floats(noise_sd)
     if samples.ndim != 2 or samples.shape[1] != len(names):
         raise ShapeError(f"samples have shape {samples.shape}; allowed: (n_samples, {len(names)})")
     if len(samples) < MIN_SAMPLES:

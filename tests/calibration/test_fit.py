@@ -12,8 +12,8 @@ from probewise._arrays import FloatArray
 from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
 from probewise.calibration.coverage import (
     Coverage,
-    coverage,
     draw_truth,
+    simulate_coverage,
     simulate_log_z_lead_of_one_gaussian,
     simulate_truth,
 )
@@ -157,7 +157,7 @@ def test_coverage_counts_survive_as_json() -> None:
 @pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     """20 recordings, 7 quantities: by the binomial 17 or more of 20 each, but for 1.6 %; 14 but for 3e-5."""
-    found = coverage(20, rng=np.random.default_rng(19), n_live=100)
+    found = simulate_coverage(20, rng=np.random.default_rng(19), n_live=100)
     assert min(found.held.values()) >= 14
     assert sum(found.held.values()) >= 122
 

@@ -33,8 +33,8 @@ def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
     """
     table = read_table(path)
     table.require_columns(*_TURNED, *_PLACE)
-    turned = [table.numbers(name, largest=_LARGEST) for name in _TURNED]
-    place = [table.numbers(name, missing=name == "height_mm", largest=_LARGEST) for name in _PLACE]
+    turned = [table.column_of_numbers(name, largest=_LARGEST) for name in _TURNED]
+    place = [table.column_of_numbers(name, missing=name == "height_mm", largest=_LARGEST) for name in _PLACE]
     return np.radians(np.stack(turned, axis=-1)), np.stack(place, axis=-1)
 
 

@@ -32,9 +32,9 @@ from probewise.world import Blob, World, gaussian_spot
 __all__ = [
     "Coverage",
     "TrueSensor",
-    "coverage",
     "draw_truth",
     "interval_holds_truth_by_quantity",
+    "simulate_coverage",
     "simulate_log_z_lead_of_one_gaussian",
     "simulate_truth",
 ]
@@ -98,7 +98,7 @@ def simulate_truth(truth: TrueSensor, *, rng: np.random.Generator) -> Recording:
     return world.simulate(paper_plan(), rng=rng)
 
 
-def coverage(
+def simulate_coverage(
     n_recordings: int,
     *,
     rng: np.random.Generator,
@@ -135,6 +135,10 @@ def coverage(
         if progress is not None:
             progress(Coverage(k + 1, held, n_live))
     return Coverage(n_recordings, held, n_live)
+
+
+coverage = simulate_coverage
+"""The old name of `simulate_coverage`."""
 
 
 def _simulate_and_check_intervals(rng: np.random.Generator, n_live: int, quick: bool) -> dict[str, bool]:
@@ -200,7 +204,7 @@ def main() -> None:
             def advance_bar(_: Coverage) -> None:
                 bar.update()
 
-            counts = coverage(
+            counts = simulate_coverage(
                 asked.recordings, rng=rng, n_live=asked.live, quick=asked.quick, executor=executor, progress=advance_bar
             )
             counts.save(asked.out, **about)

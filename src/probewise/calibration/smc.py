@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise._display import ShowsItself
 from probewise.calibration.reference_density import ReferenceDensity
 from probewise.inference import SensorProblem
@@ -97,7 +97,7 @@ class SMCResult(ShowsItself):
 
     def __post_init__(self) -> None:
         for name in ("theta", "log_likelihood", "log_weight", "log_z_of_clouds", "temperatures"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
 
     @property
     def log_z(self) -> float:

@@ -9,7 +9,7 @@ from typing import Any, Self
 import numpy as np
 from scipy.special import ndtr
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, read_only_floats
 from probewise.diagnosis.fitting.coordinates import FARTHEST, CalibratedSensor, cached_known_scene
 from probewise.diagnosis.fitting.sensor_prior import SensorPrior, sensor_from_samples
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
@@ -36,7 +36,7 @@ class SensorAndShape:
     starts: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "starts", frozen(self.starts))
+        object.__setattr__(self, "starts", read_only_floats(self.starts))
 
     @classmethod
     def of(cls, sensor: SensorPrior, shape: Shape, recording: Recording, *, rng: np.random.Generator) -> Self:

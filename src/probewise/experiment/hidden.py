@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray, floats, frozen
+from probewise._arrays import FloatArray, floats, read_only_floats
 from probewise._kinds import checked_finite_number, require_rng
 from probewise.errors import ParameterError
 from probewise.experiment.simulation import surface_of_region
@@ -28,7 +28,7 @@ class HiddenShape:
     theta: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "theta", frozen(self.theta))
+        object.__setattr__(self, "theta", read_only_floats(self.theta))
 
     @classmethod
     def from_parameters(cls, name: str, shape: Shape, theta: FloatArray, *, called: str = "truth") -> HiddenShape:

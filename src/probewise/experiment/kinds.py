@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import Estimated
 from probewise.errors import ParameterError
 from probewise.experiment.pace import DescribedEffect
@@ -175,7 +175,7 @@ class _MemberShape:
         middle[self.n_sensor] = self.number + 0.5
         more = whole.names[len(middle) :]
         columns = np.concatenate([self.columns, np.arange(len(middle), len(whole.names))])
-        others = frozen(np.concatenate([middle, np.zeros(len(more))]))
+        others = read_only_floats(np.concatenate([middle, np.zeros(len(more))]))
         return _RestrictedModel(whole, (*self.prior.names, *more), columns, others)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import FloatArray, floats, frozen
+from probewise._arrays import FloatArray, floats, read_only_floats
 from probewise.errors import ParameterError, ShapeError
 from probewise.inference._residuals import residuals
 
@@ -28,7 +28,7 @@ class GaussianKnown:
     sd: ArrayLike
 
     def __post_init__(self) -> None:
-        sd = frozen(self.sd, "sd")
+        sd = read_only_floats(self.sd, "sd")
         if sd.ndim > 1:
             raise ShapeError(f"sd has shape {sd.shape}; allowed: a number or (n_points,)")
         if not ((sd > 0) & np.isfinite(sd)).all():

@@ -8,7 +8,7 @@ from typing import Self
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.scene import CardedScene, HypothesisScene, outlines
@@ -54,7 +54,7 @@ class CullingBounds:
         low, high = (np.array([f(edge, axis=0) for edge in edges]) for f in (np.nanmin, np.nanmax))
         one = plan.take(np.array([0]))
         outside = model.predict(theta[:1], replace(one, x_mm=one.x_mm + _FAR_MM))[0, 0]
-        return cls(frozen(low - reach), frozen(high + reach), float(outside))
+        return cls(read_only_floats(low - reach), read_only_floats(high + reach), float(outside))
 
     def visible_hypotheses_by_tile(self, plan: Plan) -> Iterator[tuple[IntArray, IntArray]]:
         """Yield, for each tile of the field, its rows of the plan and the indices of the hypotheses visible there."""

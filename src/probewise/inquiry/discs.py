@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.effects import EdgeBlur, Halo, Known
 from probewise.errors import ParameterError
 from probewise.inquiry.grid import Grid
@@ -75,7 +75,7 @@ class DiscTable:
         bends = (1.0 / high, 1.0 / low)
         if isinstance(model, NaiveSensor):
             dark, bright = _readings_outside_and_inside(model, high)
-            return cls(dark, bright, 0.0, bends, frozen(np.empty((0, 0, 0))))
+            return cls(dark, bright, 0.0, bends, read_only_floats(np.empty((0, 0, 0))))
         if not isinstance(model.ssf, FixedMixture) or not all(map(is_known_uniform_effect, model.effects)):
             return None
         dark, bright = _readings_outside_and_inside(model, high)
@@ -90,7 +90,7 @@ class DiscTable:
         )
         asked = np.concatenate([asked, asked[:, :1]], axis=1)
         levels = np.ascontiguousarray(CubicSpline(coarse, asked, axis=-1)(fine))  # so that it is flat for free
-        return cls(dark, bright, margin, bends, frozen(levels))
+        return cls(dark, bright, margin, bends, read_only_floats(levels))
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from probewise._arrays import FloatArray, IntArray, frozen, frozen_int
+from probewise._arrays import FloatArray, IntArray, frozen_int, read_only_floats
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.evidence import log_volumes
 from probewise.nested.weighted_samples import WeightedSamples
@@ -65,12 +65,12 @@ class DeadPoints(WeightedSamples):
     log_start: float
 
     def __post_init__(self) -> None:
-        theta = frozen(self.theta)
+        theta = read_only_floats(self.theta)
         if theta.ndim != 2 or theta.shape[1] != len(self.names):
             raise ShapeError(f"theta has shape {theta.shape}; allowed: (n_dead, {len(self.names)}) for {self.names}")
         object.__setattr__(self, "theta", theta)
         for name in PER_POINT:
-            self._store_read_only(name, frozen(getattr(self, name)))
+            self._store_read_only(name, read_only_floats(getattr(self, name)))
         for name in COUNTS:
             self._store_read_only(name, frozen_int(getattr(self, name)))
 

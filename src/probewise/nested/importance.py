@@ -17,7 +17,7 @@ from typing import TypeAlias
 import numpy as np
 from scipy.special import expit, logsumexp
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, read_only_floats
 from probewise._kinds import require_rng
 from probewise.errors import ParameterError
 from probewise.nested.evaluate import Evaluator, Samplable
@@ -87,7 +87,7 @@ class Weighted(WeightedSamples):
 
     def __post_init__(self) -> None:
         for name in ("theta", "log_likelihood", "log_weight"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
 
     @property
     def sound(self) -> bool:

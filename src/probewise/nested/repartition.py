@@ -18,7 +18,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import gammaln, stdtr, stdtrit
 
-from probewise._arrays import FloatArray, IntArray, frozen
+from probewise._arrays import FloatArray, IntArray, read_only_floats
 from probewise.errors import ParameterError, ShapeError
 from probewise.nested.clusters import find_clusters
 from probewise.nested.evaluate import Samplable
@@ -45,7 +45,7 @@ class _StudentMixture:
 
     def __post_init__(self) -> None:
         for name in ("share", "center", "root"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
 
     def __len__(self) -> int:
         return len(self.share)

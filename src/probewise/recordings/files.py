@@ -196,7 +196,7 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     description = read_description(path.with_suffix(".json"))
     notes = list(description.notes)
     scan, scan_names = _scan_codes_and_names_in_file(table)
-    time_s = table.numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
+    time_s = table.column_of_numbers("time_s") if "time_s" in table.columns else np.arange(len(table), dtype=np.float64)
     for k, name in enumerate(scan_names):
         if not name.isprintable():
             row = table.row_number(int(np.argmax(scan == k)))
@@ -204,10 +204,12 @@ def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | 
     back = np.flatnonzero(np.diff(time_s) < 0)
     if back.size:
         notes.append(f"time_s runs backwards at row {table.row_number(int(back[0]) + 1)}")
-    orientation_deg = table.numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
+    orientation_deg = (
+        table.column_of_numbers("orientation_deg") if "orientation_deg" in table.columns else np.zeros(len(table))
+    )
     plan = Plan(
-        x_mm=table.numbers("x_mm", largest=_LARGEST_PLACE_MM),
-        y_mm=table.numbers("y_mm", largest=_LARGEST_PLACE_MM),
+        x_mm=table.column_of_numbers("x_mm", largest=_LARGEST_PLACE_MM),
+        y_mm=table.column_of_numbers("y_mm", largest=_LARGEST_PLACE_MM),
         orientation_rad=np.radians(orientation_deg),
         time_s=time_s,
         scan=scan,
@@ -239,7 +241,7 @@ def _readings_column(table: CSVTable, description: Description) -> FloatArray:
     inst = description.instrumentation
     # With a declared range a huge number is only unusable; without one it would spoil every sum.
     bounded = inst.min is not None and inst.max is not None
-    return table.numbers("reading", missing=True, largest=None if bounded else LARGEST)
+    return table.column_of_numbers("reading", missing=True, largest=None if bounded else LARGEST)
 
 
 def _scan_codes_and_names_in_file(table: CSVTable) -> tuple[IntArray, tuple[str, ...]]:
@@ -291,5 +293,5 @@ def _covariate_columns(table: CSVTable, notes: list[str]) -> dict[str, FloatArra
         elif 2 * count_numbers(filled) <= len(filled):
             notes.append(f"column {name} is text, ignored")
         else:
-            out[name] = table.numbers(name, missing=True)
+            out[name] = table.column_of_numbers(name, missing=True)
     return out

@@ -10,7 +10,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, frozen, frozen_int, require_finite
+from probewise._arrays import BoolArray, FloatArray, IntArray, frozen_int, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_finite_number, require_kind, warn_of_likely_degrees
 from probewise.errors import ParameterError, ShapeError
@@ -104,7 +104,7 @@ class Plan:
         require_kind("instrumentation", self.instrumentation, Instrumentation, "an Instrumentation(unit=...)")
         n_points = np.size(self.x_mm)
         for name in ("x_mm", "y_mm", "orientation_rad", "time_s"):
-            values = frozen(getattr(self, name), name)
+            values = read_only_floats(getattr(self, name), name)
             if values.shape != (n_points,):
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: ({n_points},), as x_mm")
             require_finite(name, values)
@@ -116,7 +116,7 @@ class Plan:
             if n_points and (codes.min() < 0 or codes.max() >= n_names):
                 raise ParameterError(name, (int(codes.min()), int(codes.max())), f"0 to {n_names - 1}")
             object.__setattr__(self, name, codes)
-        covariates = {name: frozen(values, f"covariate {name}") for name, values in self.covariates.items()}
+        covariates = {name: read_only_floats(values, f"covariate {name}") for name, values in self.covariates.items()}
         for name, values in covariates.items():
             if values.shape != (n_points,):
                 raise ShapeError(f"covariate {name} has shape {values.shape}; allowed: ({n_points},)")
@@ -285,7 +285,7 @@ class Recording(ShowsItself):
 
     def __post_init__(self) -> None:
         self._require_plan()
-        readings = frozen(self.readings, "readings")
+        readings = read_only_floats(self.readings, "readings")
         if readings.shape != (len(self.plan),):
             raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), one per row")
         object.__setattr__(self, "readings", readings)

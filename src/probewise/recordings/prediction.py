@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._arrays import FloatArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
@@ -33,12 +33,16 @@ class Prediction(ShowsItself):
     readings: FloatArray = field(default_factory=lambda: np.empty(0))
 
     def __post_init__(self) -> None:
-        readings = frozen(self.readings) if np.size(self.readings) else frozen(np.full(len(self.plan), np.nan))
+        readings = (
+            read_only_floats(self.readings)
+            if np.size(self.readings)
+            else read_only_floats(np.full(len(self.plan), np.nan))
+        )
         if readings.shape != (len(self.plan),):
             raise ShapeError(f"readings have shape {readings.shape}; allowed: ({len(self.plan)},), one per row")
         object.__setattr__(self, "readings", readings)
         for name in ("mean", "sd", "log_density"):
-            values = frozen(getattr(self, name))
+            values = read_only_floats(getattr(self, name))
             if values.shape != (len(self.plan),):
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: ({len(self.plan)},), one per row")
             if name != "log_density":
@@ -98,8 +102,8 @@ def read_prediction(path: str | os.PathLike[str]) -> tuple[FloatArray, FloatArra
     """
     table = read_table(checked_path("path", path))
     table.require_columns("mean", "sd", "log_density")
-    mean, sd = table.numbers("mean"), table.numbers("sd")
+    mean, sd = table.column_of_numbers("mean"), table.column_of_numbers("sd")
     if np.any(sd <= 0):
         k = int(np.argmax(sd <= 0))
         raise FileError(path, f"{sd[k]:g}", "greater than 0", row=table.row_number(k), column="sd")
-    return mean, sd, table.numbers("log_density", missing=True)
+    return mean, sd, table.column_of_numbers("log_density", missing=True)

@@ -67,7 +67,7 @@ class CSVTable:
                     row=1, column=name,
                 )  # fmt: skip
 
-    def numbers(self, name: str, *, missing: bool = False, largest: float | None = LARGEST) -> FloatArray:
+    def column_of_numbers(self, name: str, *, missing: bool = False, largest: float | None = LARGEST) -> FloatArray:
         """Read a column as numbers, shape (n_rows,).
 
         Parameters

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._arrays import FloatArray, read_only_floats, require_finite
 from probewise._display import ShowsItself
 from probewise._kinds import checked_whole
 from probewise.errors import ParameterError, ShapeError
@@ -111,14 +111,14 @@ class FixedMixture:
     def __post_init__(self) -> None:
         n = np.size(self.weights)
         for name, shape in (("weights", (n,)), ("means_mm", (n, 2)), ("covs_mm2", (n, 2, 2))):
-            values = frozen(getattr(self, name), name)
+            values = read_only_floats(getattr(self, name), name)
             if values.shape != shape or n == 0:
                 raise ShapeError(f"{name} has shape {values.shape}; allowed: {shape}, one Gaussian or more")
             require_finite(name, values)
             object.__setattr__(self, name, values)
         if (self.weights < 0).any() or not self.weights.sum() > 0:
             raise ParameterError("weights", self.weights.tolist(), "0 or more, at least one greater than 0")
-        object.__setattr__(self, "weights", frozen(self.weights / self.weights.sum()))
+        object.__setattr__(self, "weights", read_only_floats(self.weights / self.weights.sum()))
         if not (np.linalg.eigvalsh(self.covs_mm2) > 0).all():
             raise ParameterError("covs_mm2", self.covs_mm2.tolist(), "positive definite matrices")
 
@@ -173,7 +173,7 @@ class SSFField(ShowsItself):
             raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
         if not values.sum() > 0:
             raise ParameterError("sum of the SSF field", float(values.sum()), "greater than 0")
-        object.__setattr__(self, "values", frozen(values / values.sum()))
+        object.__setattr__(self, "values", read_only_floats(values / values.sum()))
 
     @property
     def u_mm(self) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise._kinds import checked_path
 from probewise.errors import FileError, ParameterError, ShapeError
 from probewise.recordings import Instrumentation, Recording
@@ -81,7 +81,7 @@ class RunTable:
     @cached_property
     def time_s(self) -> FloatArray:
         """Time as recorded, in its own unit; the row's number if none was recorded, (n_points,)."""
-        return frozen(np.arange(float(len(self))) if self.time is None else self.columns[self.time])
+        return read_only_floats(np.arange(float(len(self))) if self.time is None else self.columns[self.time])
 
     @cached_property
     def _run_of_row_and_names(self) -> tuple[IntArray, tuple[str, ...]]:
@@ -164,7 +164,7 @@ def _checked_column(name: str, values: Any) -> NDArray[Any]:
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
     if array.dtype.kind in "biuf":
-        return frozen(array)
+        return read_only_floats(array)
     texts = np.array([str(value) for value in array.tolist()])
     texts.flags.writeable = False
     return texts
@@ -185,10 +185,10 @@ def read_run_table(path: str | os.PathLike[str], *, time: str | None, run: str |
     columns: dict[str, NDArray[Any]] = {}
     for name in table.columns:
         if name == time:
-            columns[name] = table.numbers(name)
+            columns[name] = table.column_of_numbers(name)
             continue
         try:
-            columns[name] = table.numbers(name, missing=name != run)
+            columns[name] = table.column_of_numbers(name, missing=name != run)
         except FileError:
             columns[name] = np.array(table.cells(name))
     return RunTable(columns, time, run)

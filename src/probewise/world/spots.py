@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._arrays import FloatArray, read_only_floats, require_finite
 from probewise.errors import ParameterError, ShapeError
 
 Density = Callable[[FloatArray, FloatArray], FloatArray]
@@ -42,7 +42,7 @@ class Spot:
             raise ParameterError("weights", float(weights.min()), "0 or more, not all of them 0")
         if not self.pixel_mm > 0:
             raise ParameterError("pixel_mm", self.pixel_mm, "greater than 0")
-        object.__setattr__(self, "weights", frozen(weights / weights.sum()))
+        object.__setattr__(self, "weights", read_only_floats(weights / weights.sum()))
 
     def edges_mm(self) -> tuple[FloatArray, FloatArray]:
         """Return the edges of the pixels in u, shape (n_u + 1,), and in v, shape (n_v + 1,)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from probewise.diagnosis.repair.annealing import anneal, importance_resample
+from probewise.diagnosis.repair.annealing import draw_by_annealing, importance_resample
 
 
 def normal(center, factor, n, rng):
@@ -18,7 +18,7 @@ def normal(center, factor, n, rng):
 def drawn(center, factor, log_p, seed, n_walkers=400, n_wanted=800):
     rng = np.random.default_rng(seed)
     first, log_q = normal(np.array(center), np.array(factor), n_walkers, rng)
-    return anneal(first, log_q, log_p, n_moves=6, n_wanted=n_wanted, rng=rng)
+    return draw_by_annealing(first, log_q, log_p, n_moves=6, n_wanted=n_wanted, rng=rng)
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from probewise.world.systems.forms.inputs import behind_gear_play
-from probewise.world.systems.forms.readings import delayed, direction_of_change
+from probewise.world.systems.forms.readings import delayed_values, direction_of_change
 from probewise.world.systems.table import SystemTable
 
 
@@ -69,7 +69,8 @@ def test_a_lag_mixes_each_reading_with_the_one_before_within_a_run(solve):
 def test_what_comes_late_is_read_on_the_straight_line_and_begins_as_it_is():
     rows = _rows([0, 1, 2, 4])
     np.testing.assert_allclose(
-        delayed(np.array([[0.0, 10.0, 20.0, 20.0]]), rows, np.array([[0.5], [3.0]])), [[0, 5, 15, 20], [0, 0, 0, 10]]
+        delayed_values(np.array([[0.0, 10.0, 20.0, 20.0]]), rows, np.array([[0.5], [3.0]])),
+        [[0, 5, 15, 20], [0, 0, 0, 10]],
     )
 
 

@@ -251,7 +251,7 @@ class Motor:
         return self._target
 
     def _approach(self, goal: int, side: Side, here: int) -> int:
-        """Move towards the goal: fast to well short of it, or slowly all the way."""
+        """Move towards the goal, fast to well short of it or slowly all the way; return the count."""
         fast, slow = self.drive.fast_power, self.drive.slow_power
         target = goal - side * self._coast_counts(slow, side)
         if side * self._checked_target >= side * target:
@@ -265,7 +265,7 @@ class Motor:
         return self._make_limited_move(side * max(side * target, least), side, slow, here)
 
     def _back_off(self, goal: int, side: Side, here: int) -> int:
-        """Back off behind the goal, far enough for a slow move to start and take up the play."""
+        """Back off behind the goal, far enough for a slow move to start and take up the play; return the count."""
         back: Side = 1 if side == -1 else -1
         fast, slow = self.drive.fast_power, self.drive.slow_power
         behind = goal - side * (self._coast_counts(slow, side) + 2 * self.drive.lead_counts)

@@ -42,7 +42,7 @@ class SerialPort:
             return cls(serial.Serial(path, timeout=0, write_timeout=WRITE_S, exclusive=True))
         except (OSError, ValueError) as error:
             raise LinkError(
-                f"{path} cannot be opened ({_reason(error)}); is the brick on, paired and bound to that port, "
+                f"{path} cannot be opened ({_system_message(error)}); is the brick on, paired and bound to that port, "
                 "and does no other program use it?"
             ) from error
 
@@ -71,10 +71,12 @@ class SerialPort:
         self._port.close()
 
     def _link_cut_error(self, error: OSError) -> LinkError:
-        return LinkError(f"the line to the NXT on {self.name} is cut ({_reason(error)}); is the brick on and near?")
+        return LinkError(
+            f"the line to the NXT on {self.name} is cut ({_system_message(error)}); is the brick on and near?"
+        )
 
 
-def _reason(error: Exception) -> str:
+def _system_message(error: Exception) -> str:
     """Return the system's message, without pyserial's additions."""
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error)

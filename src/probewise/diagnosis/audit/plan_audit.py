@@ -15,7 +15,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, read_only_floats
 from probewise._display import ShowsItself
 from probewise._kinds import require_one_of
 from probewise.calibration import FittedSensor
@@ -147,7 +147,7 @@ class PlanAudit(ShowsItself):
     classes: tuple[tuple[str, ...], ...] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cosines", frozen(self.cosines))
+        object.__setattr__(self, "cosines", read_only_floats(self.cosines))
 
     def seen_as(self, detectability: Detectability, *, after: bool = False) -> tuple[EffectAudit, ...]:
         """Return the effects with this detectability, under the plan or the plan with its cures.

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, read_only_floats
 from probewise.diagnosis.evidence.hypothesis_problem import HypothesisProblem, StandardNormal
 from probewise.diagnosis.fitting.coordinates import GaussianMixtureSensor
 
@@ -40,7 +40,7 @@ class FoldedNormal(StandardNormal):
     near: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "near", frozen(self.near))
+        object.__setattr__(self, "near", read_only_floats(self.near))
 
     @cached_property
     def _reordering_maps(self) -> tuple[FloatArray, FloatArray]:

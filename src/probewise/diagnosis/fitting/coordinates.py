@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, read_only_floats
 from probewise.effects import Extent, NamedEffect
 from probewise.errors import ShapeError
 from probewise.recordings.plan import Plan
@@ -44,8 +44,8 @@ class CalibratedSensor(ABC):
 
     def __post_init__(self) -> None:
         n = self.n_params
-        object.__setattr__(self, "center", frozen(self.center))
-        object.__setattr__(self, "factor", frozen(self.factor))
+        object.__setattr__(self, "center", read_only_floats(self.center))
+        object.__setattr__(self, "factor", read_only_floats(self.factor))
         if self.center.shape != (n,) or self.factor.shape != (n, n):
             raise ShapeError(
                 f"center {self.center.shape} and factor {self.factor.shape} do not fit; allowed: ({n},) and "

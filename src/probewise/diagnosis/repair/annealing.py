@@ -77,7 +77,7 @@ def _n_distinct_effective(log_weight: FloatArray, samples: FloatArray) -> float:
         return n_effective(np.log(np.bincount(which, np.exp(log_weight - log_weight.max()))))
 
 
-def anneal(
+def draw_by_annealing(
     first: FloatArray,
     log_q: Density,
     log_p: Density,

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, read_only_floats
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.judgement.global_test import GlobalTest
 from probewise.diagnosis.prepared import Prepared
@@ -28,8 +28,8 @@ class Predicted:
     residuals: FloatArray
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "readings", frozen(self.readings))
-        object.__setattr__(self, "residuals", frozen(self.residuals))
+        object.__setattr__(self, "readings", read_only_floats(self.readings))
+        object.__setattr__(self, "residuals", read_only_floats(self.residuals))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from probewise._arrays import BoolArray, FloatArray, IntArray, frozen
+from probewise._arrays import BoolArray, FloatArray, IntArray, read_only_floats
 from probewise.calibration.fields import choose_pixel_mm, mean_field, sorted_by_mass
 from probewise.calibration.noise import noise_by_scan
 from probewise.calibration.sensor_file import FittedSensor
@@ -19,7 +19,7 @@ from probewise.diagnosis.evidence.laplace import NoiseEvidence
 from probewise.diagnosis.fitting.coordinates import FARTHEST, effect_values
 from probewise.diagnosis.fitting.fit import Fit
 from probewise.diagnosis.fitting.null import Predictor
-from probewise.diagnosis.repair.annealing import Density, anneal, importance_resample
+from probewise.diagnosis.repair.annealing import Density, draw_by_annealing, importance_resample
 from probewise.diagnosis.repair.profiled import ProfiledDensity
 from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 from probewise.diagnosis.repair.surrogate import SurrogatePosterior
@@ -59,8 +59,8 @@ class ModelSamples:
     absent: Mapping[str, BoolArray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "theta", frozen(self.theta))
-        object.__setattr__(self, "noise_sd", frozen(self.noise_sd))
+        object.__setattr__(self, "theta", read_only_floats(self.theta))
+        object.__setattr__(self, "noise_sd", read_only_floats(self.noise_sd))
 
     def effect_samples(self, effect: str) -> FloatArray:
         """Return the samples of one effect's parameters, (n_samples, n_params of the effect)."""
@@ -221,7 +221,9 @@ def _posterior_draws(
         weighed = importance_resample(first, log_q, log_p, n_wanted=n, rng=rng)
         if weighed is not None:
             return weighed
-        return anneal(first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress)
+        return draw_by_annealing(
+            first[:N_WALKERS], log_q, log_p, n_moves=n_moves, n_wanted=n, rng=rng, progress=progress
+        )
 
     e = resampled_or_annealed(draws, log_laplace, near.log_density, _MOVES_NEAR, _N_NEAR)
     return center + resampled_or_annealed(e, near.log_density, log_posterior_of_steps, _MOVES, N_SAMPLES) @ steps

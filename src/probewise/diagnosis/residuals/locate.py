@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from probewise._arrays import FloatArray, frozen
+from probewise._arrays import FloatArray, read_only_floats
 from probewise.diagnosis.evidence.bank import TemplateBank
 from probewise.diagnosis.evidence.laplace import Linearised
 from probewise.diagnosis.residuals.covariate import Covariate
@@ -56,9 +56,9 @@ class Place:
 
     def __post_init__(self) -> None:
         if self.values is not None:
-            object.__setattr__(self, "values", frozen(self.values))
+            object.__setattr__(self, "values", read_only_floats(self.values))
         for name in ("curve_at", "curve_mean", "curve_sd"):
-            object.__setattr__(self, name, frozen(getattr(self, name)))
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
 
     @property
     def figure_name(self) -> str:

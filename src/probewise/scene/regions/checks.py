@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._arrays import FloatArray, read_only_floats, require_finite
 from probewise.errors import ParameterError, ShapeError
 from probewise.scene.albedo import Region
 
@@ -40,7 +40,7 @@ def broadcast_and_freeze_fields(region: object, **shapes: tuple[int, ...]) -> No
         if len(array) not in (1, n_regions):
             raise ShapeError(f"{name} has {len(array)} rows; allowed: {n_regions}, as the other arrays, or 1")
         require_finite(name, array)
-        object.__setattr__(region, name, frozen(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
+        object.__setattr__(region, name, read_only_floats(np.broadcast_to(array, (n_regions, *array.shape[1:]))))
 
 
 broadcast_fields = broadcast_and_freeze_fields  # its earlier name

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from probewise._arrays import FloatArray, frozen, require_finite
+from probewise._arrays import FloatArray, read_only_floats, require_finite
 from probewise.errors import ParameterError, ShapeError
 
 
@@ -24,7 +24,7 @@ class ImageRegion:
     origin_mm: tuple[float, float]
 
     def __post_init__(self) -> None:
-        values = frozen(self.values)
+        values = read_only_floats(self.values)
         if values.ndim != 2 or values.size == 0:
             raise ShapeError(f"image has shape {values.shape}; allowed: (n_rows, n_columns), not empty")
         require_finite("image", values)

@@ -10,7 +10,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.world.systems.forms.form import Form, Numbers
 from probewise.world.systems.forms.modulations import scale_only_member, starting_point_of_wave, wave_bank
-from probewise.world.systems.forms.readings import delayed
+from probewise.world.systems.forms.readings import delayed_values
 from probewise.world.systems.forms.true_system import TrueSystem, draw_log_uniform
 from probewise.world.systems.table import SystemTable
 
@@ -141,7 +141,7 @@ def _forms_of_column(true: TrueSystem, column: str) -> Iterator[Form]:
         yield _nonlinear_form(
             f"input_delay:{column}",
             "tau_s",
-            lambda c, rows, v: delayed(c, rows, np.maximum(v["tau_s"], 0.0)),
+            lambda c, rows, v: delayed_values(c, rows, np.maximum(v["tau_s"], 0.0)),
             column,
             taus,
             ("previous", column),

@@ -152,7 +152,7 @@ def _make_clip_level(end: float, sign: float) -> Callable[[float, dict[str, floa
     return lambda a, drawn: {"level": end + sign * a}
 
 
-def delayed(values: FloatArray, rows: SystemTable, tau: FloatArray) -> FloatArray:
+def delayed_values(values: FloatArray, rows: SystemTable, tau: FloatArray) -> FloatArray:
     """Delay values (n or 1, n_points) by tau (n or 1, 1) within runs: interpolated, constant before the first."""
     n = max(len(values), len(tau))
     values, tau = np.broadcast_to(values, (n, values.shape[1])), np.broadcast_to(tau, (n, 1))
@@ -178,7 +178,10 @@ def _lag_and_delay_forms(true: TrueSystem) -> Iterator[Form]:
     if true.table.time is None:
         return
     gap = true.table.median_gap
-    acts = {"lag": (_lagged, 0.3), "delay": (lambda y, rows, v: delayed(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02)}
+    acts = {
+        "lag": (_lagged, 0.3),
+        "delay": (lambda y, rows, v: delayed_values(y, rows, np.maximum(v["tau_s"], 0.0)), 0.02),
+    }
     for name, (act, least) in acts.items():
         yield Form(
             name,

@@ -24,7 +24,7 @@ import numpy as np
 from probewise.campaign import run_campaign
 from probewise.challenge import NullRefit
 from probewise.challenge.case import Task
-from probewise.challenge.estimates import share
+from probewise.challenge.estimates import estimated_share
 from probewise.diagnosis import diagnose, weigh_thoroughly
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
 from probewise.world.challenge import PLANS, draw_case
@@ -63,7 +63,7 @@ def summary(results: Sequence[Result]) -> str:
             ("", chosen),
             *((f", order {n}", [w for w in chosen if w["n_gaussians"] == n]) for n in orders),
         ]:
-            agree = share([w["agree"] for w in own])
+            agree = estimated_share([w["agree"] for w in own])
             gaps, errors = (np.array([w[key] for w in own]) for key in ("gap", "error"))
             lines.append(
                 f"{name}{label}: {agree.value:.3f} ({agree.low:.3f} to {agree.high:.3f}) of {agree.n} in a nat; nested "

@@ -62,6 +62,11 @@ class Prepared:
         return np.flatnonzero(self.recording.usable)
 
     @cached_property
+    def usable_rows_of_everything(self) -> IntArray:
+        """Rows of `everything` with a reading that is used, (n_usable,)."""
+        return rows_to_diagnose(self.everything)[self.usable_rows] if self.is_thinned else self.usable_rows
+
+    @cached_property
     def noise_effect_names(self) -> frozenset[str]:
         """Names of the effects on the noise."""
         return frozenset(name for name, effect in self.effects.items() if effect.stage is Stage.NOISE)

@@ -1,10 +1,14 @@
 """What a repair says of its samples."""
 
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
 
-from probewise.diagnosis.repair.repair import Predicted, Repair
+from probewise.diagnosis.prepared import Prepared
+from probewise.diagnosis.repair.repair import Predicted, Repair, repair_of
+from probewise.diagnosis.thinning import rows_to_diagnose
+from probewise.recordings import Plan, Recording, Uniform
 
 LAG = SimpleNamespace(name="lag", sentence=lambda mean, sd: f"it lags by {mean[0]:.0f} s")
 
@@ -33,3 +37,41 @@ def test_what_is_carried_and_not_stated_is_said_of_the_samples_that_hold_it():
     marks = {"lag": np.array([False, False, True, True])}
     assert repair(marks).unstated_effects(set()) == (("lag", 0.5, "it lags by 2 s"),)
     assert repair(marks).unstated_effects({"lag"}) == ()
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A model that predicts one level, z, in every row of a plan."""
+
+    plan: Plan
+
+    def predict(self, z):
+        return np.repeat(z[:, :1], len(self.plan), axis=1)
+
+
+def fitted(recording, level):
+    model = Constant(recording.plan)
+    return SimpleNamespace(model=model, z=np.array([level]), residuals=recording.readings - level)
+
+
+def test_a_correction_by_rows_stands_at_the_readings_that_were_used_of_a_long_recording():
+    """5,000 readings of level 7, of which about half are diagnosed; the repaired model's level is 5."""
+    n = 5000
+    everything = Recording.from_arrays(
+        x_mm=np.arange(n) / n, y_mm=np.zeros(n), readings=np.full(n, 7.0), patterns=Uniform(0.5), unit="LEGO"
+    )
+    rows = rows_to_diagnose(everything)
+    assert len(rows) < n
+    recording = everything.take(rows)
+    prepared = Prepared(recording, {}, None, None, everything)
+    test = SimpleNamespace(null=SimpleNamespace(found=fitted(recording, 4.0)))
+    best = SimpleNamespace(fit=SimpleNamespace(found=fitted(recording, 5.0)), improvement=None)
+    drawn = SimpleNamespace(null=None, repaired=None)
+    found = repair_of(prepared, test, best, drawn, np.full(len(rows), 2.0))
+    assert found.by_rows
+    np.testing.assert_array_equal(found.before.readings, 4.0)
+    used = np.isin(np.arange(n), rows)
+    np.testing.assert_array_equal(found.after.readings[used], 7.0)
+    np.testing.assert_array_equal(found.after.residuals[used], 0.0)
+    np.testing.assert_array_equal(found.after.readings[~used], 5.0)
+    np.testing.assert_array_equal(found.after.residuals[~used], 2.0)

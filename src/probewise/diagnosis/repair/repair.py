@@ -101,17 +101,20 @@ def repair_of(
     prepared, test, best, drawn
         Input of the search; global test of the null; the best fit; samples of the models.
     change
-        Correction of the predictions by rows, (n_usable,), 0 if there is none.
+        Correction of the predictions of the readings that are used, (n_usable,), 0 if there is none; others have none.
     """
     null, fit = test.null.found, best.fit.found
     everything = prepared.everything
+    by_rows = np.zeros(len(everything))
+    by_rows[prepared.usable_rows_of_everything] = change
     if prepared.is_thinned:
         readings = np.where(everything.usable, everything.readings, np.nan)
-        plans = (replace(found.model, plan=everything.plan).predict(found.z[None, :])[0] for found in (null, fit))
-        before, after = (Predicted(predicted, readings - predicted) for predicted in plans)
+        plain, repaired = (
+            replace(found.model, plan=everything.plan).predict(found.z[None, :])[0] for found in (null, fit)
+        )
+        before = Predicted(plain, readings - plain)
+        after = Predicted(repaired + by_rows, readings - repaired - by_rows)
     else:
-        by_rows = np.zeros(len(prepared.recording))
-        by_rows[prepared.usable_rows] = change
         before = Predicted(_predictions_of_all_rows(null), prepared.expand_to_all_rows(null.residuals))
         after = Predicted(_predictions_of_all_rows(fit) + by_rows, prepared.expand_to_all_rows(fit.residuals - change))
     return Repair(drawn.null, drawn.repaired, best.improvement, before, after, by_rows=bool(np.any(change)))

@@ -87,6 +87,8 @@ class Particles:
         scratch; infinite for others.
     limit_is_searched
         Whether a search from scratch gave that limit. Fits alone may all have missed the best one.
+    searched_at
+        Number of readings at the last search from scratch; -inf if there was none.
     """
 
     weighted: Weighted
@@ -98,6 +100,7 @@ class Particles:
     refitted: bool = False
     log_z_limit: float = math.inf
     limit_is_searched: bool = False
+    searched_at: float = -math.inf
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "ancestor", frozen_int(self.ancestor))
@@ -236,6 +239,7 @@ def update(
         previous.refitted and with_ease,
         previous.log_z_limit,
         previous.limit_is_searched,
+        previous.searched_at,
     )
 
 

@@ -153,4 +153,5 @@ def independent_start_with_evidence(particles: Particles, found: BridgedEvidence
         refitted=particles.refitted,
         log_z_limit=particles.log_z_limit,
         limit_is_searched=particles.limit_is_searched,
+        searched_at=particles.searched_at,
     )

@@ -24,7 +24,7 @@ _BEHIND = 9.0  # nats behind the best kind, from which on a rival is not sampled
 _FEWEST = 4.0  # effective draws below which a sample replaces none
 _LEAST_FOUND = 15.0  # effective draws from which on a sample replaces another of about the same evidence
 _RULED_OUT = 10.0  # nats by which fits and a kind's own samples may miss its evidence, where both are behind
-_SEARCHED_FOR = 5  # readings that a search from scratch is good for
+_SEARCHED_FOR = 5  # readings that a search from scratch is good for, if its samples follow them with ease
 _SEARCHED_PER_READING = 1  # kinds that are searched from scratch after a reading; before a run ends, all that need it
 
 
@@ -45,9 +45,9 @@ def sample_rivals_again(
     less likely than the plain model: if it seems to be, its samples are in the wrong place. With `each`, every rival is
     sampled anew, except those that do not matter and whose samples were found in this way and have followed the
     readings since. Fits that start at samples of other kinds come first. Where few of them lead to the best fit, others
-    may be missed: the kind is searched from scratch, unless it was some readings ago; one kind after a reading in turn,
-    and with `each` all of them and those that matter. A rival that came out far below the best kind is sampled again
-    when the readings since could have made up the difference.
+    may be missed: the kind is searched from scratch, one kind after a reading in turn, and with `each` all of them and
+    those that matter. A search is good for some readings, if the samples follow them with ease. A rival that came out
+    far below the best kind is sampled again when the readings since could have made up the difference.
     """
     particles, log_odds = list(now.particles), now.log_odds
     probability = now.with_warier_odds.probability
@@ -61,7 +61,8 @@ def sample_rivals_again(
         own = particles[k]
         beyond = own.log_z < particles[plain].log_z - _NESTED
         hopeless = float(log_odds.max()) - kind.log_prior - _BEHIND
-        may_search = n_searches > 0 and len(problem.recording) >= own.searched_at + _SEARCHED_FOR
+        is_search_old = own.strained or own.hurried or len(problem.recording) >= own.searched_at + _SEARCHED_FOR
+        may_search = n_searches > 0 and is_search_old
         matters = each and may_search and probability[k] > HAS_A_SAY
         wanted = matters or (each and not own.refitted) or beyond or own.strained or own.hurried
         if not wanted or (own.log_z_limit < hopeless and (own.limit_is_searched or not each)):

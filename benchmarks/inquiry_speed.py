@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 
 from probewise.arm import Pose, Reach, SimulatedArm
-from probewise.experiment import ArmOverGrid, Experiment, Step, explore
+from probewise.experiment import ArmReachAndTravel, Experiment, Step, explore
 from probewise.experiment.acquisition import predict_and_rate_readings
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.particles import Particles, update
@@ -63,7 +63,7 @@ def follow(arm: SimulatedArm, experiment: Experiment, run: int) -> list[dict[str
     """Run once, and time every step again by itself."""
     rows = []
     with arm:
-        field = ArmOverGrid.from_instrument(arm, experiment.grid)
+        field = ArmReachAndTravel.from_instrument(arm, experiment.grid)
         steps = list(explore(arm, experiment, rng=np.random.default_rng(run)))
     for number, (before, after) in enumerate(pairwise(steps)):
         problem = experiment.problem([step.reading for step in steps[: number + 2]])

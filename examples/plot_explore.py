@@ -46,4 +46,4 @@ places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
 for n in (len(found.steps) // 2, len(found.steps)):
     fig, ax = plt.subplots(figsize=(9, 5.4), layout="constrained")
     exploration.view(found.steps[n - 1], experiment, places[:n], levels=(10.0, 60.0), ax=ax)
-    plots.field_legend(ax)
+    plots.draw_field_legend(ax)

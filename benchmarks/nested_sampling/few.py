@@ -1,4 +1,4 @@
-"""For slow likelihoods: evaluations and errors of `nested.run_slow` over many seeds, beside the best peer's.
+"""For slow likelihoods: evaluations and errors of `nested.run_in_few_calls` over many seeds, beside the best peer's.
 
     python -m nested_sampling.few --seeds 20 --out docs/results/nested_few.json
 
@@ -26,7 +26,7 @@ from nested_sampling.problems import problem
 from nested_sampling.sampler import Counted
 from nested_sampling.seeds import document
 from probewise.errors import DoubtfulResultWarning
-from probewise.nested import run_slow
+from probewise.nested import run_in_few_calls
 
 # The best correct peer's evaluations and claimed error, one run each, 2026-11-21 and before; of nestle the product of
 # evaluations and squared error is known, which is put here at an error of 0.2.
@@ -47,7 +47,7 @@ def measure(name: str, seeds: range) -> dict[str, Any]:
     rows = []
     for seed in seeds:
         counted = Counted(known)
-        found = run_slow(counted, rng=np.random.default_rng([seed, 28]), error=wanted)
+        found = run_in_few_calls(counted, rng=np.random.default_rng([seed, 28]), error=wanted)
         error = float(np.hypot(found.log_z_error, known.log_z_error))
         rows.append(((found.log_z - known.log_z) / error, error, counted.n_evaluations, found.run is None, found.sound))
     z, error, n_evaluations, drawn, sound = (np.array(column) for column in zip(*rows, strict=True))

@@ -59,7 +59,7 @@ for ax, name, found in zip(axes[0], ("trust 1", "trust 0.9"), (trusting, doubtin
     places = [(r.pose.x_mm, r.pose.y_mm, r.value) for r in found.readings]
     title = f"{name}, after {len(places)} readings"
     exploration.view(found.last, found.experiment, places, levels=(10.0, 60.0), truth_mm=outline_mm, title=title, ax=ax)
-plots.field_legend(axes)
+plots.draw_field_legend(axes)
 
 # %%
 # What the second robot believes about its sensor after each reading. A dashed line marks a reading that changed the

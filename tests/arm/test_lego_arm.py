@@ -307,7 +307,7 @@ def test_no_command_passes_the_guard(make_paper_brick, data):
 def test_the_guard_lets_a_joint_that_is_outside_come_back():
     limits = SoftLimits(SHIPPED)
     outside = SHIPPED.base.counts_at(SHIPPED.base.low_rad) - 50
-    limits.record_counts(0, outside)
+    limits.record_present_count(0, outside)
     limits.require_allowed_move(0, outside, outside + 30)
     with pytest.raises(ReachError):
         limits.require_allowed_move(0, outside, outside - 1)

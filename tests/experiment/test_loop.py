@@ -15,7 +15,7 @@ from scipy.stats import multivariate_normal
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import FileError, LinkError, NotConvergedError, ParameterError, ReachError
-from probewise.experiment import ArmOverGrid as FieldOf
+from probewise.experiment import ArmReachAndTravel as FieldOf
 from probewise.experiment import Exploration, OneScan, arm_over, begin, explore, read_journal, run, step
 from probewise.inference import GaussianKnown, StudentT
 from probewise.inquiry import Grid, InformationGain, PerSecond, ReadingEntropy, prior_entropy

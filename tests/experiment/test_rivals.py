@@ -28,7 +28,7 @@ from probewise.experiment import (
     sampled_anew,
     step,
 )
-from probewise.experiment.acquisition import ArmOverGrid, predict_and_rate_readings
+from probewise.experiment.acquisition import ArmReachAndTravel, predict_and_rate_readings
 from probewise.experiment.arm_error import arm_error_in_posterior
 from probewise.experiment.checking import ENOUGH_BITS, NAMES, OutlineCoverage, bits_about_left_out
 from probewise.experiment.method import nested_sampling_from_scratch
@@ -64,7 +64,7 @@ def stepped(doubting):
     """Two steps of a run that doubts, both of the prior's first places."""
     rng = np.random.default_rng(3)
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmOverGrid.from_instrument(arm, doubting.grid)
+        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
         state = begin(doubting, field, rng=rng)
         prior_bits = prior_entropy(doubting.prior, rng=rng)
         found = []
@@ -259,7 +259,7 @@ def test_the_arms_error_follows_the_odds_by_which_the_shape_is_reported(doubting
     fitted, rng = FittedArm(geometry, (10.0, 60.0)), np.random.default_rng(3)
     experiment = replace(doubting, fitted_arm=fitted)
     with arm_of(Trial(REFERENCE, 0)) as simulated:
-        field = ArmOverGrid.from_instrument(simulated, experiment.grid)
+        field = ArmReachAndTravel.from_instrument(simulated, experiment.grid)
     state = begin(experiment, field, rng=rng)
     for k, (x, y, value) in enumerate([(200.0, 150.0, 59.0), (250.0, 150.0, 14.0), (200.0, 200.0, 31.0)]):
         reading = Reading(value, Pose(x, y), 8.0 * k)
@@ -284,7 +284,7 @@ def test_the_side_that_no_reading_has_seen_is_asked(doubting, angles_deg, asked_
     inside = Reading(60.0, Pose(x - 0.6 * radius, y), 0.0)
     joined = prior_posterior(doubting.kinds[:1], 600, rng=np.random.default_rng(1)).particles[0].weighted
     with arm_of(Trial(REFERENCE, 0)) as arm:
-        field = ArmOverGrid.from_instrument(arm, doubting.grid)
+        field = ArmReachAndTravel.from_instrument(arm, doubting.grid)
     utility_input, _ = predict_and_rate_readings(doubting, joined, joined.theta[:20], field, at=inside)
     outline = OutlineCoverage.of(utility_input, doubting.shape.region(np.array([[x, y, radius]])), (inside, *on_edge))
     assert outline is not None

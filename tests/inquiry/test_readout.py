@@ -42,10 +42,10 @@ def test_what_is_certain_has_no_entropy():
 
 def test_a_reading_that_the_sensor_cannot_return_is_refused():
     readout = Readout(1.0, 1.0, 1.0, 100.0)
-    readout.require(100.0)
-    readout.require(math.nan)
+    readout.require_in_range(100.0)
+    readout.require_in_range(math.nan)
     with pytest.raises(ParameterError, match=r"reading is 130.0; allowed: 1 to 100, the range of the sensor"):
-        readout.require(130.0)
+        readout.require_in_range(130.0)
 
 
 @pytest.mark.parametrize("change", [{"noise_sd": 0.0}, {"step": -1.0}, {"low": 5.0, "high": 5.0}])

@@ -133,7 +133,7 @@ FIGURES = {
 
 
 def test_every_plot_function_is_here():
-    others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "field_legend", "grid_of_axes", "png", "stack_of_axes", "svg"}
+    others = {"AxesGrid", "PAGE_IN", "SMALL_PT", "draw_field_legend", "grid_of_axes", "png", "stack_of_axes", "svg"}
     of_a_diagnosis = {  # laid out by `svg`, and drawn by the tests of its pages
         "before_and_after",
         "residual_autocorrelation",

@@ -47,7 +47,7 @@ def test_each_stage_is_where_its_coefficients_add_up_to(method):
     ],
 )
 def test_the_method_is_the_one_whose_accuracy_costs_least(in_gap, method, steps):
-    schedule = StepSchedule.from_fourth_order(np.array(in_gap))
+    schedule = StepSchedule.from_fourth_order_steps(np.array(in_gap))
     assert schedule.method is method
     np.testing.assert_array_equal(schedule.n_steps, steps)
 

@@ -89,8 +89,8 @@ def carry_out(
     places = np.stack([plan.x_mm, plan.y_mm], axis=-1) + np.asarray(origin_mm)
     require_within_reach(reach_of(arm), places, "row of the plan", way_out="; move the plan's origin")
     _require_feasible_settings(arm, plan)
-    row_reader = _LegoRowReader(arm) if isinstance(arm, LegoArm) else _OwnRowReader(arm)
-    turns = row_reader.hand_turns_rad(plan, places)
+    row_measurer = _LegoRowMeasurer(arm) if isinstance(arm, LegoArm) else _OwnRowMeasurer(arm)
+    turns = row_measurer.hand_turns_rad(plan, places)
     mounted, lying = 0.0, -1
     for row in range(first, len(plan)):
         if plan.pattern[row] != lying:
@@ -101,10 +101,10 @@ def carry_out(
             ask(RequestToPerson(f"lay sheet {name!r}, {where}{shown}", pattern=name))
         if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
             mounted = float(turns[row])
-            text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {row_reader.from_where}"
+            text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {row_measurer.from_where}"
             ask(RequestToPerson(text, turned_rad=mounted))
         x_mm, y_mm = places[row].tolist()
-        reading = row_reader.read_row(x_mm, y_mm, mounted, plan, row)
+        reading = row_measurer.measure_row(x_mm, y_mm, mounted, plan, row)
         there = _place_in_plan_frame_mm(reading, plan, row, origin_mm)
         yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
 
@@ -141,8 +141,8 @@ def _place_in_plan_frame_mm(
     return round(reading.pose.x_mm - origin_mm[0], 3), round(reading.pose.y_mm - origin_mm[1], 3)
 
 
-class _LegoRowReader:
-    """Reader of a plan's rows for the LEGO arm: its base turns the sensor; a person turns it by right angles."""
+class _LegoRowMeasurer:
+    """Measurer of a plan's rows with the LEGO arm: its base turns the sensor; a person turns it by right angles."""
 
     from_where = "anticlockwise seen from above, from where the geometry has it"
 
@@ -155,15 +155,15 @@ class _LegoRowReader:
         off = plan.orientation_rad - self._arm.orientation_rad(places_mm)
         return np.asarray(np.rint(off / QUARTER_RAD) % 4 * QUARTER_RAD)
 
-    def read_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Take the reading of a row, with its place in the lab frame."""
+    def measure_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
+        """Move to the place of a row, measure, and return the reading, with its place in the lab frame."""
         self._arm.turned_rad = turned_rad
         standing = self._arm.orientation_rad(np.array([[x_mm, y_mm]]))
         return self._arm.measure(Pose(x_mm, y_mm, float(standing[0])))
 
 
-class _OwnRowReader:
-    """Reader of a plan's rows for a user's own instrument or the simulated arm, which may turn the sensor itself."""
+class _OwnRowMeasurer:
+    """Measurer of a plan's rows with a user's own instrument or the simulated arm, which may turn the sensor itself."""
 
     from_where = "anticlockwise seen from above, from how it stands by itself"
 
@@ -178,8 +178,8 @@ class _OwnRowReader:
         off = (plan.orientation_rad - self._arm.orientation_rad(places_mm)) % math.tau
         return np.where(math.tau - off < _SAME_TURN_RAD, 0.0, off)
 
-    def read_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
-        """Take the reading of a row, with its place in the lab frame."""
+    def measure_row(self, x_mm: float, y_mm: float, turned_rad: float, plan: Plan, row: int) -> Reading:
+        """Move to the place of a row, measure, and return the reading, with its place in the lab frame."""
         height_mm = plan.covariates.get("height_mm", np.full(len(plan), np.nan))[row] if self._lifts else math.nan
         up_mm = None if math.isnan(height_mm) else float(height_mm)
         return self._arm.measure(Pose(x_mm, y_mm, float(plan.orientation_rad[row]), up_mm))

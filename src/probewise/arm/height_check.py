@@ -1,8 +1,8 @@
 """A check of the sensor's height by its light: over white, a lower sensor reads more.
 
 The decrease of the reading with height is measured at one place. A reading elsewhere over the same white then gives the
-sensor's height there, to be compared with that of the counters. An inverse-square law is only a first approximation: it
-does not hold for the room's light, nor for the LED's near the surface, which the sensor shades.
+sensor's height there, to be compared with that by the motors' counters. An inverse-square law is only a first
+approximation: it does not hold for the room's light, nor for the LED's near the surface, which the sensor shades.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ ROUNDING_MM = 0.2  # sd of a height that whole counts leave
 
 @dataclass(frozen=True)
 class HeightReading:
-    """Mean reading over white at one place and height (by the counters), and its standard error."""
+    """Mean reading over white at one place and height (by the motors' counters), and its standard error."""
 
     place_mm: tuple[float, float]
     height_mm: float
@@ -35,14 +35,15 @@ class HeightReading:
 
 @dataclass(frozen=True, eq=False)
 class HeightCheck:
-    """Heights measured by the light, compared with those of the counters.
+    """Heights measured by the light, compared with those by the motors' counters.
 
     Parameters
     ----------
     per_mm
         Relative decrease of a reading per mm, at the lowest of the heights at the first place.
     off_mm, sd_mm
-        True height minus that of the counters at each other place, relative to the first, and its sd, (n_places,).
+        Height by the light minus that by the motors' counters at each other place, relative to the first, and its sd,
+        (n_places,).
     p_value
         Probability of readings at least this odd if the counters are right.
     """
@@ -54,12 +55,12 @@ class HeightCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether the readings agree with the heights of the counters."""
+        """Whether the heights by the light agree with those by the motors' counters."""
         return self.p_value >= _LEAST_P
 
 
 def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading]) -> HeightCheck:
-    """Compare heights measured by the light with those of the counters.
+    """Compare heights measured by the light with those by the motors' counters.
 
     Parameters
     ----------

@@ -27,11 +27,11 @@ class SoftLimits:
         self._geometry = geometry
         self._counts = [0, 0, 0]
 
-    def record_counts(self, joint: int, counts: int) -> None:
-        """Record the present count of a joint's motor."""
-        self._counts[joint] = counts
+    def record_present_count(self, joint: int, count: int) -> None:
+        """Record the present count of one joint's motor."""
+        self._counts[joint] = count
 
-    record = stands = record_counts  # its old names
+    record = stands = record_counts = record_present_count  # its old names
 
     @property
     def last_counts(self) -> tuple[int, int, int]:

@@ -91,13 +91,13 @@ class DryRun:
 
     def find_stop(self, joint: int, side: Side) -> None:
         """Print the command and record the count of the stop."""
-        self.limits.record_counts(joint, self._geometry.joints[joint].stop_counts)
+        self.limits.record_present_count(joint, self._geometry.joints[joint].stop_counts)
         self._say(f"{JOINTS[joint]:<8} {'up' if side > 0 else 'down'} to its stop")
 
     def reset(self, joints: Sequence[int]) -> None:
         """Print that these counters are set to 0, and record it."""
         for joint in joints:
-            self.limits.record_counts(joint, 0)
+            self.limits.record_present_count(joint, 0)
         self._say(f"set to 0 the counters of {', '.join(JOINTS[joint] for joint in joints)}")
 
     def read_percent(self) -> float:
@@ -115,7 +115,7 @@ class DryRun:
     def _check_and_print_move(self, joint: int, goal: int, how: str) -> None:
         here = self.limits.last_counts[joint]
         self.limits.require_allowed_move(joint, here, goal)
-        self.limits.record_counts(joint, goal)
+        self.limits.record_present_count(joint, goal)
         if goal != here:
             angle = math.degrees(self._geometry.joints[joint].angle_at(goal))
             self._say(f"{JOINTS[joint]:<8} to {angle:7.1f} degrees, motor from {here} to {goal} counts, {how}")

@@ -26,7 +26,7 @@ class ReadingScale:
             raise ParameterError("step", self.step, "greater than 0, or None")
 
     def convert(self, value: float) -> float:
-        """Round a value to a step and clip it to the scale; NaN, a missing reading, stays NaN."""
+        """Clip a value to the scale and round it to a step, within the scale; NaN, a missing reading, stays NaN."""
         if math.isnan(value):
             return value
         value = min(max(value, self.low), self.high)

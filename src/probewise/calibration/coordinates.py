@@ -21,7 +21,7 @@ class MixturePrior(Prior, Protocol):
         ...
 
     def amplitude_at_unit_mass(self, determinant: FloatArray) -> FloatArray:
-        """Return the amplitude a of a Gaussian of unit mass, the prior's unit of a, for its A B - C^2, any shape."""
+        """Return the unit of a: the amplitude at the prior's unit of mass, for a Gaussian's A B - C^2; any shape."""
         ...
 
     def log_prob_by_kind(self, g: FloatArray, i_min: FloatArray, i_max: FloatArray) -> FloatArray:

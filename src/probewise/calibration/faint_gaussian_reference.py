@@ -416,7 +416,7 @@ class FaintGaussianReference:
         return np.asarray(np.minimum(most, masses.min(axis=1)) if last_of_all else most)
 
     def _amplitude_at_unit_mass(self, g: FloatArray) -> FloatArray:
-        """Amplitudes that Gaussians of these widths have at unit mass, (..., 6) -> (...)."""
+        """Return the amplitudes of Gaussians of these widths at the prior's unit of mass, (..., 6) -> (...)."""
         return self.prior.amplitude_at_unit_mass(g[..., 3] * g[..., 4] - g[..., 5] ** 2)
 
     def _masses(self, theta: FloatArray) -> FloatArray:

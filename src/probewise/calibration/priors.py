@@ -183,7 +183,10 @@ class SSFPrior:
     describe = table_rows  # its earlier name
 
     def amplitude_at_unit_mass(self, determinant: FloatArray) -> FloatArray:
-        """Return the amplitude a of a Gaussian of unit mass, for its A B - C^2, any shape; 1 if the prior is of a."""
+        """Return the amplitude a of a Gaussian of mass pi `unit_mass_mm2`, for its A B - C^2; any shape in and out.
+
+        It is 1 if the prior is of a (`unit_mass_mm2` None).
+        """
         if self.unit_mass_mm2 is None:
             return np.ones_like(determinant)
         return self.unit_mass_mm2 * np.sqrt(np.maximum(determinant, _TINY))

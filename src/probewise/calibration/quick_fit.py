@@ -99,7 +99,7 @@ def fit_orders_quickly(
     parts: dict[int, PosteriorPart] = {}
     for n in range(1, highest + 1):
         needed = n == 1 or peaks[n].log_likelihood - peaks[n - 1].log_likelihood > _NEEDED
-        found[n], parts = fit_next_order(
+        found[n], parts = fit_one_more_gaussian(
             problems, n, parts, peaks[n], climbing, whole=whole, needed=needed, search=search, progress=progress
         )
     return _check_chosen_order_or_search_in_full(
@@ -144,7 +144,7 @@ def _why_smc_does_not_apply(problems: OrderProblems, highest: int) -> str:
     return ""
 
 
-def fit_next_order(
+def fit_one_more_gaussian(
     problems: OrderProblems,
     n: int,
     below: dict[int, PosteriorPart],
@@ -156,7 +156,7 @@ def fit_next_order(
     search: Search,
     progress: Progress | None,
 ) -> tuple[OrderPosterior, dict[int, PosteriorPart]]:
-    """Fit an order by SMC; search it in full where that is doubtful.
+    """Fit one Gaussian more than the order below has, by SMC; search the order in full where that is doubtful.
 
     Parameters
     ----------

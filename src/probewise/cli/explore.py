@@ -213,7 +213,7 @@ def run(arguments: argparse.Namespace) -> int:
         progress("exploring", note="choosing the first place")
         pairs: Iterable[tuple[Step, Step | None]] = ((step, None) for step in own)
         if inputs.other is not None:
-            under = posing.ArmOverGrid.from_instrument(site.arm, inputs.other.grid)
+            under = posing.ArmReachAndTravel.from_instrument(site.arm, inputs.other.grid)
             pairs = shadow_run(own, inputs.other, under, rng=inputs.streams.shadow)
         for step, shadow in pairs:
             pictures.draw_and_write(step, shadow)

@@ -40,7 +40,7 @@ class Words:
     no_cure: str = "no scan of this arm helps"
     covariates: Mapping[str, str] | None = None
 
-    def covariate(self, name: str) -> str:
+    def covariate_in_words(self, name: str) -> str:
         """Return the name of a covariate in words."""
         if self.covariates is None:
             return name.replace("_", " ")

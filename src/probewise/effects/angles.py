@@ -11,7 +11,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_words
 from probewise.effects.motion import candidate_scan_groups, scan_indicator
-from probewise.effects.vocabulary import single_column_entries, value_with_sd
+from probewise.effects.vocabulary import single_column_bank, value_with_sd
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
 
@@ -70,7 +70,7 @@ class ScanAngleError(ScanGroupEffect[Poses]):
         )
 
     def bank(self) -> FloatArray:
-        return single_column_entries(self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0]))
+        return single_column_bank(self.typical_deg * np.array([1.0, -8.0, 8.0, -14.0, 14.0]))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return f"in {scans_in_words(self.scans)} the sensor is turned {_extra_turn_in_words(mean[0], sd[0])}"

@@ -73,7 +73,10 @@ class ChangePointEffect(NamedEffect[V]):
         return replace(self, times_s=(*self.times_s[:-1:stride], self.times_s[-1]))
 
     def variant_masks(self, plan: Plan) -> Gates:
-        """Return the mask of the readings after each candidate change point, taken at the middle of its interval."""
+        """Return the masks of the readings after each candidate change point, and a bank entry that acts on all.
+
+        A candidate is put at the middle of its interval.
+        """
         always = self.bank()[0]
         always[:, -1] = -np.inf
         middles = [sum(pair) / 2 for pair in pairwise(self.times_s)]

@@ -14,7 +14,7 @@ from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
 from probewise.effects.patches import gaussian_bump
-from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.patterns import Disc, HalfPlane, Polygon, Quadrant, Stripes
 from probewise.recordings.plan import Plan
@@ -112,7 +112,7 @@ class Halo(NamedEffect[Footprint]):
         )
 
     def bank(self) -> FloatArray:
-        return single_column_entries(0.02, np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5))
+        return single_column_bank(0.02, np.geomspace(self.narrowest_mm * 1.2, self.widest_mm / 1.2, 5))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (
@@ -176,7 +176,7 @@ class EdgeShadow(NamedEffect[View]):
         return tuple(replace(self, patterns=choice) for choice in self.choices)
 
     def bank(self) -> FloatArray:
-        return single_column_entries(self.typical, np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6))
+        return single_column_bank(self.typical, np.geomspace(self.narrowest_mm * 1.5, self.widest_mm / 1.5, 6))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         kind = "darker" if mean[0] > 0 else "brighter"

@@ -12,7 +12,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
 from probewise.effects.linear import LinearEffect
-from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -50,7 +50,7 @@ class GainDrift(NamedEffect[FloatArray]):
         return np.asarray(value * (1 + theta[:, :1] * fade))
 
     def bank(self) -> FloatArray:
-        return single_column_entries(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7))
+        return single_column_bank(self.typical, np.geomspace(self.shortest_s * 1.5, self.longest_s / 1.5, 7))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         side = "too strong" if mean[0] > 0 else "too weak"

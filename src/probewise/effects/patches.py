@@ -15,7 +15,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, V, single_column_entries
+from probewise.effects.vocabulary import NamedEffect, V, single_column_bank
 from probewise.priors import LogUniform, Normal, Product, Uniform
 from probewise.recordings.plan import Plan
 
@@ -161,11 +161,11 @@ class PatchEffect(NamedEffect[V]):
         return tuple(replace(self, line=line) for line in self.lines)
 
     def bank(self) -> FloatArray:
-        """Return patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
+        """Return parameters of patches on the line, of three radii and spaced by their radius: (n_bank, 1, 4)."""
         patches = []
         for share in _RADII:
             r = share * self.line.length_mm
             along = np.arange(self.line.low_mm, self.line.high_mm + r / 2, r)
             x, y = self.line.place(along, np.zeros_like(along))
-            patches.append(single_column_entries(self.typical, x, y, r))
+            patches.append(single_column_bank(self.typical, x, y, r))
         return np.concatenate(patches)

@@ -71,7 +71,7 @@ class PositionScale(LinearEffect[Poses]):
 
     @classmethod
     def for_extent(cls, extent: Extent) -> Self | None:
-        """Keep the default scale: an error of 1 % is typical; a wrong wheel size makes tens of percent."""
+        """Return the default for every recording: 1 % is a typical error; a wrong wheel size makes tens of percent."""
         return cls()
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:

@@ -13,7 +13,7 @@ from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.motion import direction_varies, sign_of_motion
-from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -98,7 +98,7 @@ class Lag(NamedEffect[FloatArray]):
         return held
 
     def bank(self) -> FloatArray:
-        return single_column_entries(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
+        return single_column_bank(np.geomspace(self.shortest_s * 1.5, self.longest_s / 3, 7))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (

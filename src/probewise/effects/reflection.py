@@ -12,7 +12,7 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
 from probewise.priors import Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint, Stage
@@ -63,7 +63,7 @@ class Reflection(NamedEffect[Footprint]):
         angles = 2 * math.pi * np.arange(_ANGLES) / _ANGLES
         far = self.farthest_mm * np.array([0.2, 0.4, 0.8])[:, None]
         dx, dy = (far * np.cos(angles)).ravel(), (far * np.sin(angles)).ravel()
-        return single_column_entries(self.typical, dx, dy)
+        return single_column_bank(self.typical, dx, dy)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (

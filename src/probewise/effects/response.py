@@ -10,7 +10,7 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.effects.heavy_tailed_prior import LogHeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, single_column_entries, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, single_column_bank, value_with_sd
 from probewise.priors import Product
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Stage
@@ -41,7 +41,7 @@ class Nonlinearity(NamedEffect[FloatArray]):
         return np.asarray(np.clip(value, 0.0, 1.0) ** theta[:, :1])
 
     def bank(self) -> FloatArray:
-        return single_column_entries(np.exp(self.typical_log * np.array([-1.0, 1.0])))
+        return single_column_bank(np.exp(self.typical_log * np.array([-1.0, 1.0])))
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         seen = 100 * 0.5 ** mean[0]

@@ -210,7 +210,7 @@ class NoiseEffect(NamedEffect[NoiseParameters], Protocol):
         return None
 
 
-def single_column_entries(*parameters: ArrayLike) -> FloatArray:
+def single_column_bank(*parameters: ArrayLike) -> FloatArray:
     """Return bank entries of one column from the parameters' values, numbers or (n_bank,): (n_bank, 1, n_params)."""
     return np.stack(np.broadcast_arrays(*parameters), axis=-1)[:, None, :].astype(np.float64)
 

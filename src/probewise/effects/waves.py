@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from probewise._arrays import FloatArray
 from probewise.effects.extent import Extent
 from probewise.effects.heavy_tailed_prior import HeavyTailedPrior
-from probewise.effects.vocabulary import NamedEffect, V, single_column_entries, value_with_sd
+from probewise.effects.vocabulary import NamedEffect, V, single_column_bank, value_with_sd
 from probewise.priors import LogUniform, Product, Uniform
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Poses, Stage
@@ -30,7 +30,7 @@ def sine_and_cosine_entries(*parameters: ArrayLike) -> FloatArray:
 
     `parameters` are those before the phase, which is the last: numbers or (n_bank,); the first is the amplitude.
     """
-    return np.concatenate([single_column_entries(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
+    return np.concatenate([single_column_bank(*parameters, phase) for phase in (0.0, 0.5 * np.pi)], axis=1)
 
 
 def starting_point_of_wave(entry: FloatArray, amounts: FloatArray) -> FloatArray:
@@ -181,7 +181,7 @@ class StickSlip(NamedEffect[Poses]):
     def bank(self) -> FloatArray:
         waves = np.linspace(1.0 / self.longest_mm, 1.0 / self.shortest_mm, self.n_periods + 2)[1:-1]
         periods, phases = np.meshgrid(1 / waves, np.arange(self.n_phases) / self.n_phases - 0.5, indexing="ij")
-        return single_column_entries(self.typical_mm, periods.ravel(), phases.ravel())
+        return single_column_bank(self.typical_mm, periods.ravel(), phases.ravel())
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (

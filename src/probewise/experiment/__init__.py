@@ -1,6 +1,6 @@
 """The autonomous experiment: measure, infer, inquire, with a journal of measurements (paper, sections 2.2, 2.3)."""
 
-from probewise.experiment.acquisition import ArmOverGrid
+from probewise.experiment.acquisition import ArmReachAndTravel
 from probewise.experiment.configuration import Experiment, OneScan
 from probewise.experiment.digest import value_digest
 from probewise.experiment.fitted_arm import FittedArm
@@ -55,7 +55,7 @@ __all__ = [
     "TRUST",
     "AdjustedMixture",
     "ArmError",
-    "ArmOverGrid",
+    "ArmReachAndTravel",
     "Entry",
     "Experiment",
     "Exploration",
@@ -114,8 +114,8 @@ __all__ = [
     "world_like",
 ]
 
-Field = ArmOverGrid
-"""The old name of `ArmOverGrid`."""
+Field = ArmOverGrid = ArmReachAndTravel
+"""The old names of `ArmReachAndTravel`."""
 
 State = ExplorationState
 """The old name of `ExplorationState`."""

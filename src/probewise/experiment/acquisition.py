@@ -19,7 +19,7 @@ from probewise.nested.importance import Weighted
 
 
 @dataclass(frozen=True, eq=False)
-class ArmOverGrid:
+class ArmReachAndTravel:
     """Reach, orientation of the sensor and travel time of an arm at the places of a grid.
 
     `reachable` marks the places within reach, `orientation_rad` is the sensor's orientation there, to which that of a
@@ -48,7 +48,7 @@ def predict_and_rate_readings(
     experiment: Experiment,
     posterior: Weighted,
     drawn: FloatArray,
-    field: ArmOverGrid,
+    field: ArmReachAndTravel,
     *,
     at: Reading | None,
     goal: Goal | None = None,

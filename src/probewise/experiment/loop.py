@@ -20,7 +20,7 @@ from probewise._kinds import checked_path, checked_whole, require_callable, requ
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
 from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
-from probewise.experiment.acquisition import ArmOverGrid, next_poses, predict_and_rate_readings
+from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_and_rate_readings
 from probewise.experiment.arm_error import arm_error_in_posterior, draw_arm_error_shifts
 from probewise.experiment.configuration import Experiment, largest_sd_mm
 from probewise.experiment.hidden import HiddenShape
@@ -49,7 +49,7 @@ from probewise.inquiry import Goal, bits_gained, prior_entropy
 from probewise.nested.importance import Weighted
 
 
-def begin(experiment: Experiment, field: ArmOverGrid, *, rng: np.random.Generator) -> ExplorationState:
+def begin(experiment: Experiment, field: ArmReachAndTravel, *, rng: np.random.Generator) -> ExplorationState:
     """Return the state before the first reading: draws from the prior, and the pose with the largest utility.
 
     Parameters
@@ -87,7 +87,7 @@ def step(
     state: ExplorationState,
     reading: Reading,
     experiment: Experiment,
-    field: ArmOverGrid,
+    field: ArmReachAndTravel,
     *,
     prior_bits: float,
     rng: np.random.Generator,
@@ -121,7 +121,7 @@ def step(
     NotConvergedError
         If no hypothesis could have given these readings.
     """
-    experiment.readout.require(reading.value)
+    experiment.readout.require_in_range(reading.value)
     readings = (*state.readings, reading)
     problem = experiment.problem(readings)
     with warnings.catch_warnings():
@@ -330,7 +330,7 @@ def _yield_steps(
 ) -> Generator[Step, None, None]:
     """Yield the steps: those of the journal `before`, then those of new readings, written to `path`."""
     replayed, notes = ((), ()) if before is None else (before.entries, before.notes)
-    field = ArmOverGrid.from_instrument(instrument, experiment.grid)
+    field = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
     first = _rng_of_reading(seed, 0)
     prior_bits = prior_entropy(experiment.prior, rng=first)
     state = begin(experiment, field, rng=first)  # before the journal is created: a run that cannot begin leaves none
@@ -368,7 +368,7 @@ def _yield_steps(
 def _require_value_in_range(experiment: Experiment, reading: Reading) -> None:
     """Raise LinkError for a reading out of range: the instrument is at fault, and the run can be resumed."""
     try:
-        experiment.readout.require(reading.value)
+        experiment.readout.require_in_range(reading.value)
     except ParameterError as error:
         raise LinkError(f"what the instrument returned is beyond the sensor: {error}") from error
 

@@ -3,7 +3,7 @@
 The effects and their typical sizes are those of the diagnosis. A run is no recording, though: before its first reading
 nothing is known of places and times. Effects of the pose and of the footprint take their scales from a scan of
 100 mm, as a calibration has it; effects that change with the place, from the whole field; with time, from 150 s. What a
-dozen readings could not show leaves nothing out that matters (`EffectLargeEnoughForRun`).
+dozen readings could not show leaves nothing out that matters (`EffectWithRunPrior`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from probewise.effects import (
     OffsetDrift,
 )
 from probewise.errors import ParameterError
-from probewise.experiment.effect_large_enough import EffectLargeEnoughForRun
+from probewise.experiment.effect_with_run_prior import EffectWithRunPrior
 from probewise.experiment.noise_rivals import noise_likelihoods
 from probewise.experiment.pace import EACH_S, DescribedEffect, EffectInRunTime, FromRest
 from probewise.inference import GaussianKnown, Rounded
@@ -82,21 +82,21 @@ class SensorModelRival:
 def rivals_of(
     model: SensorModel, likelihood: Likelihood, field_mm: tuple[float, float]
 ) -> tuple[SensorModelRival, ...]:
-    """Return the rivals of a sensor model.
+    """Return the rivals of a sensor model: effects that it leaves out, and other noise.
 
     Parameters
     ----------
     model
         A chain with known levels.
     likelihood
-        Noise of known sd: `GaussianKnown` or `Rounded`.
+        `GaussianKnown` of one sd, or `Rounded`; of any other, no rivals of the noise are returned.
     field_mm
         Width and height of the field.
 
     Raises
     ------
     ParameterError
-        If the model or the likelihood is of another kind, which does not support effects.
+        If the model is of another kind, which does not support effects.
     """
     if not isinstance(model, Chain) or not isinstance(model.levels, FixedLevels):
         raise ParameterError(
@@ -123,11 +123,11 @@ def rivals_of(
 def _forms_of_effect_in_run(effect: NamedEffect[FloatArray], field_mm: tuple[float, float]) -> list[DescribedEffect]:
     """List the forms in which an effect may act in a run; one that changes with time does so in the run's own time."""
     if effect.name in OF_MOTION:
-        return [EffectLargeEnoughForRun(effect, field_mm), FromRest(EffectLargeEnoughForRun(effect, field_mm))]
+        return [EffectWithRunPrior(effect, field_mm), FromRest(EffectWithRunPrior(effect, field_mm))]
     if effect.name not in _IN_TIME:
-        return [EffectLargeEnoughForRun(effect, field_mm)]
+        return [EffectWithRunPrior(effect, field_mm)]
     ways = [effect, GainLoss.from_gain_drift(effect)] if isinstance(effect, GainDrift) else [effect]
-    return [EffectInRunTime(EffectLargeEnoughForRun(way, field_mm)) for way in ways]
+    return [EffectInRunTime(EffectWithRunPrior(way, field_mm)) for way in ways]
 
 
 @dataclass(frozen=True)

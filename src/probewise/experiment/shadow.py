@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise.experiment.acquisition import ArmOverGrid
+from probewise.experiment.acquisition import ArmReachAndTravel
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.loop import begin, step
 from probewise.experiment.state import Step
@@ -15,7 +15,7 @@ from probewise.inquiry import prior_entropy
 
 
 def shadow_run(
-    steps: Iterable[Step], other: Experiment, field: ArmOverGrid, *, rng: np.random.Generator
+    steps: Iterable[Step], other: Experiment, field: ArmReachAndTravel, *, rng: np.random.Generator
 ) -> Iterator[tuple[Step, Step]]:
     """Yield each step of a run together with the other experiment's step from the same reading.
 

@@ -142,11 +142,12 @@ def experiment_for(
     sensor
         The fitted sensor; if it averages several hypotheses, the most probable one is used. The SSF model takes the
         mixture with the mean and covariance of its mean field, for closed forms instead of sums over pixels, and
-        effects at their posterior means; the naive model takes its two levels.
+        effects on the mean at their posterior means; with `trust` below 1 they are inferred along with the shape.
+        Effects on the noise are left out. The naive model takes its two levels.
     shape
         The possible shape on the field.
     field
-        Grid of places: 131 x 65, as in the paper.
+        The playing field, mm; the places are a grid of 131 x 65 over it, as in the paper.
     model
         "ssf" or "naive".
     n_live
@@ -249,14 +250,14 @@ def chain_of(sensor: FittedSensor, scene: HypothesisScene, *, estimated: bool = 
         samples = [sensor.samples[:, sensor.names.index(name)] for name in names]
         if estimated and all(own.std() > 0 for own in samples):
             acting = FromRest(cast(DescribedEffect, effect)) if effect.name in OF_MOTION else effect
-            effects.append(Estimated(acting, values, tuple(map(_marginal_of_samples, samples))))
+            effects.append(Estimated(acting, values, tuple(map(_marginal_prior_from_samples, samples))))
         else:
             effects.append(Known(effect, values))
     return Chain(sensor.mixture(), levels_of(sensor), scene, tuple(effects), n_nodes=FAST_NODES)
 
 
-def _marginal_of_samples(samples: FloatArray) -> Marginal:
-    """Fit a marginal to samples, (n_samples,), by mean and sd: log-normal if all are positive, else normal."""
+def _marginal_prior_from_samples(samples: FloatArray) -> Marginal:
+    """Fit a marginal prior to samples, (n_samples,), by mean and sd: log-normal if all are positive, else normal."""
     if (samples > 0).all():
         log = np.log(samples)
         return LogNormal(float(np.exp(log.mean())), float(log.std()))

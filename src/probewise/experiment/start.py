@@ -8,7 +8,7 @@ import numpy as np
 
 from probewise.arm.instrument import Instrument, Pose
 from probewise.errors import ParameterError
-from probewise.experiment.acquisition import ArmOverGrid
+from probewise.experiment.acquisition import ArmReachAndTravel
 from probewise.experiment.configuration import Experiment
 from probewise.experiment.loop import begin, step
 from probewise.experiment.state import Exploration, Step
@@ -40,7 +40,7 @@ def run_from_place(
     """
     if max_readings < 1:
         raise ParameterError("max_readings", max_readings, "1 or more")
-    field = ArmOverGrid.from_instrument(instrument, experiment.grid)
+    field = ArmReachAndTravel.from_instrument(instrument, experiment.grid)
     prior_bits = prior_entropy(experiment.prior, rng=rng)
     state = dataclasses.replace(begin(experiment, field, rng=rng), next_pose=first, planned=())
     steps: list[Step] = []

@@ -43,14 +43,16 @@ class Readout:
         if not self.low < self.high:
             raise ParameterError("(low, high)", (self.low, self.high), "low < high")
 
-    def require(self, value: float) -> None:
-        """Raise ParameterError for a reading out of range; NaN is a missing reading."""
+    def require_in_range(self, value: float) -> None:
+        """Raise ParameterError for a reading out of range; NaN, a missing reading, passes."""
         if not (math.isnan(value) or self.low <= value <= self.high):
             raise ParameterError(
                 "reading",
                 value,
                 f"{self.low:g} to {self.high:g}, the range of the sensor; is it the sensor that was calibrated?",
             )
+
+    require = require_in_range  # its old name
 
     def edges(self, levels: FloatArray, *, fine: float = _FINE, most: int | None = None) -> FloatArray:
         """Return the edges of the cells for readings of these levels, (n_cells - 1,); the end cells are open.

@@ -34,9 +34,10 @@ def investigate(
     rng: np.random.Generator,
     progress: Progress = silent,
 ) -> Generator[Round, None, None]:
-    """Record and diagnose until an explanation is settled, no reading would help, or the budget is spent.
+    """Yield rounds of an investigation until an explanation is settled, no reading would help, or the budget is spent.
 
-    It is settled if it has probability 0.95 and the verdict is not `cannot_tell`. All ends after `rounds` rounds.
+    A round, a recording and its diagnosis, is carried out only when it is asked for. An explanation is settled if it
+    has probability 0.95 and the verdict is not `cannot_tell`. All ends after `rounds` rounds.
 
     Parameters
     ----------

@@ -19,7 +19,7 @@ from probewise.nested.refine import refine
 from probewise.nested.repartition import Repartitioned, repartitioned
 from probewise.nested.result import Agreement, Check, NestedResult
 from probewise.nested.run import run
-from probewise.nested.run_slow import run_slow
+from probewise.nested.run_in_few_calls import run_in_few_calls
 from probewise.nested.sampler import LIVE_PER_PARAM, least_live, replace_worst_live_points, step
 from probewise.nested.stop import (
     NESTED_STOP,
@@ -77,7 +77,10 @@ __all__ = [
     "repartitioned",
     "replace_worst_live_points",
     "run",
-    "run_slow",
+    "run_in_few_calls",
     "step",
     "update",
 ]
+
+run_slow = run_in_few_calls
+"""The old name of `run_in_few_calls`."""

@@ -48,7 +48,7 @@ def covariate_words_and_unit(diagnosis: Diagnosis, name: str) -> tuple[str, str]
     if not isinstance(apparatus, SimulatorApparatus):
         return ("scan" if name == "scan" else covariate_words(name)), covariate_unit(name, unit)
     units = {"time": apparatus.system.simulator.time_unit, "level": unit, "previous": unit}
-    return apparatus.words.covariate(name), units.get(name, "")
+    return apparatus.words.covariate_in_words(name), units.get(name, "")
 
 
 def axis_label(diagnosis: Diagnosis, name: str, scan: str | None = None) -> str:

@@ -141,7 +141,10 @@ def _is_same_interval(values: Mapping[str, FloatArray], place: Place, other: Pla
 
 
 def _views_of_place(diagnosis: Diagnosis, place: Place, at: FloatArray) -> list[CovariateView]:
-    """List the views of a place: along the scan's path, if it is a scan; then along its covariate `at`, (n_points,)."""
+    """List the views of a place: if it is a whole scan or run, `view_along_scan`; then, always, along its covariate.
+
+    `at`, (n_points,), holds the covariate's values.
+    """
     by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:
         return [by_covariate]

@@ -10,7 +10,7 @@ from probewise.experiment import left_out_after_step
 from probewise.report import exploration as exploration_report
 from probewise.report.html import Section, figure, paragraph, table
 from probewise.report.paper_view import window_mm
-from probewise.report.plots import PAGE_IN, effect_probabilities_by_reading, field_legend, grid_of_axes, png
+from probewise.report.plots import PAGE_IN, draw_field_legend, effect_probabilities_by_reading, grid_of_axes, png
 from probewise.report.robot_search import RobotSearch
 from probewise.report.words import count, number
 
@@ -46,7 +46,7 @@ def encoded_figures(searches: Sequence[RobotSearch]) -> dict[str, bytes]:
             title=title,
             ax=ax,
         ).set(xlim=(left, right), ylim=(low, high))
-    field_legend(axes)
+    draw_field_legend(axes)
     doubting = searches[-1].run
     beliefs = [left_out_after_step(step, doubting.experiment.trust).probability for step in doubting.steps]
     return {"doubt.png": png(axes), "belief.png": png(effect_probabilities_by_reading(beliefs))}

@@ -21,8 +21,8 @@ from probewise.experiment import (
 )
 from probewise.report.html import Markup, Section, definition_list, figure, page, paragraph, table
 from probewise.report.plots import (
+    draw_field_legend,
     effect_probabilities_by_reading,
-    field_legend,
     grid_of_axes,
     information_gained,
     playing_field,
@@ -93,7 +93,7 @@ def robot_view_png(
 ) -> bytes:
     """Draw the robot's view after one step, with its legend, as a PNG; parameters as in `view`."""
     ax = view(step, experiment, readings, levels=levels, truth_mm=truth_mm)
-    field_legend(ax)
+    draw_field_legend(ax)
     return png(ax, dpi=90, tight=False)
 
 
@@ -112,7 +112,7 @@ def robot_views_png(
     for ax, (title, step, experiment) in zip(axes[:, 0], views, strict=True):
         known = f"{title}, {count(step.number, 'reading')}, {number(step.bits, 1)} bits"
         view(step, experiment, readings, levels=levels, truth_mm=truth_mm, title=known, ax=ax)
-    field_legend(axes)
+    draw_field_legend(axes)
     return png(axes, dpi=75, tight=False)
 
 

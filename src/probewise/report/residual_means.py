@@ -50,7 +50,7 @@ def mean_residuals(
     window: tuple[float, float] | None = None,
     absorbed: FloatArray | None = None,
 ) -> ResidualMeans:
-    """Average residuals in bins of a covariate.
+    """Average residuals in bins of a covariate, with the 95 % band of chance.
 
     Parameters
     ----------

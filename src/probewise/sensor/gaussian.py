@@ -338,10 +338,11 @@ def _mean_albedo_over_carded_region(region: CardedRegion, gaussian: LabGaussian,
 
 
 def _mass_beyond_edges(height: FloatArray, start: FloatArray, end: FloatArray) -> FloatArray:
-    """Return the unit Gaussian's mass beyond each edge, seen from the origin, (n_edges,), by Owen's T.
+    """Return the unit Gaussian's signed mass beyond each edge, seen from the origin, (n_edges,), by Owen's T.
 
-    `height` is the distance of the edge's line from the origin; `start` and `end` are places along it. An end out of
-    reach counts as infinitely far, where T is half the mass beyond the line.
+    `height` is the signed distance of the edge's line from the origin, positive where the edge runs anticlockwise about
+    it, and the mass has the same sign; `start` and `end` are places along the line. An end out of reach counts as
+    infinitely far, where T is half the mass beyond the line.
     """
     half = 0.5 * ndtr(-np.abs(height))
     with np.errstate(over="ignore"):

@@ -89,7 +89,8 @@ class Footprint:
 class View:
     """The view: white fraction `seen` (n_samples, n_points), and the poses and regions it was computed from.
 
-    `poses` are relative to the patterns' described places; `brightness` is the footprint's.
+    `poses` are the true ones minus the displacement of each reading's pattern from its described place; `brightness` is
+    the strength of the signal relative to calibration.
     """
 
     seen: FloatArray

@@ -17,7 +17,7 @@ from probewise.progress import Progress
 from probewise.systems.simulator import Simulate
 
 MOST_CALLS = 20_000
-"""Limit of calls in a diagnosis, for a `simulate` that takes one sample at a time."""
+"""Expected limit of calls in a diagnosis, for a `simulate` that takes one sample at a time; it is not enforced."""
 
 _N_NODES = 5  # interpolation nodes for a parameter that cannot vary by row
 _MOST_REMEMBERED = 2_000_000  # size of the cache of earlier calls, in numbers
@@ -80,9 +80,11 @@ class Caller:
         Raises
         ------
         ParameterError
-            If it raises at every sample.
+            If no reading is finite.
         ShapeError
             If it does not return one number per row.
+        Exception
+            The function's own, if it raises one at a trial call and no other gives a finite reading.
         """
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         if broadcasts:

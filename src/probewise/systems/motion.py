@@ -149,7 +149,7 @@ class RowsInRuns:
     def step_schedule(self, max_step: float) -> StepSchedule:
         """Return the number of steps from each position to the next, as `max_step` asks for, and their method."""
         longest = self.gaps.max(axis=1, initial=0.0)
-        return StepSchedule.from_fourth_order(
+        return StepSchedule.from_fourth_order_steps(
             np.asarray(np.maximum(np.ceil(longest / max_step - 1e-9), 1), dtype=np.int64)
         )
 
@@ -175,7 +175,7 @@ def integrate_readings(
     columns
         (n_points,), or (n_samples, n_points) if an effect changes them.
     max_step
-        Largest step at fourth order, in the unit of time; see `StepSchedule.from_fourth_order`.
+        Largest step at fourth order, in the unit of time; see `StepSchedule.from_fourth_order_steps`.
     """
     states = integrate_states(motion, places, parameters, columns, max_step=max_step)
     return readings_of_states(motion.law, states, parameters, columns)

@@ -66,7 +66,7 @@ class StepSchedule:
     method: RungeKutta
 
     @classmethod
-    def from_fourth_order(cls, n_steps: IntArray) -> StepSchedule:
+    def from_fourth_order_steps(cls, n_steps: IntArray) -> StepSchedule:
         """Return a schedule of these numbers of fourth-order steps, (n_gaps,), or a third as many of eighth order.
 
         The third is rounded up in each gap. All gaps have the same order: the eighth if it costs at most 1.5 times as

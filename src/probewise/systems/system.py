@@ -71,7 +71,7 @@ class System:
         ShapeError
             If it does not return one reading per row.
         FileError
-            If it raises an error at every trial call.
+            If it raises an error at a trial call, and no other gives a finite reading; a law: at every one.
         """
         declared = simulator.noise.sd
         if isinstance(declared, str) and declared not in table.covariates:

@@ -75,14 +75,14 @@ def test_a_tail_that_is_not_there_is_none():
 
 
 @pytest.mark.parametrize(("share", "times"), [(0.02, 8.0), (0.2, 2.5)])
-def test_pseudo_observations_say_as_much_as_the_density_does(share, times):
+def test_pseudo_residuals_say_as_much_as_the_density_does(share, times):
     """Their mean follows a shift of the noise one to one, and their variance is one over the information."""
     rng = np.random.default_rng(3)
     n = 400_000
     z = rng.normal(size=n) * np.where(rng.random(n) < share, times, 1.0)
     tail = Tail(share, times)
     one = np.ones(1)
-    plain, moved = (tail.normal_pseudo_observations((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    plain, moved = (tail.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.02)
     assert np.var(plain) == pytest.approx(1 / float(tail.information), rel=0.02)
     assert np.abs(plain).max() < 10
@@ -92,7 +92,7 @@ def test_draws_are_of_unit_sd_and_leave_out_what_is_lost():
     lost = np.zeros(50, dtype=np.bool_)
     lost[7] = True
     law = NoiseLaw(np.ones(50), np.zeros(50), lost, 0.05, 8.0)
-    drawn = law.draw_pseudo_observations(4000, rng=np.random.default_rng(0))
+    drawn = law.draw_pseudo_residuals(4000, rng=np.random.default_rng(0))
     assert drawn[~lost].std() == pytest.approx(1.0, rel=0.02)
     np.testing.assert_array_equal(drawn[7], 0.0)
 

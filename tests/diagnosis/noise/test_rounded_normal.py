@@ -64,11 +64,11 @@ def test_the_likelihood_of_a_reading_is_the_probability_of_its_cell():
 
 
 @pytest.mark.parametrize("half", [0.8, 2.0, 6.0])
-def test_pseudo_observations_say_as_much_as_the_density_does(half):
+def test_pseudo_residuals_say_as_much_as_the_density_does(half):
     rng = np.random.default_rng(3)
     z = rng.normal(size=400_000) + half * rng.uniform(-1, 1, 400_000)
     flat, one = RoundedNormal(half, 1.0), np.ones(1)
-    plain, moved = (flat.normal_pseudo_observations((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
+    plain, moved = (flat.normal_pseudo_residuals((z + shift)[:, None], one)[:, 0] for shift in (0.0, 0.05))
     assert np.mean(moved - plain) == pytest.approx(0.05, rel=0.03)
     assert np.var(plain) == pytest.approx(1 / float(flat.information), rel=0.02)
 
@@ -82,8 +82,8 @@ def test_pseudo_observations_say_as_much_as_the_density_does(half):
 
 
 def test_inside_the_flat_top_a_residual_says_nothing():
-    inside = LAW.normal_pseudo_observations(np.array([[0.0], [0.3]]), np.array([SIGMA]))
-    outside = LAW.normal_pseudo_observations(np.array([[STEP]]), np.array([SIGMA]))
+    inside = LAW.normal_pseudo_residuals(np.array([[0.0], [0.3]]), np.array([SIGMA]))
+    outside = LAW.normal_pseudo_residuals(np.array([[STEP]]), np.array([SIGMA]))
     assert np.abs(inside).max() < 0.01 * outside[0, 0]
 
 
@@ -97,13 +97,13 @@ def test_laws_of_one_kind_are_taken_together():
     np.testing.assert_allclose(together.likeliest_sigma(z, 5), sigma)
 
 
-def test_no_pseudo_observation_is_farther_than_what_was_read():
+def test_no_pseudo_residual_is_farther_than_what_was_read():
     law = NoiseLaw(np.ones(5), np.zeros(5), np.zeros(5, dtype=np.bool_), flat=3.0, sigma=0.5)
     z = np.array([[0.0], [0.4], [1.4], [2.5], [-9.0]])
-    pseudo = law.bounded_pseudo_observations(z, np.array([0.5]))
+    pseudo = law.bounded_pseudo_residuals(z, np.array([0.5]))
     assert (np.abs(pseudo) <= np.abs(z)).all()
     np.testing.assert_array_equal(pseudo[3:], z[3:])
-    drawn = law.draw_pseudo_observations(20_000, rng=np.random.default_rng(0))
+    drawn = law.draw_pseudo_residuals(20_000, rng=np.random.default_rng(0))
     assert 0.8 < drawn.std() < 1.0  # of unit sd but for what is cut
 
 

@@ -42,7 +42,7 @@ class BrickMachine:
         try:
             for joint, motor in enumerate(self._motors):
                 # An earlier session that lost its connection may have left a motor turning.
-                self.limits.record_counts(joint, motor.stop_and_settle())
+                self.limits.record_present_count(joint, motor.stop_and_settle())
             self._light.set_led()
         except BaseException as error:
             self.brick.__exit__(type(error), error, error.__traceback__)
@@ -79,14 +79,14 @@ class BrickMachine:
         found = motor.find_stop(with_gears, round(range_counts) + 2 * ROOM_COUNTS)
         at_stop = mechanics.stop_counts
         self._zeros[joint] = found - at_stop
-        self.limits.record_counts(joint, at_stop)
+        self.limits.record_present_count(joint, at_stop)
 
     def reset(self, joints: Sequence[int]) -> None:
         """Set the counters of these joints' motors to 0."""
         for joint in joints:
             self._motors[joint].reset()
             self._zeros[joint] = 0
-            self.limits.record_counts(joint, 0)
+            self.limits.record_present_count(joint, 0)
 
     def read_percent(self) -> float:
         """Read the light sensor with the LED on: 0 to 100, with fractions."""
@@ -107,7 +107,7 @@ class BrickMachine:
         try:
             yield motor
         finally:
-            self.limits.record_counts(joint, motor.last_counts - self._zeros[joint])
+            self.limits.record_present_count(joint, motor.last_counts - self._zeros[joint])
 
     def _require_allowed_move(self, joint: int, here: int, to: int) -> None:
         """Raise ReachError if a move, in counts of the motor, leaves the limits, whose counts are from home."""

@@ -65,7 +65,7 @@ class NoiseEvidence:
         return self.nodes.laws[int(np.argmax(self.log_z_nodes))]
 
     @property
-    def at_likeliest_node(self) -> NoiseEvidence:
+    def with_likeliest_node_alone(self) -> NoiseEvidence:
         """The evidence with the most probable node alone; `log_z` remains that of all nodes."""
         at = [int(np.argmax(self.log_z_nodes))]
         own = NoiseNodes(self.nodes.settings[at], (self.likeliest_law,), self.nodes.log_weights[at])
@@ -147,7 +147,7 @@ def _tailed_log_evidences(found: Fit, laws: Sequence[NoiseLaw], joined: FloatArr
         sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
         variance = sigma**2 / tail.information
         curvature = gram / variance[:, None, None] + np.eye(p)
-        downhill = slopes.T @ tail.normal_pseudo_observations(left, sigma) / variance - found.z[:, None] - steps
+        downhill = slopes.T @ tail.normal_pseudo_residuals(left, sigma) / variance - found.z[:, None] - steps
         steps += _newton_steps(curvature, downhill.T).T
     left = residual - slopes @ steps
     sigma = tail.likeliest_sigma(left, n_points, floor=least, start=sigma)
@@ -201,7 +201,7 @@ class Linearised:
         sigma = sigma if known else sigma * math.sqrt(n_points / free)
         sd = float(sigma[0]) / math.sqrt(law.information)
         basis, _ = np.linalg.qr(np.concatenate([turned / sd, np.eye(p)]))
-        augmented = np.concatenate([law.bounded_pseudo_observations(whitened, sigma)[:, 0] / sd, -z])
+        augmented = np.concatenate([law.bounded_pseudo_residuals(whitened, sigma)[:, 0] / sd, -z])
         residual = augmented - basis @ (basis.T @ augmented)
         if known:
             # Rounded readings carry less information, which must not make the noise sd smaller.
@@ -228,7 +228,7 @@ class Linearised:
         """Return the shift of a fit's coordinates, (n_params,), that absorbs a change of predictions (n_points,)."""
         slopes = self.law(found.slopes) / self.sd
         left = self.law(found.residuals - change)[:, None]
-        normal = self.law.normal_pseudo_observations(left, np.array([self.sd * math.sqrt(self.law.information)]))[:, 0]
+        normal = self.law.normal_pseudo_residuals(left, np.array([self.sd * math.sqrt(self.law.information)]))[:, 0]
         shift = slopes.T @ (normal / self.sd) - found.z
         return np.asarray(np.linalg.solve(slopes.T @ slopes + np.eye(len(found.z)), shift))
 
@@ -236,7 +236,7 @@ class Linearised:
         """Draw projected residuals under the null, in noise sds, (n_rows, n_draws)."""
         eps = np.concatenate(
             [
-                self.law.draw_pseudo_observations(n_draws, rng=rng),
+                self.law.draw_pseudo_residuals(n_draws, rng=rng),
                 rng.standard_normal((self.n_rows - self.n_points, n_draws)),
             ]
         )

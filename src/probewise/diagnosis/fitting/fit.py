@@ -218,7 +218,7 @@ def _minimisation(
         sigma = law.likeliest_sigma(whitened)
         variance = float(sigma[0]) ** 2 / law.information
         curvature = turned.T @ turned / variance + eye
-        downhill = turned.T @ law.normal_pseudo_observations(whitened, sigma)[:, 0] / variance - z
+        downhill = turned.T @ law.normal_pseudo_residuals(whitened, sigma)[:, 0] / variance - z
         tries = _damped_steps(curvature, downhill)
         if not len(tries):
             break

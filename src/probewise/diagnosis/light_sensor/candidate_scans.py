@@ -43,9 +43,10 @@ def excerpts(scan: IntArray, *, strides: Sequence[int] = (1,), level: FloatArray
     scan
         Its row numbers.
     strides
-        Strides to try; each gives an excerpt if it leaves eight readings; otherwise stride 1.
+        Strides to try; those that leave fewer than eight readings are skipped, and if all are, stride 1 is tried.
     level
-        Expected readings, in the order of `scan`: adds an excerpt where they change most.
+        Expected readings, in the order of `scan`: adds the 26 successive readings over which they change most, if the
+        scan is longer.
     """
     out = []
     for stride in [s for s in strides if len(scan[::s]) >= _LEAST_ROWS] or [1]:

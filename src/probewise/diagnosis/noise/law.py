@@ -201,27 +201,27 @@ class NoiseLaw:
         """
         return self.whitened_density.minus_log_likelihood(whitened, sigma, self.n_points)
 
-    def normal_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Convert whitened residuals (n_points, k) to equally informative normal pseudo-observations."""
-        return self.whitened_density.normal_pseudo_observations(whitened, sigma)
+    def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Convert whitened residuals, (n_points, k), to equally informative normal ones, of the same shape."""
+        return self.whitened_density.normal_pseudo_residuals(whitened, sigma)
 
-    def bounded_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Return normal pseudo-observations that, for rounded readings, are never larger than the residual.
+    def bounded_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Return normal pseudo-residuals that, for rounded readings, are never larger than the residual.
 
         A rounded reading has a flat-topped density. On its steep flank, the score over the Fisher information would
         exceed the residual.
         """
-        normal = self.normal_pseudo_observations(whitened, sigma)
+        normal = self.normal_pseudo_residuals(whitened, sigma)
         return np.clip(normal, -np.abs(whitened), np.abs(whitened)) if self.flat else normal
 
-    def draw_pseudo_observations(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
-        """Draw pseudo-observations as from `bounded_pseudo_observations`, in units of their sd, (n_points, n_draws)."""
+    def draw_pseudo_residuals(self, n_draws: int, *, rng: np.random.Generator) -> FloatArray:
+        """Draw pseudo-residuals as from `bounded_pseudo_residuals`, in units of their sd, (n_points, n_draws)."""
         eps = rng.standard_normal((len(self.sd), n_draws))
         if not self.whitened_density.is_normal:
             eps *= np.where(rng.random(eps.shape) < self.share, self.times, 1.0)
             if self.flat:
                 eps += self.flat * rng.uniform(-1.0, 1.0, eps.shape)
-            eps = self.bounded_pseudo_observations(eps, np.ones(n_draws)) * math.sqrt(self.information)
+            eps = self.bounded_pseudo_residuals(eps, np.ones(n_draws)) * math.sqrt(self.information)
         return eps * self.kept[:, None]
 
 
@@ -274,11 +274,11 @@ class Tail:
         of_kept = log_density.sum(axis=0) - (len(whitened) - n_points) * at_zero
         return np.asarray(n_points * (np.log(sigma) - np.log1p(-self.share)) - of_kept)
 
-    def normal_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Convert residuals to equally informative normal pseudo-observations.
+    def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Convert residuals to equally informative normal ones, of sd sigma / sqrt(information) and the same shape.
 
-        The score of the density over its Fisher information, with sd sigma / sqrt(information); outlying residuals have
-        little weight (Huber 1981, section 6.7).
+        Each is the score of the density over its Fisher information; outlying residuals have little weight (Huber 1981,
+        section 6.7).
         """
         if self.is_normal:
             return whitened

@@ -50,8 +50,8 @@ class RoundedNormal:
         of_kept = density.sum(axis=0) - (len(whitened) - n_points) * at_zero
         return np.asarray(n_points * np.log(sigma) - of_kept)
 
-    def normal_pseudo_observations(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Convert residuals to equally informative normal pseudo-observations, as `Tail` does."""
+    def normal_pseudo_residuals(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Convert residuals to equally informative normal ones, of sd sigma / sqrt(information) and the same shape."""
         return np.asarray(sigma * self._score(whitened / sigma) / self.information)
 
     def log_sigma_curvature(self, whitened: FloatArray, sigma: FloatArray, n_points: int) -> FloatArray:

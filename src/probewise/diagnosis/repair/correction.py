@@ -42,7 +42,9 @@ class Correction:
 
 
 def correct_by_best_basis(found: Fit, problem: Linearised, bases: TemplateBank, scan: IntArray) -> Correction:
-    """Correct a fit by the basis with the largest evidence.
+    """Return the correction of a fit by one basis: of those within 5 nats of the largest evidence, the narrowest.
+
+    The narrowest has the fewest columns.
 
     Parameters
     ----------

@@ -97,7 +97,7 @@ class ProfiledDensity:
             whitened = law((readings - predicted).T).T.reshape(n, len(rest) + 1, -1)
             sigma = law.likeliest_sigma(whitened[:, 0].T)
             height = -law.minus_log_likelihood(whitened[:, 0].T, sigma) - 0.5 * np.sum(z**2, axis=1)
-            normal = law.normal_pseudo_observations(whitened[:, 0].T, sigma).T
+            normal = law.normal_pseudo_residuals(whitened[:, 0].T, sigma).T
             joined = np.concatenate([(whitened[:, 1:] - whitened[:, :1]) / _STEP, normal[:, None]], axis=1)
             return np.where(np.isfinite(height), height, -np.inf), joined
 

@@ -191,13 +191,13 @@ def _posterior_draws(
     order = np.roll(np.arange(len(found.z)), -model.sensor.n_params)
     at, steps = np.ix_(order, order), np.empty_like(curvature)
     steps[at] = np.linalg.inv(np.linalg.cholesky(curvature[at][::-1, ::-1]))[::-1, ::-1]
-    normal = law.normal_pseudo_observations(whitened, np.maximum(sigma, 1e-150))[:, 0]
+    normal = law.normal_pseudo_residuals(whitened, np.maximum(sigma, 1e-150))[:, 0]
     center = found.z + np.linalg.solve(curvature, turned.T @ normal / sd**2 - found.z)
     center = np.clip(center, -FARTHEST, FARTHEST)
     draws = rng.standard_normal((_N_NEAR if annealed else N_SAMPLES, len(center)))
     if not annealed:
         return np.asarray(center + draws @ steps)
-    problem, usable = HypothesisProblem(model, recording, noise.at_likeliest_node), recording.usable
+    problem, usable = HypothesisProblem(model, recording, noise.with_likeliest_node_alone), recording.usable
 
     def log_posterior(z: FloatArray) -> FloatArray:
         height = problem.prior.log_prob(z) + problem.log_likelihood(z)

@@ -18,7 +18,7 @@ from probewise.diagnosis.repair.quadratic import QuadraticPredictions
 class SurrogatePosterior:
     """An approximate posterior of coordinates z = center + e @ steps, as a function of e, (n_samples, n_params).
 
-    The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-observations. `residual`
+    The noise is normal: for heavy-tailed noise, residuals are replaced by pseudo-residuals. `residual`
     (n_changes + 1,), at the center, and `changes` (n_changes + 1, n_changes) are whitened, in orthonormal axes of the
     space that they span, where a sum of squares has few terms.
     """
@@ -41,7 +41,7 @@ class SurrogatePosterior:
     ) -> Self:
         """Build from quadratic predictions of the usable readings, the readings, (n_points,), and the noise."""
         residual = law(readings - quadratic.center)[:, None]
-        residual = law.normal_pseudo_observations(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
+        residual = law.normal_pseudo_residuals(residual, np.maximum(law.likeliest_sigma(residual), 1e-150))
         _, turned = np.linalg.qr(np.concatenate([law(quadratic.changes.T), residual], axis=1))
         normal = law.without_tail_or_rounding()
         return cls(quadratic, center, steps, normal, turned[:, -1], turned[:, :-1])

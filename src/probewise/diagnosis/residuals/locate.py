@@ -108,9 +108,9 @@ def bayes_factor_p_value(problem: Linearised, banks: Sequence[TemplateBank], dra
 
 
 def window_columns_and_bounds(covariate: Covariate, n_points: int) -> tuple[FloatArray, list[tuple[float, float]]]:
-    """Build windows over the sorted values of a covariate: each half as wide as the last, half overlapping.
+    """Build windows over the sorted values of a covariate: of half the readings, a quarter and so on, half overlapping.
 
-    Of a categorical covariate, one window per value.
+    Equal values stay together. Of a categorical covariate, one window per value.
 
     Returns
     -------

@@ -64,7 +64,7 @@ def remainder_of(searched: Searched, judged: Judged, best: BestRepair, *, rng: n
         best.problem, covariates, prepared.recording.plan.scan_names, best.fit.found.residuals, draws
     )
     where = found[0].covariate if found else None
-    shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate(where)}"
+    shows = "" if where is None else f"; it shows most in {prepared.apparatus.words.covariate_in_words(where)}"
     share = more / (named + more) if named + more > 0 else 0.0
     sentence = f"A smaller misfit remains ({p_in_words(p_value)}, {share:.0%} of the gain in log evidence){shows}."
     return Remainder(p_value, share, where, sentence)

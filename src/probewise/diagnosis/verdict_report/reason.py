@@ -102,12 +102,12 @@ def _unknown_sentence(judged: Judged, grounds: Grounds) -> str:
         like = "; ".join(grounds.like)
         return f"Something is missing ({p}) that no named effect explains; it looks most like this: {like}."
     if grounds.family.endswith(FAR_OUT):
-        covariate = grounds.words.covariate(grounds.family.removesuffix(FAR_OUT))
+        covariate = grounds.words.covariate_in_words(grounds.family.removesuffix(FAR_OUT))
         tail = f"a test of the mean alone, which takes them for heavy-tailed noise, gives {p}"
         return f"Outlying readings cluster in {covariate}: something is missing there ({tail})."
     likeliest = grounds.family.partition(",")[0].removesuffix(" within scans")
     most = likeliest if likeliest in grounds.shows_in else next(iter(grounds.shows_in), "")
-    place = f"; it shows most in {grounds.words.covariate(most)}" if most else ""
+    place = f"; it shows most in {grounds.words.covariate_in_words(most)}" if most else ""
     known = " and ".join(spoken_name(name) for name in grounds.beside)
     what = f"Beside {known}, something" if known else "Something"
     return f"{what} is missing ({p}) that no named effect explains{place}."

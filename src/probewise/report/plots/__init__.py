@@ -37,7 +37,7 @@ from probewise.report.plots.residuals import (
     scan_with_residuals,
 )
 from probewise.report.plots.scans import before_and_after, residuals_by_scan
-from probewise.report.plots.scene import field_legend, playing_field
+from probewise.report.plots.scene import draw_field_legend, playing_field
 from probewise.report.plots.ssf import spatial_sensitivity, ssf_by_order
 from probewise.report.plots.study import posterior_widths_of_runs, readings_needed
 from probewise.report.plots.verdict import hypothesis_probabilities, probabilities_by_round
@@ -53,8 +53,8 @@ __all__ = [
     "confusion_matrix",
     "corner_plot",
     "doubt_against_trust",
+    "draw_field_legend",
     "effect_probabilities_by_reading",
-    "field_legend",
     "gain_by_scan",
     "grid_of_axes",
     "hypothesis_probabilities",
@@ -107,8 +107,8 @@ tails = residual_histogram
 one_scan = scan_with_residuals
 """The old name of `scan_with_residuals`."""
 
-explain_field = field_legend
-"""The old name of `field_legend`."""
+explain_field = field_legend = draw_field_legend
+"""The old names of `draw_field_legend`."""
 
 residual_clouds = residuals_against_covariates
 """The old name of `residuals_against_covariates`."""

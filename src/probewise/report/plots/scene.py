@@ -123,7 +123,7 @@ def playing_field(
     return ax
 
 
-def field_legend(axes: Axes | AxesGrid) -> None:
+def draw_field_legend(axes: Axes | AxesGrid) -> None:
     """Draw one legend for all playing fields of a figure, below them."""
     legend_below(axes, n_columns=3, ground=GROUND, ink="white")
 

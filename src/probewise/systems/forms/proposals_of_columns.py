@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from probewise._arrays import FloatArray
-from probewise.effects.vocabulary import single_column_entries
+from probewise.effects.vocabulary import single_column_bank
 from probewise.priors import LogUniform
 from probewise.sensor import Stage
 from probewise.systems.forms.about import ReferenceFit
@@ -85,7 +85,7 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
             continue
         saturating = LogUniform(_LEAST_DOSE * largest, _MOST_DOSE * largest)
         tried = np.geomspace(1.5 * saturating.low, 0.7 * saturating.high, _N_DOSES)
-        typical = about.typical_amplitude(Stage.OFFSET, act, single_column_entries(about.sd, tried), about.sd)
+        typical = about.typical_amplitude(Stage.OFFSET, act, single_column_bank(about.sd, tried), about.sd)
         if typical is None:
             continue
         text = f"1 - exp(-D / d), D the {summed} of {what} since the start of the run"
@@ -96,7 +96,7 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
             (own.unit, ""),
             (name, "time", "run"),
             act,
-            single_column_entries(typical, tried),
+            single_column_bank(typical, tried),
             (0,),
             lambda mean, sd, what=what: (  # type: ignore[misc]  # the second name of a value, not a parameter
                 f"{own.reading} shifts in the end by {mean_with_sd(mean[0], sd[0], own.unit)} as the {summed} of "

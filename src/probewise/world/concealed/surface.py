@@ -52,7 +52,7 @@ class AlbedoGradient:
 
 @dataclass(frozen=True)
 class AlbedoPatch:
-    """A stain in every pattern: albedo plus a Gaussian of height `albedo` and sd `r` about a place."""
+    """A stain at one place of the lab frame, on every pattern: albedo plus a Gaussian of height `albedo`, sd `r`."""
 
     name: ClassVar[str] = "albedo_patch"
     stage: ClassVar[Stage] = "albedo"

@@ -25,7 +25,7 @@ _SMALLEST = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class EffectLargeEnoughForRun(WrappedEffect[Any]):
+class EffectWithRunPrior(WrappedEffect[Any]):
     """An effect with the prior for a run: no sizes too small to show, change points within the run.
 
     `field_mm` holds width and height of the field, on which a patch may lie anywhere.

@@ -1,4 +1,4 @@
-"""`run_slow`: few evaluations, for likelihoods that take seconds.
+"""`run_in_few_calls`: few evaluations, for likelihoods that take seconds.
 
 The chains of a nested run spend most evaluations far from the posterior. Here draws from the prior are weighted by a
 small power of the likelihood, a density is fitted to them, and more are drawn from it. The power rises to one as the
@@ -85,7 +85,7 @@ class _WeightedDraws:
     defensive: Proposal
 
 
-def run_slow(
+def run_in_few_calls(
     problem: Samplable | Callable[..., Any],
     prior: AnyPrior | None = None,
     *,

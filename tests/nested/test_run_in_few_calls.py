@@ -10,7 +10,7 @@ from nested_sampling import hard, problems
 from nested_sampling.sampler import Counted
 
 from probewise.errors import ParameterError
-from probewise.nested import run_slow
+from probewise.nested import run_in_few_calls
 from probewise.nested.mixture import fit_mixture, single_student_t
 
 N_ERRORS = 3.9
@@ -29,7 +29,7 @@ def two_spots(theta: np.ndarray) -> np.ndarray:
 def test_a_gaussian_is_right_to_the_error_asked_for() -> None:
     known = problems.gaussian(2, 0.5)
     counted, told = Counted(known), list[int]()
-    found = run_slow(counted, rng=rng(), error=0.02, progress=told.append)
+    found = run_in_few_calls(counted, rng=rng(), error=0.02, progress=told.append)
     assert found.sound
     assert found.run is None
     assert abs(found.log_z - known.log_z) < N_ERRORS * found.log_z_error < N_ERRORS * 0.026
@@ -40,20 +40,20 @@ def test_a_gaussian_is_right_to_the_error_asked_for() -> None:
 @pytest.mark.slow
 def test_a_plain_function_of_one_point_gives_the_same_as_one_of_a_batch() -> None:
     prior = problems.box(2, 0, 1)
-    one = run_slow(lambda theta: float(two_spots(theta[None])[0]), prior, rng=rng(2), error=0.2)
-    many = run_slow(two_spots, prior, vectorized=True, rng=rng(2), error=0.2)
+    one = run_in_few_calls(lambda theta: float(two_spots(theta[None])[0]), prior, rng=rng(2), error=0.2)
+    many = run_in_few_calls(two_spots, prior, vectorized=True, rng=rng(2), error=0.2)
     assert one.log_z == pytest.approx(many.log_z, abs=1e-9)
     assert abs(many.log_z - math.log(2 * math.pi * 0.01**2)) < N_ERRORS * many.log_z_error
     assert many.weight @ (many.theta[:, 0] < 0.5) == pytest.approx(0.75, abs=0.12)
 
 
 def test_an_error_much_finer_than_what_was_asked_for_is_not_claimed() -> None:
-    assert run_slow(problems.gaussian(2), rng=rng(3), error=0.5).log_z_error >= 0.5
+    assert run_in_few_calls(problems.gaussian(2), rng=rng(3), error=0.5).log_z_error >= 0.5
 
 
 def test_where_draws_do_not_reach_the_posterior_an_ordinary_run_follows() -> None:
     known = problems.gaussian(8, 0.9)
-    found = run_slow(known, rng=rng(4), max_calls=5000)
+    found = run_in_few_calls(known, rng=rng(4), max_calls=5000)
     assert found.run is not None
     assert found.n_calls <= 5000
     assert any("max_calls" in doubt for doubt in found.doubts)
@@ -65,7 +65,7 @@ def test_a_prior_of_which_little_is_possible_is_drawn_from_until_enough_is() -> 
     def corner(theta: np.ndarray) -> np.ndarray:
         return np.where((theta < 0.1).all(axis=1), 0.0, -np.inf)
 
-    found = run_slow(corner, problems.box(2, 0, 1), vectorized=True, rng=rng(5))
+    found = run_in_few_calls(corner, problems.box(2, 0, 1), vectorized=True, rng=rng(5))
     assert abs(found.log_z - math.log(0.01)) < N_ERRORS * found.log_z_error
 
 
@@ -73,7 +73,7 @@ def test_a_prior_of_which_little_is_possible_is_drawn_from_until_enough_is() -> 
 def test_in_six_dimensions_a_narrow_part_may_be_lost_and_the_result_says_so() -> None:
     """Of two seeds one loses the needle, and with it 4.5 nats."""
     known = hard.needle_beside_hill()
-    found = [run_slow(known, rng=np.random.default_rng([seed, 28])) for seed in range(2)]
+    found = [run_in_few_calls(known, rng=np.random.default_rng([seed, 28])) for seed in range(2)]
     assert all("narrow part of the posterior" in one.doubts[-1] for one in found)
     assert not any(one.sound for one in found)
 
@@ -87,7 +87,7 @@ def test_options_out_of_range_are_refused() -> None:
         ({"prior": known.prior}, "given beside a problem that has its own"),
     ):
         with pytest.raises(ParameterError, match=message):
-            run_slow(known, rng=rng(), **options)
+            run_in_few_calls(known, rng=rng(), **options)
 
 
 def test_a_mixture_is_a_density_and_finds_the_parts() -> None:
@@ -119,6 +119,6 @@ def test_errors_are_honest_over_many_seeds(name: str) -> None:
     known = problems.problem(name)
     z = []
     for seed in range(12):
-        found = run_slow(known, rng=rng(100 + seed), error=0.05)
+        found = run_in_few_calls(known, rng=rng(100 + seed), error=0.05)
         z.append((found.log_z - known.log_z) / math.hypot(found.log_z_error, known.log_z_error))
     assert np.mean(np.square(z)) < 3.26

@@ -90,6 +90,8 @@ def read_geometry(path: str | Path) -> Geometry:
 def text_with_fitted_values(text: str, geometry: Geometry) -> str:
     """Return the text of a geometry file with the fitted values and their accuracy replaced.
 
+    Limits and stops of the joints, which shift with their home angles, are replaced too; a missing entry is not added.
+
     Parameters
     ----------
     text

@@ -41,7 +41,10 @@ class Goal:
 
 
 def in_lego_units(percent: float, geometry: Geometry) -> float:
-    """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, as in recordings."""
+    """Convert the light sensor's percent, 0 to 100 with fractions, to LEGO units, 1 to 100, as in recordings.
+
+    They are whole numbers where the geometry has `whole_percent`; NaN stays NaN.
+    """
     if geometry.whole_percent and math.isfinite(percent):
         percent = math.floor(percent)  # the brick truncates fractions
     return ReadingScale(step=1.0 if geometry.whole_percent else None).convert(percent)
@@ -131,9 +134,9 @@ class LegoArm:
         Raises
         ------
         ReachError
-            If the arm cannot reach the pose; nothing moves.
+            If the arm cannot reach the pose (nothing moves), or the sensor cannot rise from where it is.
         LinkError
-            If the brick does not answer, or a motor does not move.
+            If the brick does not answer, or a motor does not move; not after the reading, while the sensor rises.
         """
         place = np.array([[pose.x_mm, pose.y_mm]])
         require_within_reach(self.geometry, place, "pose")

@@ -24,7 +24,7 @@ class Machine(Protocol):
     ) -> None: ...
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Turn a joint's motor to a count, approaching in direction `side`, and hold it."""
+        """Turn a joint's motor to a count, approaching with the count rising (side 1) or falling (-1), and hold it."""
         ...
 
     def move_near(self, joint: int, goal: int) -> None:
@@ -36,7 +36,7 @@ class Machine(Protocol):
         ...
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint gently in direction `side` to its stop, and set its counter there."""
+        """Turn a joint gently to its stop, its angle rising (side 1) or falling (-1), and set its counter there."""
         ...
 
     def reset(self, joints: Sequence[int]) -> None:

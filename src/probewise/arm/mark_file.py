@@ -29,7 +29,7 @@ class TouchedMark:
 def read_turns_and_places(path: Path) -> tuple[FloatArray, FloatArray]:
     """Read marks: turns in radians and places in mm, both (n_marks, 3).
 
-    Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty.
+    Raises FileError if a column is missing or a cell is not a number; only `height_mm` may be empty, which gives NaN.
     """
     table = read_table(path)
     table.require_columns(*_TURNED, *_PLACE)

@@ -174,12 +174,16 @@ class OwnInstrument:
             return seconds
 
     def measure(self, pose: Pose) -> Reading:
-        """Measure and return a Reading; by default with the clock's time and the commanded pose.
+        """Measure and return a Reading: the object's own, or one built from its number or dict.
+
+        Where the dict does not say otherwise, its time is the clock's and its pose the commanded one.
 
         Raises
         ------
-        ParameterError, LinkError
-            If the result is not a valid reading; LinkError for an instrument from a file.
+        ParameterError
+            If the result is not a valid reading; the object's own errors pass through.
+        LinkError
+            In place of all these, for an instrument from a file.
         """
         with self._errors_located("measure"):
             return self._as_reading(self._own.measure(pose), pose)
@@ -239,7 +243,7 @@ def instrument_of(
         to all places. Attributes `turns = True` and `lifts = True` declare that it turns its sensor to the pose's
         orientation and reads at the pose's height. `close()`, or `__exit__`, is always called at the end.
     start_s
-        Time at the start, for resuming an earlier run.
+        Time at the start, for resuming an earlier run; without effect on instruments of this package.
     name
         Name for messages.
 

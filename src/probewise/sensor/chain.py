@@ -234,7 +234,7 @@ class Chain:
     look, read, seen = simulated_view, readings_from_simulated_view, white_fraction  # their earlier names
 
     def poses(self, theta: FloatArray, plan: Plan) -> Poses:
-        """Return the sensor's true poses under each hypothesis: the chain up to stage POSE."""
+        """Return the sensor's true poses: the chain up to stage POSE; arrays (n_samples or 1, n_points), lab frame."""
         told = Poses(plan.x_mm[None], plan.y_mm[None], plan.orientation_rad[None])
         found: Poses = self._stage_applier(theta, plan)(Stage.POSE, told)
         return found
@@ -323,7 +323,8 @@ class Layout:
     regions
         Region by pattern name.
     poses
-        Poses relative to the patterns' described places, arrays broadcasting to (n_samples, n_points).
+        True poses minus the displacement of each reading's pattern from its described place, arrays broadcasting to
+        (n_samples, n_points).
     plan
         Which pattern lies under each reading.
     """
@@ -434,6 +435,10 @@ class _HypothesesByGeometry:
             Footprints of all hypotheses, with weights that are the same at every reading.
         n_nodes
             Nodes of the quadrature over curved edges.
+
+        Returns
+        -------
+        R of every hypothesis, (n_samples, n_points).
         """
         n_samples, n_gaussians = len(self.which), footprint.weight.shape[2]
 

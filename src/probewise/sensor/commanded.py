@@ -23,13 +23,13 @@ def has_commanded_height_or_led(plan: Plan) -> bool:
 
 
 def led_state(plan: Plan) -> FloatArray:
-    """Return the LED's state at each reading, 0 or 1, (n_points,) or (1,)."""
+    """Return the LED's state at each reading, 0 or 1, (n_points,), or (1,) without a column `led`; 1 at NaN."""
     led = plan.covariates.get("led")
     return np.ones(1) if led is None else np.where(np.isfinite(led), led, 1.0)
 
 
 def height_ratio(plan: Plan) -> FloatArray | None:
-    """Return h/h0 of each reading, (n_points,); None where no height is known or all are the description's."""
+    """Return h/h0 of each reading, (n_points,), 1 at NaN; None if no height is known or all are the description's."""
     height_mm, usual_mm = plan.covariates.get("height_mm"), plan.instrumentation.height_mm
     if height_mm is None or usual_mm is None:
         return None
@@ -44,7 +44,10 @@ def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint
 
 
 def footprint_at_height_ratio(footprint: Footprint, ratio: FloatArray) -> Footprint:
-    """Scale the footprint by h/h0, (n_samples, n_points), and divide its brightness by the square."""
+    """Scale the footprint by h/h0, (n_samples or 1, n_points), and divide its brightness by the square.
+
+    A ratio below 0.1 or above 10 counts as that.
+    """
     # A fit may try heights that no arm can take: the result only has to stay finite.
     ratio = np.clip(ratio, 0.1, 10.0)
     k = ratio[:, :, None]

@@ -302,7 +302,10 @@ def mass_in_quadrant(
 
 @mean_albedo_under_one.register
 def _mean_albedo_over_polygon(region: PolygonRegion, gaussian: LabGaussian, n_nodes: int) -> FloatArray:
-    """Sum Owen's T over the edges, in the frame in which the Gaussian is the unit one."""
+    """Sum over the edges the angle that each subtends at the mean, less the mass beyond it.
+
+    This is in the frame in which the Gaussian is the unit one, with its mean at the origin.
+    """
     sd_x = np.sqrt(gaussian.var_x)
     slope = gaussian.cov_xy / gaussian.var_x
     sd_free = np.sqrt(gaussian.var_y - slope * gaussian.cov_xy)

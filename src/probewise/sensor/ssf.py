@@ -287,9 +287,9 @@ def _reached_slice(centres: FloatArray, mean: float, sd: float) -> slice:
 def merged_mean_mixture(
     footprint: Footprint, *, weights: FloatArray | None = None, n_gaussians: int = 1
 ) -> FixedMixture:
-    """Merge the mean of sampled mixtures, arrays (n_samples, 1, n), into one mixture of `n_gaussians`.
+    """Merge the mean of sampled mixtures, arrays (n_samples, 1, n), into one mixture of at most `n_gaussians`.
 
-    The mean over the samples is a large mixture; its components are merged by the law of
+    `weights` are the samples', (n_samples,), equal when None. The mean over the samples is a large mixture; its components are merged by the law of
     total covariance, so mean and covariance of the mean field are exact.
     """
     arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
@@ -303,7 +303,7 @@ def merged_mean_mixture(
 def mixture_of_field(field: SSFField, *, n_gaussians: int = 1) -> FixedMixture:
     """Approximate a field by a mixture of the same mean and covariance, for which responses have closed forms.
 
-    Negative values of the field count as 0.
+    Negative values of the field count as 0. Gaussians without mass are left out of the `n_gaussians`.
     """
     values = np.maximum(field.values.ravel(), 0.0)
     kept = values > 1e-7 * values.max()

@@ -16,7 +16,7 @@ _N_RIM = 720  # points on an oval's outline among which the nearest is searched
 def distance_to_nearest_edge(surface: Surface, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
     """Return the distance in mm to the nearest printed edge, (n_points,); infinite where there is none.
 
-    Images count as having no edges, since they are not described.
+    Ramps and images count as having none: a ramp is smooth, and an image's edges are not described.
     """
     match surface:
         case CoveredSurface():
@@ -49,7 +49,7 @@ def distance_to_nearest_edge(surface: Surface, x_mm: FloatArray, y_mm: FloatArra
 
 
 def edge_normal(surface: Surface) -> tuple[float, float]:
-    """Return the unit vector across the edge of a pattern with a single straight edge; along X for others."""
+    """Return the unit vector across the edges of a half-plane or stripes, or up a ramp; along X for others."""
     match surface:
         case HalfPlane() | Stripes() | Ramp():
             return math.cos(surface.normal_rad), math.sin(surface.normal_rad)

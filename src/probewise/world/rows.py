@@ -32,7 +32,7 @@ class Rows:
     covariates
         Other logged columns, arrays of shape (n_points,).
     across
-        Unit vector across the edge of the pattern below, (1, 0) if it has no single edge, (n_points, 2).
+        Unit vector across the straight edges of the pattern below (`edge_normal`), (1, 0) for others, (n_points, 2).
     edge_mm
         Distance from the place to the nearest edge of the pattern, infinite where it has none, (n_points,).
     """

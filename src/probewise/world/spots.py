@@ -103,7 +103,7 @@ def _slice_with_mass(profile: FloatArray) -> slice:
 
 
 def gaussian_spot(blobs: Sequence[Blob], *, pixel_mm: float = 0.25) -> Spot:
-    """Make a footprint of one or several Gaussians."""
+    """Make a footprint of one or several Gaussians; only the ratios of their shares count."""
     low = [min(b.center_mm[k] - 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
     high = [max(b.center_mm[k] + 6 * b.sd_mm[k] for b in blobs) for k in (0, 1)]
 
@@ -199,7 +199,7 @@ def ring_spot(
 
 
 def blurred(spot: Spot, sd_mm: float) -> Spot:
-    """Convolve a footprint with a round Gaussian."""
+    """Convolve a footprint with a round Gaussian of sd `sd_mm`; its pixels become no larger than that."""
     # A Gaussian sampled more coarsely than its sd is too narrow: refine the pixels first.
     cuts = math.ceil(spot.pixel_mm / sd_mm)
     pixel_mm = spot.pixel_mm / cuts

@@ -114,7 +114,7 @@ class World:
         time_s
             Time of the reading.
         rng
-            Generator of the noise; None: a reading without noise.
+            Generator of the noise; None: a reading without noise, but rounded.
         direction
             Unit vector of the motion that led there, for backlash and hysteresis.
         height_mm

@@ -96,7 +96,7 @@ class Brick:
     def battery_mv(self) -> int:
         """Read the battery's voltage, in mV; warn once if it is low.
 
-        A voltage far from the last one must be confirmed by a second reading, since the protocol has no checksum.
+        The first voltage, and one far from the last, must be confirmed by a second reading, since the protocol has no checksum.
 
         Raises
         ------

@@ -56,7 +56,7 @@ class BrickMachine:
         self.brick.__exit__(kind, error, trace)
 
     def move_to(self, joint: int, goal: int, side: Side) -> None:
-        """Turn a joint's motor to a count, approaching in direction `side`, and hold it; see `Motor.move_to`."""
+        """Turn a joint's motor to a count, approaching in the motor's direction `side`; see `Motor.move_to`."""
         with self._recording_counts(joint) as motor:
             motor.move_to(goal + self._zeros[joint], side)
 
@@ -71,7 +71,7 @@ class BrickMachine:
             motor.release()
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint to its stop; from then on its counts agree with the geometry."""
+        """Turn a joint to its stop, in the joint's direction `side`; from then on its counts agree with the geometry."""
         mechanics = self._joints[joint]
         motor = self._motors[joint]
         with_gears: Side = side if mechanics.gear_ratio > 0 else -side

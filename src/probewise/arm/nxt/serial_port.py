@@ -52,7 +52,7 @@ class SerialPort:
         return str(self._port.name)
 
     def read(self, size: int, timeout_s: float) -> bytes:
-        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`."""
+        """Return up to `size` bytes, fewer if no more arrive within `timeout_s`; LinkError if the line is cut."""
         try:
             self._port.timeout = timeout_s
             return bytes(self._port.read(size))
@@ -60,7 +60,7 @@ class SerialPort:
             raise self._link_cut_error(error) from error
 
     def write(self, data: bytes) -> None:
-        """Send all bytes."""
+        """Send all bytes; LinkError if the line is cut."""
         try:
             self._port.write(data)
         except OSError as error:

@@ -68,7 +68,10 @@ class MomentCoordinates:
         return np.concatenate([out.reshape(len(theta), 6 * n), theta[:, 6 * n :]], axis=1)
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters, (n_samples, 6 N + 2); also return the prior's log density, (n_samples,)."""
+        """Map coordinates to parameters, (n_samples, 6 N + 2); also return the log prior density, (n_samples,).
+
+        It is the density of the coordinates, -inf where the Gaussians are not sorted.
+        """
         n = self.prior.n_gaussians
         # One contiguous row per kind of coordinate, for speed.
         g = np.ascontiguousarray(view_by_kind_and_gaussian(x))

@@ -97,7 +97,7 @@ def noise_by_scan(
     sd_ceiling: float,
     rng: np.random.Generator,
 ) -> tuple[ScanNoise, ...]:
-    """Summarise the posterior of every scan's noise sd, in the order of the scans.
+    """Summarise the posterior of every scan's noise sd, in the order of the scans; those without rows are left out.
 
     Parameters
     ----------

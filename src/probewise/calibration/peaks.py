@@ -117,7 +117,7 @@ def _split_gaussian(theta: FloatArray, rng: np.random.Generator) -> FloatArray:
 def _with_light_gaussian_added(
     prior: SSFPrior, theta: FloatArray, lone: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Add a Gaussian with at most a fifth of the first one's light, (n, 6 N + 2), (n, 6) -> (n, 6 N + 8)."""
+    """Add the Gaussians `lone`, with 0.01 to 0.2 of the first one's light: (n, 6 N + 2), (n, 6) -> (n, 6 N + 8)."""
     one, first = lone.copy(), theta[:, :6]
     light = first[:, 0] / prior.amplitude_at_unit_mass(first[:, 3] * first[:, 4] - first[:, 5] ** 2)
     one[:, 0] = (

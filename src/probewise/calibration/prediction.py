@@ -57,6 +57,8 @@ def predict(
     ------
     ShapeError
         If readings and rows differ in number.
+    ParameterError
+        If readings are given with a recording, or the plan reads over a pattern that is not described.
 
     Warns
     -----

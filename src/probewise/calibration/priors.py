@@ -198,8 +198,8 @@ class SSFPrior:
 class ScanGeometry:
     """Lengths and ranges that bound what a recording can resolve and contain.
 
-    `step_mm` is the median step within scans, `span_mm` the median length of the scans that
-    move; `low`, `high` the extreme readings; `albedo_low`, `albedo_high` the extreme albedo
+    `step_mm` is the median step within scans, at most a fiftieth of `span_mm`; that is the median length of the scans
+    that move, or the diagonal of all places if none does; `low`, `high` the extreme readings; `albedo_low`, `albedo_high` the extreme albedo
     at the commanded places; `inverted` is True if dark places give high readings.
     """
 
@@ -329,7 +329,8 @@ def blind_axis_rad(recording: Recording) -> float | None:
 
     Returns
     -------
-    The axis, radians anticlockwise from x', 0 to pi; `None` if there are two directions or more.
+    The axis, radians anticlockwise from x', 0 to pi; `None` if there are two directions or more, a pattern of another
+    kind (but uniform ones), or no straight pattern at all.
     """
     plan = recording.plan
     angles: list[FloatArray] = []

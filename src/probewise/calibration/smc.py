@@ -326,7 +326,10 @@ def _snapshots_of_posterior(
     n_more: int,
     rng: np.random.Generator,
 ) -> list[_Particles]:
-    """Move particles of the posterior `n_more` times; return `N_SNAPSHOTS` states of them from the last half."""
+    """Move particles of the posterior `n_more` times; return `N_SNAPSHOTS` states of them from the last half.
+
+    They are fewer if the moves are very few.
+    """
     keep = {round(n_more * (0.5 + 0.5 * k / (N_SNAPSHOTS - 1))) for k in range(N_SNAPSHOTS)}
     kept = []
     for k in range(1, n_more + 1):

@@ -289,8 +289,8 @@ def merged_mean_mixture(
 ) -> FixedMixture:
     """Merge the mean of sampled mixtures, arrays (n_samples, 1, n), into one mixture of at most `n_gaussians`.
 
-    `weights` are the samples', (n_samples,), equal when None. The mean over the samples is a large mixture; its components are merged by the law of
-    total covariance, so mean and covariance of the mean field are exact.
+    `weights` are the samples', (n_samples,), equal when None. The mean over the samples is a large mixture; its
+    components are merged by the law of total covariance, so mean and covariance of the mean field are exact.
     """
     arrays = np.broadcast_arrays(footprint.weight, *footprint.moments)
     n_samples, _, n = arrays[0].shape

@@ -96,7 +96,8 @@ class Brick:
     def battery_mv(self) -> int:
         """Read the battery's voltage, in mV; warn once if it is low.
 
-        The first voltage, and one far from the last, must be confirmed by a second reading, since the protocol has no checksum.
+        The first voltage, and one far from the last, must be confirmed by a second reading, since the protocol has no
+        checksum.
 
         Raises
         ------

@@ -43,7 +43,7 @@ class CleanSetup:
 
     @cached_property
     def edge_scan_names(self) -> tuple[str, ...]:
-        """Names of the scans of 20 readings or more over a pattern with an edge."""
+        """Names of the scans of 20 readings or more that start over a pattern that is not uniform."""
         return tuple(
             self.plan.scan_names[k]
             for k, rows in enumerate(self.plan.rows_by_scan())

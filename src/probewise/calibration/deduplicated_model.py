@@ -13,8 +13,8 @@ from probewise.sensor import SensorModel
 class DeduplicatedModel:
     """Wrapper of a model that predicts repeated rows of one plan only once.
 
-    The model's predictions may depend only on a row's place, orientation and pattern, as those of every chain without
-    effects do. The wrapper predicts only the plan that it was made for.
+    The model's predictions may depend only on a row's place, orientation and pattern, as those of a chain without
+    effects do where the plan commands neither height nor LED. The wrapper predicts only the plan that it was made for.
     """
 
     def __init__(self, model: SensorModel, plan: Plan) -> None:

@@ -199,8 +199,8 @@ class ScanGeometry:
     """Lengths and ranges that bound what a recording can resolve and contain.
 
     `step_mm` is the median step within scans, at most a fiftieth of `span_mm`; that is the median length of the scans
-    that move, or the diagonal of all places if none does; `low`, `high` the extreme readings; `albedo_low`, `albedo_high` the extreme albedo
-    at the commanded places; `inverted` is True if dark places give high readings.
+    that move, or the diagonal of all places if none does; `low`, `high` are the extreme readings, `albedo_low`,
+    `albedo_high` the extreme albedo at the commanded places; `inverted` is True if dark places give high readings.
     """
 
     step_mm: float

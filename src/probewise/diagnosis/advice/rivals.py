@@ -27,7 +27,8 @@ _SIZES = 4  # sizes tried, each a quarter of the last
 def choose_next_measurement(searched: Searched, null: WeighedFit) -> NextMeasurement | None:
     """Choose the readings that separate the leading refitted hypotheses on the mean.
 
-    If only one is left, its rival is an effect too weak to be detected so far. None if no scan is informative.
+    If only one is left, its rival is an effect too weak to be detected so far. None if no scan is informative, or only
+    one is left and the budget of costly predictions is spent.
     """
     by_mean = searched.posterior.by_mean
     # An unknown effect makes no prediction beyond the null.

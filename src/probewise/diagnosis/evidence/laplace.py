@@ -344,7 +344,7 @@ def mix_scales(explained: FloatArray, gain: FloatArray, n_points: int) -> FloatA
 
     Returns
     -------
-    Log Bayes factors, (n_templates, n_draws).
+    Log Bayes factors, (n_templates, n_draws); about -48 for a template that is detectable at no scale.
     """
     terms = np.empty((len(SCALES), explained.shape[0], explained.shape[2]))
     visible = SCALES[:, None] ** 2 * gain.sum(axis=1) >= LEAST_VISIBLE**2

@@ -107,7 +107,10 @@ def _scans_and_patterns_of(variant: NamedEffect[Any]) -> tuple[object, object]:
 
 
 def _predicted_changes(found: Fit, effect: NamedEffect[Any], bank: FloatArray, usable: IntArray) -> list[FloatArray]:
-    """Return the change of readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans."""
+    """Return the change of readings by each entry of a bank, (n_usable, n_columns), 0 outside the effect's scans.
+
+    A column is 0 too where its model diverges, or the change is no more than rounding.
+    """
     plain, plan = found.model, found.model.plan
     model = plain.with_effect(effect)
     n_rows = bank.shape[0] * bank.shape[1]

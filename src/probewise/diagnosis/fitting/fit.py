@@ -105,8 +105,9 @@ class Model:
 class Fit:
     """The best point of a model: coordinates `z`, and at it the usable rows' predictions and slopes.
 
-    `predicted`, `residuals` (n_usable,), `slopes` (n_usable, n_params); `sd` is the most likely sigma of its noise
-    model; `settled`: the last step gained less than the tolerance.
+    `predicted`, `residuals` (n_usable,), reading minus prediction, `slopes` (n_usable, n_params); `sd` is the most
+    likely sigma of its noise model; `objective` is minus the log posterior there, up to a constant; `settled`: the last
+    step gained less than the tolerance. Where the start is not finite, it is returned with both infinite.
     """
 
     model: Model
@@ -119,7 +120,7 @@ class Fit:
     settled: bool = False
 
     def change_by(self, name: str, usable: IntArray) -> FloatArray:
-        """Return the change of the usable readings by one of its effects, other parameters fixed, (n_usable,)."""
+        """Return the predictions minus those without one of its effects, other parameters fixed, (n_usable,)."""
         without, stay = self.model.model_and_mask_without(name)
         return np.asarray(self.predicted - without.predict(self.z[None, stay])[0, usable])
 
@@ -133,7 +134,7 @@ def fit(
     max_steps: int = 30,
     tolerance: float = 5e-3,
 ) -> Fit:
-    """Find the maximum of the posterior with the noise sd integrated out.
+    """Find the maximum of the posterior, with the noise sd that is most likely at each point.
 
     Maximises the log likelihood under the noise model minus |z|^2 / 2, over the box |z| <= 6.
     Each step differentiates in one vectorised prediction and tries five dampings in another.

@@ -194,7 +194,10 @@ def is_along_line(plan: Plan | RunTable, rows: IntArray) -> bool:
 
 
 def _probability_unknown_depends_on(diagnosis: Diagnosis, place: Place) -> float:
-    """Return the probability that the unknown effect depends on a place's covariate; 0 where the effect is named."""
+    """Return the probability that the unknown effect depends on a place's covariate.
+
+    It is 0 unless the verdict is `unknown` and the most probable form of the effect is a family of bases.
+    """
     shares = diagnosis.judged.unknown_shares
     if diagnosis.verdict != "unknown" or max(shares, key=lambda k: shares[k], default="") in UNNAMED:
         return 0.0

@@ -71,7 +71,7 @@ class BrickMachine:
             motor.release()
 
     def find_stop(self, joint: int, side: Side) -> None:
-        """Turn a joint to its stop, its angle rising (side 1) or falling (-1); its counts then agree with the geometry."""
+        """Turn a joint to its stop, its angle rising (side 1) or falling (-1); then its counts fit the geometry."""
         mechanics = self._joints[joint]
         motor = self._motors[joint]
         with_gears: Side = side if mechanics.gear_ratio > 0 else -side

@@ -249,7 +249,7 @@ def audit_plan(
     Raises
     ------
     ParameterError
-        If the plan has no row, or a pattern that its description lacks.
+        If the plan has no row, or a pattern that its description lacks, or the noise is not above 0.
     """
     if isinstance(plan, Recording):
         plan = plan.plan

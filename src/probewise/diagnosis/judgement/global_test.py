@@ -32,7 +32,7 @@ class GlobalTest:
 
 
 def run_global_test(searched: Searched, *, rng: np.random.Generator) -> GlobalTest:
-    """Test whether the mean of the null is complete.
+    """Test whether the mean of the null is complete; the p-value is 1 where all readings are equal.
 
     Raises
     ------

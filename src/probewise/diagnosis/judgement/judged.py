@@ -150,7 +150,7 @@ def ranked_hypotheses(
     probabilities: Mapping[tuple[Names, Names], float],
     reported_as: Callable[[Names], Names] = _unknown_if_out_of_vocabulary,
 ) -> tuple[Hypothesis, ...]:
-    """Join effects on mean and noise into hypotheses; unknown is one hypothesis under any noise.
+    """Join effects on mean and noise into hypotheses, most probable first; unknown is one under any noise.
 
     `reported_as` maps a combination on the mean to the name under which it counts.
     """
@@ -183,7 +183,7 @@ def verdict_and_combination(
 
 
 def credible_labels(hypotheses: tuple[Hypothesis, ...]) -> tuple[str, ...]:
-    """Return the labels of the smallest set of hypotheses with a probability of 95 %."""
+    """Return the labels of the smallest set of hypotheses with a probability of 95 % or more, most probable first."""
     out, held = [], 0.0
     for hypothesis in sorted(hypotheses, key=lambda h: -h.probability):
         out.append(hypothesis.label)

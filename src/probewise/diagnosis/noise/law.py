@@ -100,7 +100,7 @@ class NoiseLaw:
 
     @property
     def has_memory(self) -> bool:
-        """Return whether successive readings have some of their noise in common."""
+        """Whether successive readings have some of their noise in common."""
         return bool(self.walk.size or np.any(self.carry))
 
     @property
@@ -191,7 +191,10 @@ class NoiseLaw:
         return replace(self, share=0.0, times=1.0, flat=0.0, sigma=1.0, least=0.0 if self.flat else self.least)
 
     def likeliest_sigma(self, whitened: FloatArray) -> FloatArray:
-        """Return the most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,)."""
+        """Return the most likely sigma of whitened residuals, at least the floor, (n_points, k) -> (k,).
+
+        For rounded noise it is the known one.
+        """
         return self.whitened_density.likeliest_sigma(whitened, self.n_points, floor=self.sigma_floor)
 
     def minus_log_likelihood(self, whitened: FloatArray, sigma: FloatArray) -> FloatArray:
@@ -353,7 +356,7 @@ def noise_statistics(residuals: FloatArray, steps: IntArray, level: FloatArray) 
 
     Returns
     -------
-    Lag-1 autocorrelation, excess kurtosis, and correlation of the squares with the level.
+    Lag-1 autocorrelation, excess kurtosis, and projection of the squares on the level.
     """
     r = residuals / np.sqrt(np.maximum(np.mean(residuals**2, axis=0), 1e-300))
     neighbours = np.flatnonzero(steps == 1)

@@ -70,7 +70,7 @@ class NoiseModel:
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
     def thinned_nodes(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return every third node, and log weights, of each effect with more than twelve, by name, for `likely`."""
+        """Return every third node, and log weights, for `likely`: of effects with one parameter and over twelve nodes."""
         out = {}
         for effect in self.effects:
             nodes = effect.bank()[:, 0, :]
@@ -197,7 +197,7 @@ class NoiseModel:
 def log_prior_of_lost_value(value: float, cells: float, ends: Sequence[float]) -> float:
     """Return the log prior probability of the value of lost readings.
 
-    Half is for the ends of the declared range, and half for any of the cells.
+    Half is for the ends of the declared range, and half for any of the cells; without ends, all is for the cells.
     """
     if not ends:
         return -math.log(cells)
@@ -252,6 +252,7 @@ def rough_sd(recording: Recording) -> float:
     """Estimate the noise sd without a model, from second differences within scans, few of which are at an edge.
 
     The estimate includes rounding; equal readings are spread over a step, so that the median is not one of few values.
+    It is 0 if no three usable readings are successive.
     """
     readings, steps = recording.readings[recording.usable], n_rows_since_previous_usable(recording)
     inner = np.flatnonzero((steps[1:-1] == 1) & (steps[2:] == 1)) + 1

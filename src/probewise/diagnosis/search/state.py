@@ -207,7 +207,7 @@ class SearchState:
         """Return the log evidence of (mean, noise) by screening, for combinations that were not refitted.
 
         Screening about a fit with part of the effects is more accurate than about the null; the latter is corrected for
-        refits of its parts.
+        refits of its parts. `optimism` is taken off, unless a refit has shown that an effect is insignificant.
         """
         refitted = self.refitted_combinations
         out = {}

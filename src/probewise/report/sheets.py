@@ -179,14 +179,14 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
 
 
 def field_sheet(field_mm: tuple[float, float], outline_mm: FloatArray | None = None) -> Sheet:
-    """Make the sheet of the black field with a white target of the given outline, (n, 2), in place."""
+    """Make the sheet of the black field with a white target in place, of the given closed outline, (n, 2)."""
     pattern: Pattern = Uniform(0.0) if outline_mm is None else Polygon(_vertices_without_closing(outline_mm))
     said = "all black" if outline_mm is None else "black, the target white at its place"
     return Sheet("field", pattern, (0.0, 0.0), field_mm, (said,), frame="the field's lower left corner")
 
 
 def target_sheet(name: str, outline_mm: FloatArray) -> Sheet:
-    """Make the sheet of a white target of the given outline, (n, 2), to cut out and lay on a black field."""
+    """Make the sheet of a white target of the given closed outline, (n, 2), to cut out and lay on a black field."""
     low = np.floor((outline_mm.min(axis=0) - _ROUND_MM) / _ROUND_MM) * _ROUND_MM
     high = np.ceil((outline_mm.max(axis=0) + _ROUND_MM) / _ROUND_MM) * _ROUND_MM
     lines = ("white: cut it out along the line and lay it on the black field",)

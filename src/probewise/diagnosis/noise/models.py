@@ -70,7 +70,7 @@ class NoiseModel:
         return {effect.name: own for effect, own in effects_with_columns(self.effects)}[name]
 
     def thinned_nodes(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """Return every third node, and log weights, for `likely`: of effects with one parameter and over twelve nodes."""
+        """Return every third node, and log weights, for `likely`: of effects of one parameter and over twelve nodes."""
         out = {}
         for effect in self.effects:
             nodes = effect.bank()[:, 0, :]

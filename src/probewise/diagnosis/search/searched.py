@@ -86,8 +86,8 @@ class Evidences:
     def one_name_outweighs_unnamed(self) -> bool:
         """Return whether some named effect, on mean or noise, has more evidence alone than any unnamed effect alone.
 
-        Unnamed are unknown effects and formulas. Combinations do not count: they were chosen from too many for their
-        evidence alone to decide.
+        Unnamed are unknown effects and formulas; without any, False. Combinations do not count: they were chosen from
+        too many for their evidence alone to decide.
         """
         plain = self._simplest_noise
         nameless = [v for (_, names, noise), v in self.unknown.items() if not names and noise == plain]

@@ -34,7 +34,7 @@ def model_with(recording: Recording, names: Sequence[str], *, rng: np.random.Gen
     Returns
     -------
     ModelSamples
-        The samples; effects on the mean that do not act on these readings are left out.
+        The samples; without any effect on the mean if the search kept no refit with all of them.
 
     Raises
     ------

@@ -112,7 +112,8 @@ def _first_figure_svg(diagnosis: Diagnosis, chance: ResidualNoise) -> bytes:
 def _place_svg(diagnosis: Diagnosis, chance: ResidualNoise, place: Place, at: FloatArray) -> bytes:
     """Draw the calibrated model's residuals against a place's covariate: readings, means, the band of chance.
 
-    A scan is drawn along its path, which shows residuals that change sign, and below that beside the other scans.
+    A whole scan or run is drawn along X, Y, time or rows, which shows residuals that change sign, and below that beside
+    the others.
     """
     by_covariate = view_of_place(diagnosis, place, at)
     if place.scan is None or place.covariate != diagnosis.apparatus.words.run:

@@ -109,7 +109,10 @@ class NoiseLaw:
         return float(self.whitened_density.information)
 
     def take(self, rows: BoolArray) -> NoiseLaw:
-        """Return the distribution of some readings, which must be whole scans."""
+        """Return the distribution of some readings: exact for whole scans, else as if those left out between were not.
+
+        A reading then has its correlation with the one taken before it.
+        """
         walk = np.diff(np.cumsum(self.walk)[rows], prepend=0.0) if self.walk.size else self.walk
         return replace(self, sd=self.sd[rows], carry=self.carry[rows], lost=self.lost[rows], walk=walk)
 

@@ -44,7 +44,7 @@ ON_NOISE: tuple[type[NamedEffect[Any]], ...] = (
     Quantisation,
     DriftingNoise,
 )
-CALLS_OF_A_SEARCH = 16_000  # what judging and sampling ask beyond it stays within the 20,000 that a diagnosis may
+CALLS_OF_A_SEARCH = 16_000  # with what judging and sampling ask beyond it, some 20,000 in a diagnosis
 STEPS_OF_A_SEARCH = 600_000  # of the integration, some 70 microseconds each, of however many samples
 _N_BLOCKS = 5
 

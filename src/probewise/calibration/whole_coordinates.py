@@ -63,7 +63,10 @@ class WholeFootprintCoordinates:
         return x
 
     def leave(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Map coordinates to parameters, (n, 6 N + 2); also return the prior's log density, (n,)."""
+        """Map coordinates to parameters, (n, 6 N + 2); also return the log prior density of the coordinates, (n,).
+
+        It is -inf where the Gaussians are not sorted, or there are no such parameters.
+        """
         y = x.copy()
         g = view_by_kind_and_gaussian(y)
         # Sorted by mass; a clipped ratio must not pass for one that is.

@@ -102,6 +102,18 @@ def test_rows_predicted_once_are_those_predicted_one_by_one(recording: Recording
         wrapped.predict(truth[None], recording.plan)
 
 
+def test_rows_that_differ_in_height_or_led_are_predicted_apart(recording: Recording, truth: FloatArray) -> None:
+    plan = recording.plan.take(np.array([5, 5, 5, 5]))
+    for name, values in (("led", [1.0, 0.0, 1.0, 0.0]), ("height_mm", [14.0, 16.0, 14.0, 20.0])):
+        commanded = replace(
+            plan, covariates={name: np.array(values)}, instrumentation=replace(plan.instrumentation, height_mm=14.0)
+        )
+        chain = Chain(FreeMixture(1), FreeLevels(), KnownScene(plan.patterns))
+        predicted = DeduplicatedModel(chain, commanded).predict(truth[None], commanded)
+        np.testing.assert_allclose(predicted, chain.predict(truth[None], commanded), rtol=1e-12)
+        assert np.ptp(predicted) > 0.0
+
+
 def test_readings_left_out_change_nothing_but_are_counted(recording: Recording, truth: FloatArray) -> None:
     readings = recording.readings.copy()
     readings[[3, 70]] = np.nan

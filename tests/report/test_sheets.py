@@ -159,6 +159,14 @@ def test_a_sheet_is_as_large_as_its_readings_need():
     assert set(sheets) == set(plan.pattern_names)
 
 
+def test_a_pattern_that_the_plan_does_not_have_needs_no_sheet():
+    plan = paper_plan()
+    described = {**plan.patterns, "another": Uniform(0.5)}
+    assert [sheet.name for sheet in plan_sheets(described, plan)] == [
+        sheet.name for sheet in plan_sheets(plan.patterns, plan)
+    ]
+
+
 def test_patterns_alone_make_sheets_and_what_no_outline_draws_is_a_picture():
     picture = Image(np.linspace(0, 1, 20).reshape(4, 5), 10.0, (0.0, 0.0), "x.npy")
     sheets = plan_sheets({"a": Stripes(0.3, 8.0, 0.5, 1.0), "b": picture, "c": Uniform(0.5)})

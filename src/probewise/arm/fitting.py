@@ -68,7 +68,7 @@ class FittedGeometry:
         if known is not None:
             lines.append(
                 f"the sensor is placed to {known.place_sd_mm:.2f} mm, its height known to {known.height_sd_mm:.2f} mm "
-                "where it is least (sds)"
+                "where it is known least (sds)"
             )
         return "\n".join(lines)
 

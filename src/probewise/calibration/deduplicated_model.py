@@ -7,18 +7,20 @@ import numpy as np
 from probewise._arrays import FloatArray
 from probewise.errors import ParameterError
 from probewise.recordings import Plan
-from probewise.sensor import SensorModel
+from probewise.sensor import COMMANDED, SensorModel
 
 
 class DeduplicatedModel:
     """Wrapper of a model that predicts repeated rows of one plan only once.
 
-    The model's predictions may depend only on a row's place, orientation and pattern, as those of a chain without
-    effects do where the plan commands neither height nor LED. The wrapper predicts only the plan that it was made for.
+    The model's predictions may depend only on a row's place, orientation, pattern, and commanded height and LED, as
+    those of a chain without effects do. The wrapper predicts only the plan that it was made for.
     """
 
     def __init__(self, model: SensorModel, plan: Plan) -> None:
-        keys = np.stack([plan.x_mm, plan.y_mm, plan.orientation_rad, plan.pattern.astype(np.float64)], axis=-1)
+        commanded = [plan.covariates[name] for name in COMMANDED if name in plan.covariates]
+        pattern = plan.pattern.astype(np.float64)
+        keys = np.stack([plan.x_mm, plan.y_mm, plan.orientation_rad, pattern, *commanded], axis=-1)
         _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         self._model = model
         self._plan = plan

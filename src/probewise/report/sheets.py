@@ -164,7 +164,8 @@ def plan_sheets(patterns: Mapping[str, Pattern], plan: Plan | None = None) -> tu
     for name, pattern in patterns.items():
         places, turns = np.zeros((1, 2)), ()
         if plan is not None:
-            rows = np.flatnonzero(plan.pattern == plan.pattern_names.index(name))
+            used = [index for index, own in enumerate(plan.pattern_names) if own == name]
+            rows = np.flatnonzero(np.isin(plan.pattern, used))
             if not rows.size:
                 continue
             places = np.stack([plan.x_mm[rows], plan.y_mm[rows]], axis=-1)

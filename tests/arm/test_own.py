@@ -281,6 +281,29 @@ def test_a_plan_is_carried_out_with_a_person_who_lays_patterns_and_turns_the_sen
     assert back.plan.instrumentation.unit == "counts"
 
 
+def turns_asked(asked):
+    return [round(math.degrees(request.turned_rad)) for request in asked if request.turned_rad is not None]
+
+
+def test_a_sensor_that_an_earlier_plan_left_turned_is_turned_back():
+    asked, own = [], Own()
+    with instrument_of(own) as arm:
+        for _ in range(2):
+            list(carry_out(arm, plan(), origin_mm=(100.0, 50.0), ask=asked.append))
+    assert turns_asked(asked) == [60, 0, 60]
+
+
+def test_a_sensor_that_the_rows_taken_before_may_have_left_turned_is_turned_back():
+    asked = []
+    angles = [0.0, math.pi / 3, 0.0, 0.0]
+    taken(Own(), asked, plan(orientation_rad=angles), first=2)
+    assert turns_asked(asked) == [0]
+    with instrument_of(Own()) as arm:  # all rows of the first plan were taken in an earlier session
+        for first in (4, 0):
+            list(carry_out(arm, plan(orientation_rad=angles), origin_mm=(0.0, 0.0), ask=asked.append, first=first))
+    assert turns_asked(asked) == [0, 0, 60, 0]
+
+
 def test_one_that_turns_its_sensor_and_lifts_it_is_told_where_to_and_nobody_is_asked():
     asked, own = [], Own(turns=True, lifts=True)
     taken(own, asked, plan(covariates={"height_mm": [10, 10, 14, 14]}), first=2)

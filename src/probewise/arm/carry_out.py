@@ -58,7 +58,8 @@ def carry_out(
 
     The LEGO arm's orientation follows from its pose; the person turns the sensor on its mount by right angles to come
     as close to the planned orientation as possible. With a user's own instrument that does not turn its sensor, the
-    person turns it to the planned orientation. The reading holds the true orientation.
+    person turns it to the planned orientation. The reading holds the true orientation. Where the sensor was left turned
+    by an earlier plan, or may have been by the first rows of this one, the person is asked to turn it.
 
     Parameters
     ----------
@@ -91,7 +92,9 @@ def carry_out(
     _require_feasible_settings(arm, plan)
     row_measurer = _LegoRowMeasurer(arm) if isinstance(arm, LegoArm) else _OwnRowMeasurer(arm)
     turns = row_measurer.hand_turns_rad(plan, places)
-    mounted, lying = 0.0, -1
+    if (turns[:first] > _SAME_TURN_RAD).any():
+        arm.mounted_rad = math.nan  # by hand, in an earlier session
+    lying = -1
     for row in range(first, len(plan)):
         if plan.pattern[row] != lying:
             lying = int(plan.pattern[row])
@@ -99,12 +102,13 @@ def carry_out(
             where = f"its origin at ({origin_mm[0]:g}, {origin_mm[1]:g}) mm of the field, its x axis along the field's"
             shown = f": {where_white_in_words(plan.patterns[name])}" if name in plan.patterns else ""
             ask(RequestToPerson(f"lay sheet {name!r}, {where}{shown}", pattern=name))
-        if abs(float(turns[row]) - mounted) > _SAME_TURN_RAD:
-            mounted = float(turns[row])
-            text = f"turn the sensor on its mount to {math.degrees(mounted):.4g} degrees, {row_measurer.from_where}"
-            ask(RequestToPerson(text, turned_rad=mounted))
+        turned = float(turns[row])
+        if not abs(turned - arm.mounted_rad) <= _SAME_TURN_RAD:
+            text = f"turn the sensor on its mount to {math.degrees(turned):.4g} degrees, {row_measurer.from_where}"
+            ask(RequestToPerson(text, turned_rad=turned))
+            arm.mounted_rad = turned
         x_mm, y_mm = places[row].tolist()
-        reading = row_measurer.measure_row(x_mm, y_mm, mounted, plan, row)
+        reading = row_measurer.measure_row(x_mm, y_mm, arm.mounted_rad, plan, row)
         there = _place_in_plan_frame_mm(reading, plan, row, origin_mm)
         yield dataclasses.replace(reading, pose=Pose(*there, reading.pose.orientation_rad))
 

@@ -68,6 +68,8 @@ class LegoArm:
     ----------
     turned_rad
         Angle by which the sensor has been turned by hand on its mount, relative to the geometry.
+    mounted_rad
+        Angle to which a person was last asked to turn it, see `carry_out`; NaN: not known.
     first_down
         Function called before each step of the first lowering with the height that the sensor should have; it returns
         when a person has confirmed it. None: the arm lowers in one move.
@@ -79,6 +81,7 @@ class LegoArm:
         self._is_down = False
         self._arrived: list[int] = [0, 0, 0]  # the direction from which each joint reached its position
         self.turned_rad = 0.0
+        self.mounted_rad = 0.0
         self.first_down: Callable[[float], None] | None = None
 
     def __enter__(self) -> Self:

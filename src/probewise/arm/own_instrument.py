@@ -53,6 +53,11 @@ class OwnInstrument:
         Time at the start, for resuming an earlier run.
     clock
         Clock for readings without a time.
+
+    Attributes
+    ----------
+    mounted_rad
+        Angle to which a person was last asked to turn its sensor, see `carry_out`; NaN: not known.
     """
 
     def __init__(
@@ -61,6 +66,7 @@ class OwnInstrument:
         require_callable("connect", connect, "a function without arguments that returns an object with measure(pose)")
         self._connect, self.source, self._start_s, self._clock = connect, source, start_s, clock
         self._own: Any = None
+        self.mounted_rad = 0.0
         self._zero_s = clock.monotonic() - start_s
         self._speed = Speed()
 

@@ -53,6 +53,11 @@ class SimulatedArm:
         Height of the sensor above the surface when reading, unless the pose gives one.
     last
         Last reading of an earlier run: the arm starts at its pose and time. None: it starts at rest, at time 0.
+
+    Attributes
+    ----------
+    mounted_rad
+        Always 0: it turns its sensor itself.
     """
 
     def __init__(
@@ -75,6 +80,7 @@ class SimulatedArm:
         self._light, self._scale, self._height_mm = light, scale, height_mm
         self.reach: Workspace = Reach() if reach is None else reach
         self.speed = Speed() if speed is None else speed
+        self.mounted_rad = 0.0
         self._home = Pose(*self.reach.rest_mm)
         self._pose, self._time_s = (self._home, 0.0) if last is None else (last.pose, last.time_s)
 

@@ -6,7 +6,17 @@ import math
 import numpy as np
 import pytest
 
-from probewise.arm import DryRun, LegoArm, Pose, Reading, carry_out, read_geometry, recording_of, shipped_geometry_path
+from probewise.arm import (
+    DryRun,
+    LegoArm,
+    Pose,
+    Reading,
+    carry_out,
+    read_geometry,
+    readings_of_recording,
+    recording_of,
+    shipped_geometry_path,
+)
 from probewise.errors import ParameterError, ReachError
 from probewise.recordings import paper_plan, read_recording, two_way_plan, write_recording
 
@@ -122,3 +132,11 @@ def test_a_recording_says_what_was_read_and_comes_back_from_its_file(tmp_path):
     np.testing.assert_array_equal(back.plan.covariates["battery_mv"], 7400.0 - np.arange(5))
     np.testing.assert_array_equal(back.plan.x_mm, plan.x_mm[:5])
     assert [back.plan.pattern_names[k] for k in back.plan.pattern] == [plan.pattern_names[k] for k in plan.pattern[:5]]
+
+
+def test_what_a_plan_commands_stays_in_rows_that_are_read_after_a_resumption():
+    rows = paper_plan().take(np.arange(4))
+    plan = dataclasses.replace(rows, covariates={"led": np.ones(4)})
+    readings = [Reading(40.0, Pose(0.0, 0.0), float(k)) for k in range(4)]
+    resumed = [*readings_of_recording(recording_of(plan, readings[:2])), *readings[2:]]
+    assert recording_of(plan, resumed).plan.covariates["led"].tolist() == [1.0] * 4

@@ -202,6 +202,8 @@ def _can_lift(arm: OwnInstrument | SimulatedArm) -> bool:
 def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
     """Build a recording of the plan's first rows with true places, orientations, times, battery voltage and heights.
 
+    A covariate that a reading lacks is the planned one, or NaN if none is planned.
+
     Parameters
     ----------
     plan
@@ -211,7 +213,12 @@ def recording_of(plan: Plan, readings: Sequence[Reading]) -> Recording:
     """
     rows = plan.take(np.arange(len(readings)))
     names = sorted({name for reading in readings for name in reading.covariates})
-    covariates = {name: np.array([reading.covariates.get(name, math.nan) for reading in readings]) for name in names}
+    covariates = {}
+    for name in names:
+        planned = rows.covariates.get(name, np.full(len(readings), math.nan))
+        covariates[name] = np.array(
+            [reading.covariates.get(name, own) for reading, own in zip(readings, planned.tolist(), strict=True)]
+        )
     taken = dataclasses.replace(
         rows,
         x_mm=np.array([reading.pose.x_mm for reading in readings]),

@@ -80,6 +80,20 @@ def test_rows_that_cannot_be_are_refused(changes, named):
     assert caught.value.name == named
 
 
+def test_rows_that_differ_have_names_that_differ():
+    rows = [
+        Row(**{name: value}) for name in ("width", "noise_sd") for value in (1.254, 1.25, 1.3, 1.3000001, 0.996, 0.7)
+    ]
+    assert len({row.name for row in rows}) == len(rows)
+    assert [rows[k].name.split(", ")[-1] for k in (0, 1, 2, 5, 9)] == [
+        "believed 1.254 times as wide",
+        "believed 25% too wide",
+        "believed 30% too wide",
+        "believed 30% too narrow",
+        "noise 1.3000001",
+    ]
+
+
 @pytest.mark.slow
 def test_other_processes_come_to_the_same(study, tmp_path):
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:

@@ -83,16 +83,19 @@ class Row:
 
     @property
     def name(self) -> str:
-        """Distribution of the circles, sensor model, and what else differs from the reference, in words."""
+        """Distribution of the circles, sensor model, and what else differs from the reference, in words.
+
+        Two rows that differ have different names, by which a study's file keeps their runs.
+        """
         words = [self.population, "SSF" if self.model == "ssf" else "naive"]
         if self.method == "paper":
             words.append("the paper's method" + (" to remaining evidence" if self.nested_stop == "remaining" else ""))
         elif self.utility != REFERENCE.utility:
             words.append(self.utility)
         if self.noise_sd != REFERENCE.noise_sd:
-            words.append(f"noise {self.noise_sd:g}")
+            words.append(f"noise {_exact_text(self.noise_sd)}")
         if self.width != REFERENCE.width:
-            words.append(f"believed {abs(self.width - 1):.0%} too {'wide' if self.width > 1 else 'narrow'}")
+            words.append(_width_in_words(self.width))
         if self.learn_sensor:
             words.append("learning it")
         if self.batch != REFERENCE.batch:
@@ -102,6 +105,18 @@ class Row:
     def settings(self) -> dict[str, Any]:
         """Return its fields as JSON values."""
         return asdict(self)
+
+
+def _exact_text(value: float) -> str:
+    """Return a number as text, in six digits if these are all."""
+    return text if float(text := f"{value:g}") == value else repr(float(value))
+
+
+def _width_in_words(width: float) -> str:
+    """Describe a wrong width: in whole percent if it is one, otherwise as a factor."""
+    if width != round(width, 2):
+        return f"believed {float(width)!r} times as wide"
+    return f"believed {abs(width - 1):.0%} too {'wide' if width > 1 else 'narrow'}"
 
 
 REFERENCE = Row()

@@ -45,6 +45,13 @@ def test_a_round_that_was_cut_is_the_round_that_was_not(tmp_path, monkeypatch):
     np.testing.assert_array_equal(resumed.readings, whole.readings)
 
 
+def test_an_instrument_that_fails_soon_loses_no_reading(tmp_path):
+    folder = RoundsFolder(tmp_path / "rounds", {"seed": 1}, resume=False)
+    with pytest.raises(Cut):
+        folder.record(1, few_rows(), "", take=cut_after(5))
+    assert folder.n_readings == 5
+
+
 def test_a_plan_that_was_written_decides(tmp_path):
     folder = RoundsFolder(tmp_path / "rounds", {"seed": 1}, resume=False)
     first = folder.record(1, few_rows(), "", take=TAKE)

@@ -82,13 +82,16 @@ class RoundsFolder:
         readings = readings_of_recording(read_recording(readings_file)) if readings_file.exists() else []
         kept_s = time.monotonic()
         progress(f"round {number}, readings", len(readings), len(plan))
-        for reading in take(number, plan, asked, tuple(readings)):
-            readings.append(reading)
-            progress(f"round {number}, readings", len(readings), len(plan))
-            if time.monotonic() - kept_s > _KEPT_AGAIN_S:
+        try:
+            for reading in take(number, plan, asked, tuple(readings)):
+                readings.append(reading)
+                progress(f"round {number}, readings", len(readings), len(plan))
+                if time.monotonic() - kept_s > _KEPT_AGAIN_S:
+                    write_recording(recorded(plan, readings), readings_file)
+                    kept_s = time.monotonic()
+        finally:  # an error or an interruption loses none of them
+            if readings:
                 write_recording(recorded(plan, readings), readings_file)
-                kept_s = time.monotonic()
-        write_recording(recorded(plan, readings), readings_file)
         return read_recording(readings_file)
 
     @property

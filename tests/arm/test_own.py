@@ -64,6 +64,14 @@ def test_a_reading_is_handed_on_as_it_is():
     assert entered(Own(reading)).measure(Pose(0.0, 0.0)) is reading
 
 
+def test_the_covariates_of_a_reading_of_its_own_become_floats():
+    known = {"lux": np.float32(0.5), "count": np.int64(3)}
+    reading = entered(Own(Reading(math.nan, Pose(1.0, 2.0), 4.0, known))).measure(Pose(0.0, 0.0))
+    assert [type(number) for number in reading.covariates.values()] == [float, float]
+    assert reading.covariates == {"lux": 0.5, "count": 3.0}
+
+
+HERE = Pose(1.0, 2.0)
 BAD = {
     "nothing": (None, "what measure returned is None; allowed: a finite number, or a dict"),
     "nan": (math.nan, "what measure returned is nan; allowed: a finite number"),
@@ -82,6 +90,10 @@ BAD = {
         {"value": 3, "orientation_deg": 90},
         "a name in what measure returned is 'orientation_deg'; allowed: .*orientation_rad",
     ),
+    "a Reading that is infinite": (Reading(math.inf, HERE, 1.0), "value of what measure returned is inf"),
+    "a Reading at no time": (Reading(1.0, HERE, math.nan), "time_s of what measure returned is nan"),
+    "a Reading nowhere": (Reading(1.0, Pose(math.nan, 2.0), 1.0), "x_mm of what measure returned is nan"),
+    "a Reading with a text": (Reading(1.0, HERE, 1.0, {"note": "ok"}), "note of what measure returned is 'ok'"),
 }
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import sys
 import time
@@ -196,7 +197,7 @@ class OwnInstrument:
 
     def _as_reading(self, found: object, pose: Pose) -> Reading:
         if isinstance(found, Reading):
-            return found
+            return _checked_reading(found)
         now_s = self._clock.monotonic() - self._zero_s
         if not isinstance(found, Mapping):
             return Reading(_checked_value("what measure returned", found), pose, now_s)
@@ -279,6 +280,18 @@ def _checked_value(name: str, found: object) -> float:
     if isinstance(number, bool) or not isinstance(number, Real) or not math.isfinite(number):
         raise ParameterError(name, found, _A_READING)
     return float(number)
+
+
+def _checked_reading(found: Reading) -> Reading:
+    """Return an instrument's own Reading, whose value may be NaN (missing), with its covariates as floats."""
+    if math.isinf(found.value):
+        raise ParameterError(
+            "value of what measure returned", found.value, "a finite number, or nan where it is missing"
+        )
+    for name, number in (("time_s", found.time_s), *((name, getattr(found.pose, name)) for name in _OF_THE_POSE)):
+        checked_finite_number(f"{name} of what measure returned", number)
+    known = {name: _checked_covariate(name, number) for name, number in found.covariates.items()}
+    return dataclasses.replace(found, covariates=known) if known else found
 
 
 def _checked_covariate(name: object, number: object) -> float:

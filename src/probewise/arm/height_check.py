@@ -74,10 +74,14 @@ def check_heights(curve: Sequence[HeightReading], others: Sequence[HeightReading
     ParameterError
         If there are too few heights or places, or the readings at the first place do not fall with the height.
     """
-    if len(curve) < LEAST_HEIGHTS:
-        raise ParameterError("heights", len(curve), f"{LEAST_HEIGHTS} or more at the first place")
+    n_heights = len({look.height_mm for look in curve})
+    if n_heights < LEAST_HEIGHTS:
+        raise ParameterError("heights", n_heights, f"{LEAST_HEIGHTS} or more at the first place")
     if not others:
         raise ParameterError("places", 1, "two or more")
+    for look in (*curve, *others):
+        if not look.error > 0:
+            raise ParameterError("error", look.error, "greater than 0, the standard error of each reading")
     height, value, error = (
         np.array([getattr(look, name) for look in curve]) for name in ("height_mm", "value", "error")
     )

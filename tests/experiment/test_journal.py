@@ -167,6 +167,13 @@ def test_a_covariate_that_one_reading_lacks_is_nan_there():
     assert np.isnan(recording.plan.covariates["battery_mv"]).tolist() == [False, True]
 
 
+def test_the_height_that_was_commanded_is_a_covariate_unless_the_reading_has_its_own():
+    pose = Pose(0.0, 0.0, height_mm=20.0)
+    told = [Reading(5.0, pose, 1.0), Reading(5.0, pose, 2.0, {"height_mm": 20.5}), Reading(5.0, Pose(0.0, 0.0), 3.0)]
+    height_mm = recording_of(told).plan.covariates["height_mm"]
+    np.testing.assert_array_equal(height_mm, [20.0, 20.5, np.nan])
+
+
 @dataclass(frozen=True)
 class Holder:
     values: object

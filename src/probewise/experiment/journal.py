@@ -111,10 +111,12 @@ def recording_of(
 
     Returns
     -------
-    A recording of n_points = len(readings) rows; a covariate that some readings lack is NaN there.
+    A recording of n_points = len(readings) rows; a covariate that some readings lack is NaN there. The height of a pose
+    is the covariate `height_mm`, unless the reading has its own.
     """
     n = len(readings)
-    names = sorted({name for reading in readings for name in reading.covariates})
+    covariates = [_covariates_with_height(reading) for reading in readings]
+    names = sorted({name for known in covariates for name in known})
     zeros = np.zeros(n, dtype=np.int64)
     plan = Plan(
         x_mm=_value_per_reading(readings, lambda r: r.pose.x_mm),
@@ -127,11 +129,17 @@ def recording_of(
         pattern_names=(PATTERN,),
         patterns={} if patterns is None else patterns,
         covariates={
-            name: _value_per_reading(readings, lambda r, name=name: r.covariates.get(name, math.nan)) for name in names
+            name: np.array([known.get(name, math.nan) for known in covariates], dtype=np.float64) for name in names
         },
         instrumentation=Instrumentation() if instrumentation is None else instrumentation,
     )
     return Recording(plan, _value_per_reading(readings, lambda r: r.value), source)
+
+
+def _covariates_with_height(reading: Reading) -> Mapping[str, float]:
+    """Return a reading's covariates, with the commanded height of its pose where the instrument tells none."""
+    height_mm = reading.pose.height_mm
+    return reading.covariates if height_mm is None else {"height_mm": height_mm, **reading.covariates}
 
 
 def _value_per_reading(readings: Sequence[Reading], value: Any) -> FloatArray:

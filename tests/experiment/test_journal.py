@@ -174,6 +174,21 @@ def test_the_height_that_was_commanded_is_a_covariate_unless_the_reading_has_its
     np.testing.assert_array_equal(height_mm, [20.0, 20.5, np.nan])
 
 
+@pytest.mark.parametrize("key", [None, "x", [1.5], [-1]])
+def test_a_journal_without_a_usable_seed_is_refused(small, tmp_path, key):
+    experiment = small.experiment()
+
+    class Own:
+        def measure(self, pose):
+            return 10.0
+
+    run(Own(), experiment, rng=np.random.default_rng(5), max_readings=1, journal=tmp_path / "j")
+    first, *rest = (tmp_path / "j").read_text().split("\n")
+    (tmp_path / "j").write_text("\n".join([json.dumps({**json.loads(first), "spawn_key": key}), *rest]))
+    with pytest.raises(FileError, match="spawn_key is"):
+        run(Own(), experiment, rng=np.random.default_rng(5), max_readings=2, journal=tmp_path / "j")
+
+
 @dataclass(frozen=True)
 class Holder:
     values: object

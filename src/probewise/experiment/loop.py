@@ -19,7 +19,7 @@ import numpy as np
 from probewise._kinds import checked_path, checked_whole, require_callable, require_kind, require_rng
 from probewise.arm.instrument import Instrument, Reading
 from probewise.arm.own_instrument import Measures, instrument_of, require_measures
-from probewise.errors import DoubtfulResultWarning, LinkError, ParameterError
+from probewise.errors import DoubtfulResultWarning, FileError, LinkError, ParameterError, shown
 from probewise.experiment.acquisition import ArmReachAndTravel, next_poses, predict_and_rate_readings
 from probewise.experiment.arm_error import arm_error_in_posterior, draw_arm_error_shifts
 from probewise.experiment.configuration import Experiment, largest_sd_mm
@@ -281,7 +281,7 @@ def explore(
     settings = {} if path is None else experiment.settings(seed) | dict(about or {})  # settings may lack a name
     if before is not None:
         require_same_settings(before, settings)
-        seed = np.random.SeedSequence(seed.entropy, spawn_key=tuple(before.settings["spawn_key"]))
+        seed = _seed_of_journal(before, seed)
         if len(before.entries) > max_readings:
             raise ParameterError(
                 "max_readings", max_readings, f"the {len(before.entries)} readings the journal holds, or more"
@@ -387,6 +387,15 @@ def _run_seed(rng: np.random.Generator) -> np.random.SeedSequence:
     if not isinstance(seed, np.random.SeedSequence):
         seed = np.random.SeedSequence([int(word) for word in rng.integers(2**32, size=4)])
     return seed.spawn(1)[0]
+
+
+def _seed_of_journal(journal: Journal, seed: np.random.SeedSequence) -> np.random.SeedSequence:
+    """Return the seed of the run in a journal, a child of the same parent as `seed`; raise FileError without one."""
+    key = journal.settings.get("spawn_key")
+    if not isinstance(key, list) or not all(isinstance(word, int) and word >= 0 for word in key):
+        allowed = "a list of whole numbers, as explore writes it"
+        raise FileError(journal.path, f"spawn_key is {shown(key)}", allowed, row=1)
+    return np.random.SeedSequence(seed.entropy, spawn_key=tuple(key))
 
 
 def _rng_of_reading(seed: np.random.SeedSequence, number: int) -> np.random.Generator:

@@ -299,6 +299,21 @@ def test_only_places_within_reach_are_measured(small):
     assert arm.reachable(np.array([[p.x_mm, p.y_mm] for p in arm.poses])).all()
 
 
+def test_a_reading_whose_true_place_is_just_beyond_the_reach_ends_no_run(small):
+    class Own:
+        def reachable(self, places_mm):
+            return places_mm[:, 0] >= 100.0
+
+        def travel_s(self, start, places_mm):
+            return np.where(self.reachable(places_mm), 2.0, np.nan)
+
+        def measure(self, pose):
+            return {"value": 10.0, "x_mm": 99.9}
+
+    experiment = small.experiment(utility=PerSecond())
+    assert len(run(Own(), experiment, rng=np.random.default_rng(3), max_readings=2).steps) == 2
+
+
 def test_a_field_out_of_reach_is_an_error(small):
     with pytest.raises(ReachError, match="reachable places is 0"):
         next(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Self
@@ -79,7 +80,10 @@ def predict_and_rate_readings(
     else:
         here = np.array([[at.pose.x_mm, at.pose.y_mm]])
         read_s = float(field.travel_s(at.pose, here)[0])
-        cost_s = designs.cost_s(field.travel_s(at.pose, experiment.grid.places_mm), read_s)
+        travel_s = field.travel_s(at.pose, experiment.grid.places_mm)
+        if math.isnan(read_s):  # the true place, just beyond the reach
+            read_s = float(travel_s[field.reachable].min())
+        cost_s = designs.cost_s(travel_s, read_s)
     plan = designs.plan(PATTERN, time_s=0.0 if at is None else at.time_s)
     standing = np.tile(field.orientation_rad, len(designs.combinations))
     plan = dataclasses.replace(

@@ -47,3 +47,9 @@ def test_tables_without_runs_are_a_run_each():
     first, second = RunTable({"x": [1.0, 2.0]}), RunTable({"x": [3.0]})
     joined, _ = join_tables([first, second], ["a.csv", "b.csv"])
     assert joined.scan_names == ("a.csv", "b.csv")
+
+
+def test_a_renamed_run_is_not_merged_with_another_run_of_its_table():
+    joined, _ = join_tables([runs((20.0,)), runs((25.0, 26.0), names=("1", "1 (2)"))], ["a.csv", "b.csv"])
+    assert joined.scan_names == ("1", "1 (3)", "1 (2)")
+    assert len(set(joined.scan.tolist())) == 3

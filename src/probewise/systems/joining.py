@@ -87,11 +87,11 @@ def _run_names_by_row(tables: Sequence[RunTable], sources: Sequence[str], *, nam
     """Yield the name of each row's run, with a number appended if a run of an earlier table has that name."""
     taken: set[str] = set()
     for table, source in zip(tables, sources, strict=True):
-        own = {}
-        for name in table.scan_names if named else (source,):
-            own[name] = unused_name(name, taken)
+        names, own = table.scan_names if named else (source,), {}
+        for name in names:
+            # A new name must not be one of this table's own either, which follows unchanged.
+            own[name] = unused_name(name, taken | set(own.values()) | (set(names) - {name}))
         taken |= set(own.values())
-        names = table.scan_names if named else (source,)
         yield from (own[names[k]] for k in table.scan.tolist())
 
 

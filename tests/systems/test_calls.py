@@ -125,3 +125,46 @@ def test_a_law_that_raises_for_some_parameters_is_counted_and_the_others_are_int
     np.testing.assert_allclose(found[0], np.exp(-0.8 * X), rtol=1e-5)
     assert np.isnan(found[1]).all()
     assert system.tally.n_failed == 1
+
+
+@pytest.mark.parametrize("vectorized", [False, True])
+@pytest.mark.parametrize(
+    "simulate",
+    [
+        lambda p, data: p["a"] * (data["x"] - data["x"][0]) + p["b"],
+        lambda p, data: p["a"] * (data["x"] - data["x"].mean()) + p["b"],
+        lambda p, data: p["a"] * np.cumsum(data["x"]) + p["b"],
+    ],
+    ids=["first row", "mean", "running sum"],
+)
+def test_a_function_that_looks_at_all_rows_of_a_column_sees_those_of_one_sample_where_an_effect_changes_them(
+    simulate, vectorized
+):
+    system, _ = _system(simulate, vectorized=vectorized)
+    parameters = {"a": np.array([[1.0], [2.0], [3.0]]), "b": np.array([[0.0], [1.0], [0.5]])}
+    changed = X + np.array([[0.0], [0.1], [0.2]]) * X**2
+    apart = [simulate({name: v[k] for name, v in parameters.items()}, {"x": changed[k]}) for k in range(3)]
+    np.testing.assert_allclose(system.caller(parameters, {"x": changed}), apart)
+
+
+def test_an_elementwise_function_is_called_once_for_all_samples_of_a_changed_column():
+    system, _ = _system(_elementwise)
+    system.caller.n_calls = 0
+    system.caller({"a": np.ones((3, 1)), "b": np.ones((3, 1))}, {"x": X + np.arange(3.0)[:, None]})
+    assert system.caller.n_calls == 1
+
+
+@pytest.mark.parametrize("vectorized", [False, True])
+def test_a_sample_for_which_a_broadcasting_function_raises_leaves_the_others_as_they_are(vectorized):
+    def simulate(p, data):
+        if np.any(p["a"] > 1.2):
+            raise ValueError("too large")
+        return p["a"] + p["b"] * data["x"]
+
+    system, table = _system(simulate, vectorized=vectorized)
+    theta = np.array([[1.0, 1.0], [1.8, 1.0], [0.7, 1.0], [0.6, 1.0], [1.9, 1.0]])
+    system.caller.n_failed = 0
+    readings = system.chain(table, ()).predict(theta, table)
+    np.testing.assert_allclose(readings[[0, 2, 3]], theta[[0, 2, 3], :1] + X)
+    assert np.isnan(readings[[1, 4]]).all()
+    assert system.caller.n_failed == 2

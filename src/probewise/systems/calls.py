@@ -61,6 +61,7 @@ class Caller:
     name: str = "simulate"
     on_call: Callable[[], None] = lambda: None
     _known: dict[bytes, FloatArray] = field(default_factory=dict, repr=False)
+    _taken_together: dict[frozenset[str], bool] = field(default_factory=dict, repr=False)
 
     @classmethod
     def from_trial_calls(
@@ -89,7 +90,7 @@ class Caller:
         one = cls(simulate, broadcasts=False, by_row=frozenset(per_run), name=name)
         if broadcasts:
             together = cls(simulate, broadcasts=True, name=name)
-            if not np.isfinite(together(samples, columns, strict=True)).any():
+            if not np.isfinite(_readings_of_some_samples(together, samples, columns)).any():
                 raise ParameterError(name, "NaN at every place of the prior that was tried", "finite readings")
             return together
         alone = one(samples, columns, strict=True)
@@ -115,15 +116,16 @@ class Caller:
         n_points = max(np.shape(v)[-1] for v in columns.values())
         with np.errstate(all="ignore"):
             if self.broadcasts:
-                self._count_call()
-                try:
-                    readings = np.asarray(self.simulate(dict(parameters), dict(columns)), dtype=np.float64)
-                except Exception:
-                    if strict:
-                        raise
-                    self.n_failed += n_samples
-                    return np.full((n_samples, n_points), np.nan)
-                return _checked_readings(readings, (n_samples, n_points), self.name)
+                if self._takes_changed_columns_together(parameters, columns):
+                    return self._call_together(parameters, columns, (n_samples, n_points), strict=strict)
+                return np.concatenate(
+                    [
+                        self._call_together(
+                            *_sample_with_plain_columns(parameters, columns, k), (1, n_points), strict=strict
+                        )
+                        for k in range(n_samples)
+                    ]
+                )
             out, first_error = np.full((n_samples, n_points), np.nan), None
             for k in range(n_samples):
                 own = {name: _value_of_sample(values, k) for name, values in parameters.items()}
@@ -141,6 +143,67 @@ class Caller:
             if strict and first_error is not None and not np.isfinite(out).any():
                 raise first_error
         return out
+
+    def _call_together(
+        self,
+        parameters: Mapping[str, FloatArray],
+        columns: Mapping[str, NDArray[Any]],
+        shape: tuple[int, int],
+        *,
+        strict: bool,
+    ) -> FloatArray:
+        """Call a broadcasting `simulate` once; where it raises, halve the samples until those that fail are alone."""
+        n_samples = shape[0]
+        self._count_call()
+        try:
+            readings = np.asarray(self.simulate(dict(parameters), dict(columns)), dtype=np.float64)
+        except Exception:
+            if strict:
+                raise
+            if n_samples == 1:
+                self.n_failed += 1
+                return np.full(shape, np.nan)
+            middle = n_samples // 2
+            halves = (slice(0, middle), middle), (slice(middle, n_samples), n_samples - middle)
+            return np.concatenate(
+                [
+                    self._call_together(
+                        _values_of_samples(parameters, own),
+                        _values_of_samples(columns, own),
+                        (n, shape[1]),
+                        strict=False,
+                    )
+                    for own, n in halves
+                ]
+            )
+        return _checked_readings(readings, shape, self.name)
+
+    def _takes_changed_columns_together(
+        self, parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
+    ) -> bool:
+        """Return whether samples may be simulated together if some columns, (n_samples, n_points), differ among them.
+
+        A `simulate` that takes a column's mean, sum or first row means that of one sample. Two samples are tried with
+        each set of changed columns, together and apart.
+        """
+        changed = frozenset(name for name, values in columns.items() if np.ndim(values) == 2)
+        if not changed:
+            return True
+        if changed not in self._taken_together:
+            trial = Caller(self.simulate, broadcasts=True, name=self.name)
+            own = {name: values[[0, -1]] for name, values in parameters.items()}
+            given = {name: _two_unlike_rows(columns[name][0]) if name in changed else columns[name] for name in columns}
+            shape = 2, max(np.shape(v)[-1] for v in columns.values())
+            try:
+                together = trial._call_together(own, given, shape, strict=True)
+                apart = [
+                    trial._call_together(*_sample_with_plain_columns(own, given, k), (1, shape[1]), strict=True)
+                    for k in range(2)
+                ]
+                self._taken_together[changed] = _nearly_equal(together, np.concatenate(apart))
+            except Exception:
+                self._taken_together[changed] = False
+        return self._taken_together[changed]
 
     def _cached_call(self, own: Mapping[str, Any], columns: Mapping[str, NDArray[Any]], n_points: int) -> FloatArray:
         """Call `simulate`, or return its cached result: effects on the readings do not change its arguments."""
@@ -208,6 +271,21 @@ class ProgressWithCallCount:
         self._progress(stage, done, total, f"{note}, {calls}" if note else calls)
 
 
+def _readings_of_some_samples(
+    together: Caller, samples: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]]
+) -> FloatArray:
+    """Return the readings of samples, NaN where `simulate` raises; its error if it raises for all of them."""
+    try:
+        return together(samples, columns, strict=True)
+    except ShapeError:
+        raise
+    except Exception:
+        readings = together(samples, columns)
+        if not np.isfinite(readings).any():
+            raise
+        return readings
+
+
 def _names_taken_by_row(
     one: Caller,
     samples: Mapping[str, FloatArray],
@@ -235,6 +313,25 @@ def _value_of_sample(values: FloatArray, k: int) -> Any:
     """Return a parameter's value in sample k, a number or one per row; the same for all if there is only one."""
     own = values[min(k, len(values) - 1)]
     return float(own[0]) if own.shape == (1,) else own
+
+
+def _values_of_samples(values: Mapping[str, Any], samples: slice) -> dict[str, Any]:
+    """Return the values of some samples; arrays with one axis, or with one sample, are the same for all."""
+    return {name: v[samples] if np.ndim(v) == 2 and len(v) > 1 else v for name, v in values.items()}
+
+
+def _sample_with_plain_columns(
+    parameters: Mapping[str, FloatArray], columns: Mapping[str, NDArray[Any]], k: int
+) -> tuple[dict[str, FloatArray], dict[str, NDArray[Any]]]:
+    """Return the parameters of sample k, (1, 1 or n_points) each, and its columns, (n_points,) each."""
+    own = {name: v[[min(k, len(v) - 1)]] for name, v in parameters.items()}
+    return own, {name: v[min(k, len(v) - 1)] if np.ndim(v) == 2 else v for name, v in columns.items()}
+
+
+def _two_unlike_rows(values: FloatArray) -> FloatArray:
+    """Return a column (n_points,) and a slightly different one in the same order, (2, n_points)."""
+    size = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
+    return np.stack([values, 1.01 * values + 0.01 * size])
 
 
 def _chebyshev_nodes(values: FloatArray) -> FloatArray:

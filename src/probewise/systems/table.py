@@ -118,6 +118,19 @@ class RunTable:
         """Row numbers of each run, in the order of the table."""
         return [np.flatnonzero(self.scan == k) for k in range(len(self.scan_names))]
 
+    def interpolated_within_runs(self, values: FloatArray) -> FloatArray:
+        """Return a column, (n_points,), with its missing values interpolated linearly from row to row of each run.
+
+        Beyond the first and the last value of a run, that value holds; in a run without one it is the column's median.
+        """
+        there = np.isfinite(values)
+        out = np.where(there, values, np.median(values[there]))
+        for own in self.rows_by_scan():
+            known = np.flatnonzero(there[own])
+            if known.size:
+                out[own] = np.interp(np.arange(len(own)), known, values[own[known]])
+        return out
+
     def take(self, rows: IntArray | BoolArray) -> RunTable:
         """Return a table of these rows, given by numbers or by a mask, in their order."""
         return replace(self, columns={name: values[rows] for name, values in self.columns.items()})

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from probewise.diagnosis import diagnose_system
-from probewise.systems import Law, Simulator
+from probewise.diagnosis.system.diagnose import prepare_system
+from probewise.systems import Law, Simulator, table_for
 
 _N = 40
 _X, _T = np.linspace(0.0, 1.0, _N), 0.5 * np.arange(_N)
@@ -39,3 +40,32 @@ def test_an_odd_table_gets_a_verdict(name):
     diagnosis = diagnose_system(simulator, table, rng=np.random.default_rng(1))
     assert diagnosis.verdict in ("clean", "named", "noise", "cannot_tell", "unknown")
     assert sum(h.probability for h in diagnosis.judged.hypotheses) == pytest.approx(1.0)
+
+
+def _table_with_a_gap(*, law):
+    time, heat = 0.5 * np.arange(60), 2.0 + np.sin(0.3 * np.arange(60))
+    heat_with_gap = np.where(np.arange(60) == 12, np.nan, heat)
+    noise = 0.02 * np.random.default_rng(2).standard_normal(60)
+    if not law:
+        simulator = Simulator("y", "V", {"a": (0, 5)}, simulate=lambda p, u: p["a"] * u["heat"], time="t")
+        return simulator, {"t": time, "heat": heat_with_gap, "y": 3.0 * heat + noise, "run": np.repeat([1.0, 2.0], 30)}
+    simulator = Simulator(
+        "y",
+        "V",
+        {"a": (0, 5)},
+        law=Law({"s": 1.0}, lambda s, p, u: {"s": p["a"] * u["heat"] - s["s"]}),
+        time="t",
+        run="run",
+    )
+    state = 3.0 * heat.mean() + np.cos(time) + noise
+    return simulator, {"t": time, "heat": heat_with_gap, "y": state, "run": np.repeat([1.0, 2.0], 30)}
+
+
+@pytest.mark.parametrize("law", [False, True])
+def test_a_missing_input_leaves_out_its_readings_and_no_effect(law):
+    simulator, table = _table_with_a_gap(law=law)
+    whole = {**table, "heat": np.where(np.isnan(table["heat"]), 1.5, table["heat"])}
+    with_gap, without = (prepare_system(simulator, table_for(simulator, each)) for each in (table, whole))
+    assert set(with_gap.effects) == set(without.effects)
+    assert np.flatnonzero(~with_gap.recording.usable).tolist() == (list(range(13, 30)) if law else [12])
+    assert np.isfinite(with_gap.apparatus.about.predicted).all()

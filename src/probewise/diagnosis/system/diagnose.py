@@ -20,7 +20,7 @@ from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
 from probewise.effects import NamedEffect
 from probewise.errors import ParameterError
 from probewise.progress import Progress, silent
-from probewise.recordings.plan import Recording
+from probewise.recordings.plan import Plan, Recording
 from probewise.systems import ProgressWithCallCount, RunRecording, RunTable, Simulator, System, as_recording, table_for
 from probewise.systems.calls import IntegrationTally
 from probewise.systems.forms import ReferenceFit
@@ -120,7 +120,9 @@ def prepare_system(
     """Fit the simulator, and build what the engine needs; effects are scaled to the fit, none unless `with_effects`."""
     recording = replace(recording_of(simulator, table), source=source or simulator.source, notes=tuple(notes))
     system = System.of(simulator, table)
-    recording = without_unpredictable_readings(system, recording)
+    plan, recording = recording.plan, without_unpredictable_readings(system, recording)
+    if recording.plan is not plan:
+        table = replace(table, columns=cast(RunTable, recording.plan).columns)
     recording, stop = without_readings_at_stop(simulator, table, recording)
     told = _progress_with_call_count(progress, system)
     told("fitting the simulator")
@@ -141,6 +143,9 @@ def _progress_with_call_count(progress: Progress, system: System) -> Progress:
 def without_unpredictable_readings(system: System, recording: RunRecording) -> RunRecording:
     """Leave out, with a note, the readings of rows in which a missing column makes a prediction impossible.
 
+    If there is such a row, what columns lack is interpolated from the other rows of the run, so that effects with a
+    memory, such as backlash, are defined in the rows after it.
+
     Raises
     ------
     ParameterError
@@ -149,8 +154,9 @@ def without_unpredictable_readings(system: System, recording: RunRecording) -> R
     table = cast(RunTable, recording.plan)
     tried = system.chain(table, ()).predict(system.theta(system.starts), table)
     there = np.isfinite(tried)
-    lost = ~there[there.any(axis=1)].any(axis=0) & recording.usable if there.any() else recording.usable
-    if not lost.any():
+    unpredictable = ~there[there.any(axis=1)].any(axis=0) if there.any() else np.ones(len(table), dtype=np.bool_)
+    lost = unpredictable & recording.usable
+    if not unpredictable.any():
         return recording
     missing = np.zeros(len(table), dtype=np.bool_)
     for values in table.covariates.values():
@@ -164,7 +170,19 @@ def without_unpredictable_readings(system: System, recording: RunRecording) -> R
         where = f"no finite reading in {len(wrong)} of {len(table)} rows, first in row {wrong[0] + 2}"
         raise ParameterError(what, where, "a finite reading in each row somewhere in the prior")
     note = f"{int(lost.sum())} readings left out: a column that the simulator reads is missing there"
-    return replace(recording, readings=np.where(lost, np.nan, recording.readings), notes=(*recording.notes, note))
+    filled = table.with_columns(
+        {
+            name: table.interpolated_within_runs(values)
+            for name, values in table.covariates.items()
+            if name not in (system.simulator.reading, system.simulator.noise.sd)
+        }
+    )
+    return replace(
+        recording,
+        plan=cast(Plan, filled),
+        readings=np.where(lost, np.nan, recording.readings),
+        notes=(*recording.notes, note) if lost.any() else recording.notes,
+    )
 
 
 def without_readings_at_stop(

@@ -7,7 +7,8 @@ import pytest
 from heater import SIMULATOR, fitted, runs
 
 from probewise.errors import DoubtfulResultWarning, ParameterError
-from probewise.systems import FittedSystem, predict_system, write_system_prediction
+from probewise.systems import FittedSystem, RunTable, Simulator, predict_system, write_system_prediction
+from probewise.systems.forms.rebinding import Recorded
 
 RNG = 7
 
@@ -98,3 +99,36 @@ def test_the_density_of_a_new_run_does_not_hang_on_which_starts_were_drawn():
         found = predicted(model, dataclasses.replace(table, columns=columns))
         expected = -0.5 * ((reading - 20) / 5) ** 2 - np.log(5 * np.sqrt(2 * np.pi))
         assert abs(found.log_density[0] - expected) < 0.25
+
+
+def _line_with(effect, **sizes):
+    """Return y = 3 x with an effect of given size, about a table of x, the temperature and y."""
+    t = np.arange(40.0)
+    table = RunTable({"t": t, "x": np.sin(t / 5) + 2, "room": 20 + np.cos(t / 7), "y": 3 * (np.sin(t / 5) + 2)}, "t")
+    simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], time="t")
+    samples = np.tile([3.0, *sizes.values()], (500, 1))
+    names = ("a", *(f"{effect}.{name}" for name in sizes))
+    known = Recorded(table, table.columns["y"])
+    return FittedSystem(simulator, names, samples, np.full(500, 0.1), effects=(effect,), known=known), table
+
+
+@pytest.mark.parametrize("column", [np.full(40, np.nan), np.array(["warm"] * 40)], ids=["empty", "texts"])
+def test_a_column_without_numbers_that_an_effect_reads_is_refused_by_name(column):
+    model, table = _line_with("sensitivity:room", a=1.0)
+    with pytest.raises(ParameterError, match=r"room.*numbers in this column"):
+        predicted(model, table.with_columns({"room": column}))
+
+
+def _formula_of_the_room_temperature():
+    _, table = _line_with("sensitivity:room", a=1.0)
+    middle = f"{np.mean(table.columns['room']):.6g}"
+    return f"formula:reading:y:(room - {float(middle):.4g})^2"
+
+
+def test_a_formula_needs_the_column_in_it_and_no_reading():
+    model, table = _line_with(_formula_of_the_room_temperature(), a=1.0)
+    bare = dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "y"})
+    np.testing.assert_array_equal(predicted(model, bare).mean, predicted(model, table).mean)
+    lacking = dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "room"})
+    with pytest.raises(ParameterError, match="room"):
+        predicted(model, lacking)

@@ -13,7 +13,7 @@ import numpy as np
 from probewise._arrays import BoolArray, FloatArray
 from probewise._display import ShowsItself
 from probewise._kinds import require_rng
-from probewise.effects import EFFECTS, NamedEffect, NoisePerRun, PredictiveMixture, RandomWalk
+from probewise.effects import AGAIN, EFFECTS, PROPOSAL, NamedEffect, NoisePerRun, PredictiveMixture, RandomWalk
 from probewise.errors import DoubtfulResultWarning, ParameterError
 from probewise.progress import Progress, silent
 from probewise.recordings import Instrumentation, write_text_atomically
@@ -30,6 +30,7 @@ from probewise.systems.table import RunRecording, RunTable, relative_sds_of_colu
 
 _FEW = 20  # samples used to find rows that cannot be predicted
 _BLOCK = 2_000_000  # numbers in memory for one block of samples
+_NOT_COLUMNS = {"level", "time", "run"}  # where the residual of a formula is visible
 _SOME = 200  # samples used to estimate the scatter of predictions in each row
 
 
@@ -197,16 +198,17 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
     """
     forms: Mapping[str, Any] = {}
     if fitted.known is not None:
-        lacking = _target_columns(fitted.effects, fitted.known.table) - set(table.columns)
+        new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
+        forms = rebind_forms(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
+        lacking = _columns_of_effects(fitted, forms) - set(table.covariates)
         if lacking:
             name = min(lacking)
             raise ParameterError(
                 "columns",
                 name,
-                f"a table with this column, which an effect of the model reads; it has {', '.join(table.columns)}",
+                "a table with numbers in this column, which an effect of the model reads; "
+                f"it has {', '.join(table.columns)}",
             )
-        new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
-        forms = rebind_forms(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
     out = []
     for name in fitted.effects:
         if name in forms:
@@ -223,9 +225,14 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
     return cast(list[NamedEffect[Any]], out)
 
 
-def _target_columns(effects: Sequence[str], table: RunTable) -> set[str]:
-    """Return the names of the recording's columns that effects are bound to, from the effects' names."""
-    return {part for name in effects for part in name.split(":")[1:] if part in table.columns}
+def _columns_of_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:
+    """Return the names of the recording's columns of numbers that effects read: targets, and those in formulas."""
+    assert fitted.known is not None
+    known_names = [name for name in fitted.effects if not name.startswith(PROPOSAL)]
+    named = {part for name in known_names for part in name.removesuffix(AGAIN).split(":")[1:]}
+    in_formulas = {c for name, form in forms.items() if name.startswith(PROPOSAL) for c in form.covariates}
+    columns = fitted.known.table.covariates.keys() - {fitted.simulator.reading}
+    return columns & (named | (in_formulas - _NOT_COLUMNS))
 
 
 def _kernel_width(chain: SystemChain, theta: FloatArray, table: RunTable) -> FloatArray:

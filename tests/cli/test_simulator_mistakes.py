@@ -38,6 +38,8 @@ FILES = {
     ),
     "a control that the table lacks": (('["power_w"]\nnoise', '["powr_w"]\nnoise'), "controls is 'powr_w'"),
     "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
+    "a zero that is no number": (('"sd": 0.05', '"zero": "0.5"'), "noise[\"zero\"] is '0.5'; allowed: a finite number"),
+    "a zero that is NaN": (('"sd": 0.05', '"zero": float("nan")'), 'noise["zero"] is nan; allowed: a finite number'),
     "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "row 9: is no Python"),
     "no simulator": (("def simulate", "def simulat"), "simulate, rates is 'neither'"),
     "runs that are not named": (
@@ -70,6 +72,14 @@ TABLES = {
 @pytest.mark.parametrize(("table", "said"), TABLES.values(), ids=TABLES)
 def test_a_mistake_in_the_table_is_one_line(capsys, tmp_path, table, said):
     assert said in refused(capsys, tmp_path, FILE, table=table)
+
+
+@pytest.mark.parametrize("start", ["None", "float('nan')", "[20.0, 21.0]"])
+def test_a_state_that_starts_at_no_number_is_refused_by_name(capsys, tmp_path, start):
+    law = FILE.partition("def simulate")[0] + (
+        f'states = {{"temp_c": {start}}}\n\ndef rates(s, p, u):\n    return {{"temp_c": -s["temp_c"]}}\n'
+    )
+    assert "states['temp_c'] is " in refused(capsys, tmp_path, law)
 
 
 def test_a_law_that_asks_for_a_state_that_is_none_is_told_where(capsys, tmp_path):

@@ -78,6 +78,8 @@ class Noise:
             raise ParameterError('noise["sd"]', self.sd, "a number greater than 0, or the name of a column")
         if self.step is not None and not 0 < self.step < np.inf:
             raise ParameterError('noise["step"]', self.step, "greater than 0")
+        if not _is_finite_number(self.zero):
+            raise ParameterError('noise["zero"]', self.zero, "a finite number, the reading of nothing")
         low, high = self.range
         if low is not None and high is not None and not low < high:
             raise ParameterError('noise["range"]', self.range, "(low, high), low < high")
@@ -216,7 +218,7 @@ class Simulator:
             if self.time is None:
                 raise ParameterError("time", None, "the column of time, which rates are integrated over")
             for state, start in self.law.states.items():
-                if isinstance(start, str) and start not in self.parameters:
+                if not (start in self.parameters if isinstance(start, str) else _is_finite_number(start)):
                     raise ParameterError(
                         f"states[{state!r}]", start, f"a number or a parameter: {', '.join(self.parameters)}"
                     )
@@ -259,6 +261,11 @@ def parse_prior(name: str, given: object) -> Marginal:
         return kinds[kind](float(numbers[0]), float(numbers[1]))
     except ParameterError as error:
         raise ParameterError(f"parameters[{name!r}]", given, f"{error.allowed}: a prior with mass") from error
+
+
+def _is_finite_number(value: object) -> bool:
+    """Return whether a value is a finite number, also an array of one."""
+    return np.size(value) == 1 and np.asarray(value).dtype.kind in "biuf" and bool(np.isfinite(np.asarray(value)).all())
 
 
 def _is_number(value: object) -> bool:

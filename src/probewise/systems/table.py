@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from numbers import Real
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -176,6 +177,8 @@ def _checked_column(name: str, values: Any) -> NDArray[Any]:
     array = np.asarray(values)
     if array.ndim != 1:
         raise ShapeError(f"column {name!r} has shape {array.shape}; allowed: one axis, one value for each row")
+    if array.dtype == object and all(value is None or isinstance(value, Real) for value in array.tolist()):
+        array = array.astype(np.float64)  # None is missing, NaN
     if array.dtype.kind in "biuf":
         return read_only_floats(array)
     texts = np.array([str(value) for value in array.tolist()])

@@ -40,6 +40,10 @@ FILES = {
     "a noise that the table lacks": (('"sd": 0.05', '"sd": "u_c"'), "noise[\"sd\"] is 'u_c'"),
     "a zero that is no number": (('"sd": 0.05', '"zero": "0.5"'), "noise[\"zero\"] is '0.5'; allowed: a finite number"),
     "a zero that is NaN": (('"sd": 0.05', '"zero": float("nan")'), 'noise["zero"] is nan; allowed: a finite number'),
+    "a range that ends at no number": (('"sd": 0.05', '"range": (0, "5")'), "noise[\"range\"] is (0, '5')"),
+    "a range that ends at NaN": (('"sd": 0.05', '"range": (float("nan"), None)'), 'noise["range"] is (nan, None)'),
+    "an sd that is a list": (('"sd": 0.05', '"sd": [0.05]'), 'noise["sd"] is [0.05]'),
+    "a negative sd of NumPy": (('"sd": 0.05', '"sd": np.int64(-1)'), 'noise["sd"] is'),
     "what is no Python": (("def simulate(p, data):", "def simulate(p, data)"), "row 9: is no Python"),
     "no simulator": (("def simulate", "def simulat"), "simulate, rates is 'neither'"),
     "runs that are not named": (
@@ -117,6 +121,19 @@ def test_a_row_in_which_an_input_is_missing_is_left_out_and_noted():
     )
     assert prepared.recording.notes == ("1 readings left out: a column that the simulator reads is missing there",)
     assert 3 not in prepared.usable_rows
+
+
+def test_an_extra_effect_has_the_priors_of_a_file_and_a_finite_null():
+    from probewise.errors import ParameterError
+    from probewise.priors import Uniform
+    from probewise.systems import Extra, Simulator
+
+    def simulator(extra):
+        return Simulator("y", "V", {"a": (0, 1)}, simulate=lambda p, u: p["a"] * u["x"], extra={"drag": extra})
+
+    assert simulator(Extra((0, 0.3), 0.0, "drag of {value}")).extra["drag"].prior == Uniform(0, 0.3)
+    with pytest.raises(ParameterError, match="null"):
+        simulator(Extra(Uniform(0, 0.3), float("nan"), "drag of {value}"))
 
 
 def _table(x, y):

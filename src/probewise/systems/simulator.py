@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -74,14 +74,14 @@ class Noise:
         return cls(given.get("sd"), given.get("step"), (ends[0], ends[1]), given.get("zero", 0.0))
 
     def __post_init__(self) -> None:
-        if isinstance(self.sd, int | float) and not 0 < self.sd < np.inf:
+        if not (self.sd is None or isinstance(self.sd, str) or _is_positive_number(self.sd)):
             raise ParameterError('noise["sd"]', self.sd, "a number greater than 0, or the name of a column")
-        if self.step is not None and not 0 < self.step < np.inf:
+        if not (self.step is None or _is_positive_number(self.step)):
             raise ParameterError('noise["step"]', self.step, "greater than 0")
         if not _is_finite_number(self.zero):
             raise ParameterError('noise["zero"]', self.zero, "a finite number, the reading of nothing")
-        low, high = self.range
-        if low is not None and high is not None and not low < high:
+        low, high = (bound if end is None else end for end, bound in zip(self.range, (-np.inf, np.inf), strict=True))
+        if not (_is_number(low) and _is_number(high) and low < high):
             raise ParameterError('noise["range"]', self.range, "(low, high), low < high")
 
 
@@ -222,8 +222,14 @@ class Simulator:
                     raise ParameterError(
                         f"states[{state!r}]", start, f"a number or a parameter: {', '.join(self.parameters)}"
                     )
+        own = {
+            n: replace(e, prior=parse_prior(n, e.prior)) if isinstance(e, Extra) else e for n, e in self.extra.items()
+        }
+        object.__setattr__(self, "extra", own)
         for name, effect in self.extra.items():
             require_kind(f"extra[{name!r}]", effect, Extra, "an Extra(prior, null, says), of probewise.systems")
+            if not _is_finite_number(effect.null):
+                raise ParameterError(f"extra[{name!r}].null", effect.null, "a finite number, at which it is absent")
             if name in self.parameters:
                 raise ParameterError("extra", name, "names that no parameter has")
 
@@ -264,8 +270,13 @@ def parse_prior(name: str, given: object) -> Marginal:
 
 
 def _is_finite_number(value: object) -> bool:
-    """Return whether a value is a finite number, also an array of one."""
-    return np.size(value) == 1 and np.asarray(value).dtype.kind in "biuf" and bool(np.isfinite(np.asarray(value)).all())
+    """Return whether a value is a finite number, also an array without an axis."""
+    array = np.asarray(value)
+    return array.ndim == 0 and array.dtype.kind in "biuf" and bool(np.isfinite(array))
+
+
+def _is_positive_number(value: object) -> bool:
+    return _is_finite_number(value) and float(value) > 0  # type: ignore[arg-type]  # it is a number
 
 
 def _is_number(value: object) -> bool:

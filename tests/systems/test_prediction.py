@@ -132,3 +132,12 @@ def test_a_formula_needs_the_column_in_it_and_no_reading():
     lacking = dataclasses.replace(table, columns={k: v for k, v in table.columns.items() if k != "room"})
     with pytest.raises(ParameterError, match="room"):
         predicted(model, lacking)
+
+
+def test_a_model_with_a_lag_refuses_a_time_that_falls_within_a_run_and_one_without_predicts_it():
+    model, table = _line_with("lag", tau_s=1.0)
+    again = table.with_columns({"t": table.time_s % 20})
+    with pytest.raises(ParameterError, match=r"0 in row 22, after 19.*begins anew"):
+        predicted(model, again)
+    drift, _ = _line_with("offset_drift", a=0.01)
+    np.testing.assert_allclose(predicted(drift, again).mean, table.columns["y"] + 0.01 * again.time_s)

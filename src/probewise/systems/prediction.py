@@ -194,10 +194,13 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
     Raises
     ------
     ParameterError
-        If a column that an effect reads is missing, or this version has no such effect.
+        If a column that an effect reads is missing, time falls within a run and an effect depends on earlier times, or
+        this version has no such effect.
     """
     forms: Mapping[str, Any] = {}
     if fitted.known is not None:
+        if any(_asks_for_earlier_times(name) for name in fitted.effects):
+            table.require_rising_time()
         new = [run for run in table.scan_names if run not in fitted.known.table.scan_names]
         forms = rebind_forms(fitted.effects, fitted.simulator, fitted.known, more_runs=new)
         lacking = _columns_of_effects(fitted, forms) - set(table.covariates)
@@ -223,6 +226,13 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
         else:
             raise ParameterError("effects", name, "an effect that this version can bind again; diagnose anew with it")
     return cast(list[NamedEffect[Any]], out)
+
+
+def _asks_for_earlier_times(effect: str) -> bool:
+    """Return whether an effect depends on what was at earlier times of the run: lag, delays, and doses."""
+    if effect.startswith(PROPOSAL):
+        return "integral over" in effect
+    return effect.partition(":")[0] in ("lag", "delay", "input_delay")
 
 
 def _columns_of_effects(fitted: FittedSystem, forms: Mapping[str, Any]) -> set[str]:

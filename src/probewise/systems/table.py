@@ -119,6 +119,19 @@ class RunTable:
         """Row numbers of each run, in the order of the table."""
         return [np.flatnonzero(self.scan == k) for k in range(len(self.scan_names))]
 
+    def require_rising_time(self) -> None:
+        """Raise ParameterError, with the row, if time decreases within a run."""
+        if self.time is None:
+            return
+        for name, rows in zip(self.scan_names, self.rows_by_scan(), strict=True):
+            falls = np.flatnonzero(np.diff(self.time_s[rows]) < 0)
+            if falls.size:
+                before, at = rows[falls[0]], rows[falls[0] + 1]
+                run = f" in run {name}" if self.run is not None else ""
+                found = f"{self.time_s[at]:g} in row {at + 2}, after {self.time_s[before]:g}{run}"
+                cure = "" if self.run is not None else '; where it begins anew name the runs: run = "..."'
+                raise ParameterError(f"column {self.time!r}", found, f"a time that does not fall within a run{cure}")
+
     def interpolated_within_runs(self, values: FloatArray) -> FloatArray:
         """Return a column, (n_points,), with its missing values interpolated linearly from row to row of each run.
 

@@ -8,7 +8,7 @@ from heater import heater, runs
 
 from probewise.diagnosis import audit_system
 from probewise.errors import ParameterError
-from probewise.systems import Noise
+from probewise.systems import Noise, Simulator
 
 TABLE = runs()
 
@@ -57,3 +57,9 @@ def test_readings_that_change_nowhere_are_refused():
     simulator = heater(simulate=lambda p, data: p["start_c"] + 0.0 * data["t_s"], noise=Noise(sd=0.1), per_run=())
     with pytest.raises(ParameterError, match="one reading in all rows"):
         audit_system(simulator, TABLE)
+
+
+def test_a_time_that_falls_within_a_run_is_refused_as_in_a_diagnosis():
+    simulator = Simulator("y", "V", {"a": (0, 10)}, simulate=lambda p, u: p["a"] * u["x"], time="t")
+    with pytest.raises(ParameterError, match="begins anew"):
+        audit_system(simulator, {"x": np.arange(20.0), "t": np.arange(20.0) % 10})

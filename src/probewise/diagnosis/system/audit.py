@@ -41,9 +41,11 @@ def audit_system(simulator: Simulator, table: RunTable | Mapping[str, Any]) -> P
     Raises
     ------
     ParameterError
-        If the table lacks a column that the simulator reads, or the readings are constant everywhere in the prior.
+        If the table lacks a column that the simulator reads, time falls within a run, or the readings are constant
+        everywhere in the prior.
     """
     table = table_for(simulator, table)
+    table.require_rising_time()
     own = cast(RunTable, as_recording(simulator, _without_reading_column(simulator, table)).plan)
     system = System.of(simulator, own)
     z, predicted, where = _point_where_readings_vary(system, own)

@@ -251,7 +251,7 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     """
     if simulator.reading not in table.columns:
         raise ParameterError("reading", simulator.reading, f"a column of the table: {', '.join(table.columns)}")
-    _require_rising_time(table)
+    table.require_rising_time()
     whole = as_recording(simulator, table)
     readings = whole.readings
     usable = np.flatnonzero(whole.usable)
@@ -262,19 +262,6 @@ def recording_of(simulator: Simulator, table: RunTable) -> RunRecording:
     chosen = usable[np.arange(len(usable)) % every < stretch]
     kept[chosen] = readings[chosen]
     return replace(whole, readings=kept)
-
-
-def _require_rising_time(table: RunTable) -> None:
-    if table.time is None:
-        return
-    for name, rows in zip(table.scan_names, table.rows_by_scan(), strict=True):
-        falls = np.flatnonzero(np.diff(table.time_s[rows]) < 0)
-        if falls.size:
-            before, at = rows[falls[0]], rows[falls[0] + 1]
-            run = f" in run {name}" if table.run is not None else ""
-            found = f"{table.time_s[at]:g} in row {at + 2}, after {table.time_s[before]:g}{run}"
-            cure = "" if table.run is not None else '; where it begins anew name the runs: run = "..."'
-            raise ParameterError(f"column {table.time!r}", found, f"a time that does not fall within a run{cure}")
 
 
 def fit_system(system: System, recording: Recording) -> tuple[System, Fit, float]:

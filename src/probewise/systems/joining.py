@@ -87,7 +87,8 @@ def _run_names_by_row(tables: Sequence[RunTable], sources: Sequence[str], *, nam
     """Yield the name of each row's run, with a number appended if a run of an earlier table has that name."""
     taken: set[str] = set()
     for table, source in zip(tables, sources, strict=True):
-        names, own = table.scan_names if named else (source,), {}
+        names: tuple[str, ...] = table.scan_names if named else (source,)
+        own: dict[str, str] = {}
         for name in names:
             # A new name must not be one of this table's own either, which follows unchanged.
             own[name] = unused_name(name, taken | set(own.values()) | (set(names) - {name}))

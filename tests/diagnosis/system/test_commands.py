@@ -59,3 +59,8 @@ def test_commands_set_behind_each_other_are_runs_of_their_own():
 def test_no_command_has_more_than_102_readings():
     long = runs((20.0,), n=1000)
     assert max(len(command.table) for command in offered(table=long).values()) <= 102
+
+
+def test_a_run_that_was_taken_as_advised_does_not_lend_its_name_to_the_next():
+    table = runs((20.0, 21.0), names=("1", "1 again"))
+    assert list(offered((), table)) == ["1 again (2)", "1 again again"]

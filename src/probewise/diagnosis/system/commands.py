@@ -62,7 +62,8 @@ def possible_run_commands(table: RunTable, reading: str, controls: Sequence[str]
         kept = rows[:: -(-len(rows) // MOST_READINGS)]
         of = f"run {name}" if table.run is not None else "the rows"
         for kind, words, columns, slower in _changes_of_run(table, kept, ends, of):
-            made = _planned_run(table, kept, columns, reading, f"{name} {kind}", name, slower)
+            called = unused_name(f"{name} {kind}", table.scan_names)
+            made = _planned_run(table, kept, columns, reading, called, name, slower)
             out.append(RunCommand(kind, words, made, _minutes_of_runs(made, time_unit)))
     return out
 

@@ -143,3 +143,8 @@ def test_a_cluster_that_loses_a_worker_loses_and_counts_twice_nothing(study, tmp
     assert killed
     assert timeless(found) == timeless(study[0])
     assert len(path.read_text().splitlines()) == 1 + 4
+
+
+def test_a_study_without_rows_is_refused(tmp_path):
+    with pytest.raises(ParameterError, match="one row or more"):
+        run_study([], 2, path=tmp_path / "trials.jsonl")

@@ -49,7 +49,8 @@ def open_arm_and_truth(arguments: argparse.Namespace, inputs: Inputs, taken: tup
     world, surface = posing.world_like(inputs.sensor), posing.with_cards(hidden.surface, inputs.cards)
     arm: Instrument
     if chosen.is_lego and geometry is not None:
-        built, seed = chosen.true_geometry_file(arguments.geometry), inputs.streams.noise
+        built = chosen.true_geometry_file(arguments.geometry)
+        seed = inputs.streams.noise + len(taken)  # a resumed run draws no noise a second time
         arm, _ = open_emulated_arm_and_bench(geometry, built, world, surface, seed=seed, start_s=start_s)
     else:
         arm = posing.arm_over(

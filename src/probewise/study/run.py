@@ -62,6 +62,8 @@ def run_study(
         See `run_campaign`.
     """
     wanted = dict(rows) if isinstance(rows, Mapping) else dict.fromkeys(rows, n_circles or 0)
+    if not wanted:
+        raise ParameterError("rows", rows, "one row or more, such as those of standard_rows()")
     for row, n in wanted.items():
         if n < 1:
             raise ParameterError(f"circles of the row {row.name!r}", n, "1 or more")

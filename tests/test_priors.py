@@ -62,6 +62,14 @@ def test_improper_priors_are_refused(make):
         make()
 
 
+@pytest.mark.parametrize("prior", [Product({}), Joint(()), Joint((Empty(),))])
+def test_a_prior_of_no_parameters_draws_none(prior):
+    nothing = np.zeros((3, 0))
+    assert prior.names == ()
+    assert prior.from_unit_cube(nothing).shape == prior.to_unit_cube(nothing).shape == (3, 0)
+    assert prior.log_prob(nothing).tolist() == [0.0, 0.0, 0.0]
+
+
 def test_the_wrong_number_of_columns_is_refused():
     with pytest.raises(ShapeError, match="allowed"):
         Product({"a": Uniform(0, 1)}).from_unit_cube(np.zeros((3, 2)))

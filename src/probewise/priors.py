@@ -236,12 +236,14 @@ class Product:
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each coordinate by its own marginal, both (n_samples, n_params)."""
         u = checked_columns(u, self.names)
-        return np.stack([m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
+        columns = [m.from_unit(u[:, i]) for i, m in enumerate(self.marginals.values())]
+        return np.stack(columns, axis=-1) if columns else u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each parameter by its own marginal, both (n_samples, n_params)."""
         theta = checked_columns(theta, self.names)
-        return np.stack([m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())], axis=-1)
+        columns = [m.to_unit(theta[:, i]) for i, m in enumerate(self.marginals.values())]
+        return np.stack(columns, axis=-1) if columns else theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the sum of the marginals' log densities, (n_samples, n_params) -> (n_samples,)."""
@@ -273,12 +275,14 @@ class Joint:
     def from_unit_cube(self, u: FloatArray) -> FloatArray:
         """Map each part's coordinates by that part, both (n_samples, n_params)."""
         u = checked_columns(u, self.names)
-        return np.concatenate([p.from_unit_cube(c) for p, c in self._parts_with_columns(u)], axis=-1)
+        columns = [p.from_unit_cube(c) for p, c in self._parts_with_columns(u)]
+        return np.concatenate(columns, axis=-1) if columns else u
 
     def to_unit_cube(self, theta: FloatArray) -> FloatArray:
         """Map each part's parameters by that part, both (n_samples, n_params)."""
         theta = checked_columns(theta, self.names)
-        return np.concatenate([p.to_unit_cube(c) for p, c in self._parts_with_columns(theta)], axis=-1)
+        columns = [p.to_unit_cube(c) for p, c in self._parts_with_columns(theta)]
+        return np.concatenate(columns, axis=-1) if columns else theta
 
     def log_prob(self, theta: FloatArray) -> FloatArray:
         """Return the sum of the parts' log densities, (n_samples, n_params) -> (n_samples,)."""

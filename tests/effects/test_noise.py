@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from probewise.effects import (
     CorrelatedNoise,
@@ -13,7 +14,9 @@ from probewise.effects import (
     Extent,
     FittedReadings,
     Outliers,
+    PredictiveMixture,
     Quantisation,
+    RandomWalk,
     SignalDependentNoise,
     lattice_step,
     lattice_step_sd,
@@ -124,3 +127,15 @@ def test_a_printing_lattice_and_a_declared_one_are_no_effect():
     assert Quantisation().nodes(printed[:, 0], rows).shape == (0, 1)
     declared = replace(PLAN, instrumentation=replace(PLAN.instrumentation, step=1.0))
     assert Quantisation.for_extent(Extent(10.0, 60.0, declared)) is None
+
+
+def test_a_random_walk_is_scored_at_the_rows_that_have_a_reading():
+    walk = RandomWalk().apply(
+        NoiseParameters(np.full((4, 1), SD), np.zeros((1, 1))), np.full((4, 1), 0.5), PLAN.take(slice(3))
+    )
+    predicted, readings = np.zeros((4, 3)), np.array([0.1, np.nan, -0.2])
+    mixture = PredictiveMixture(readings, np.isfinite(readings))
+    mixture.add(predicted, walk)
+    _, sd, scores = mixture.mean_sd_and_log_density()
+    np.testing.assert_allclose(sd, SD * np.sqrt(1 + 0.25 * np.array([1, 2, 3])))
+    np.testing.assert_allclose(scores, norm.logpdf(readings, 0.0, sd))

@@ -75,6 +75,5 @@ class PredictiveMixture:
 
 def _noise_of_rows(noise: NoiseParameters, rows: BoolArray) -> NoiseParameters:
     """Return the noise of some rows, given by their mask (n_points,)."""
-    if noise.sd.shape[-1] == 1:
-        return noise
-    return replace(noise, sd=noise.sd[:, rows])
+    sd = noise.sd if noise.sd.shape[-1] == 1 else noise.sd[:, rows]
+    return replace(noise, sd=sd, walked=noise.walked if len(noise.walked) == 1 else noise.walked[rows])

@@ -111,6 +111,18 @@ def test_a_table_may_say_n_a_where_a_number_is_missing_and_hold_dates():
     assert made(x_mm=[0, 1], readings=[1, 2], time_s=stamps).plan.time_s.tolist() == [0.0, 0.5]
 
 
+def test_dates_with_and_without_a_time_zone_are_refused_together():
+    begun = datetime.datetime(2026, 11, 23, 18, 0, tzinfo=datetime.UTC)
+    with pytest.raises(ParameterError, match=r"time_s is .* dates that all have a time zone, or none of them"):
+        made(x_mm=[0, 1], readings=[1, 2], time_s=[begun, begun.replace(tzinfo=None)])
+
+
+def test_two_columns_of_one_name_but_for_blanks_are_refused():
+    table = {"x_mm": [0, 1], "y_mm": [0, 0], "reading": [1, 2], " x_mm": [5, 6]}
+    with pytest.raises(ParameterError, match="columns is 'x_mm'; allowed: each name once"):
+        Recording.from_table(table, patterns=EDGE, unit="V")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

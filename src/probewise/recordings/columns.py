@@ -36,14 +36,20 @@ class TableLike(Protocol):
 def columns_by_name(table: TableLike) -> dict[str, Any]:
     """Return a table's columns by name.
 
-    Raises ParameterError if it has no columns by name.
+    Raises ParameterError if it has no columns by name, or two of one name but for the blanks around it.
     """
     names: Any = getattr(table, "columns", None)  # of a data frame, pandas or polars
     if isinstance(table, Mapping) or names is None:
         names = table.keys() if hasattr(table, "keys") else getattr(getattr(table, "dtype", None), "names", None)
     if names is None:
         raise ParameterError("table", table, "columns by name: a dict of arrays, or a data frame")
-    return {str(name).strip(): table[name] for name in names}
+    columns: dict[str, Any] = {}
+    for name in names:
+        own = str(name).strip()
+        if own in columns:
+            raise ParameterError("columns", own, "each name once, also without the blanks around it")
+        columns[own] = table[name]
+    return columns
 
 
 def numbers_per_reading(name: str, values: ArrayLike, n_points: int | None = None) -> FloatArray:
@@ -85,10 +91,15 @@ def _number_or_nan(cell: Any) -> Any:
 
 
 def dates_to_seconds(values: ArrayLike) -> ArrayLike:
-    """Convert dates to seconds since the first; numbers are returned unchanged."""
+    """Convert dates to seconds since the first; numbers are returned unchanged.
+
+    Raises ParameterError if some dates have a time zone and others none.
+    """
     array = np.asarray(values)
     cells = array.tolist() if array.dtype == np.object_ and array.ndim == 1 else []
     if cells and all(isinstance(cell, datetime.datetime) for cell in cells):
+        if len({cell.utcoffset() is None for cell in cells}) > 1:
+            raise ParameterError("time_s", values, "dates that all have a time zone, or none of them")
         return [(cell - cells[0]).total_seconds() for cell in cells]
     if array.dtype.kind == "M" and array.ndim == 1 and not np.isnat(array).any():
         return np.asarray((array - array[:1]) / np.timedelta64(1, "s"), dtype=np.float64)

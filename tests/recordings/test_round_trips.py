@@ -169,6 +169,30 @@ def test_an_image_that_a_png_cannot_hold_is_not_rounded_in_silence(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_two_images_that_differ_have_no_file_in_common(tmp_path):
+    dark, light = (Image(np.full((2, 2), level), 1.0, (0.0, 0.0), "photo.npy") for level in (0.0, 1.0))
+    with pytest.raises(ParameterError, match=r"file of patterns\['light'\] is 'photo.npy'; allowed: another file"):
+        write_plan(plan_of(2, patterns={"white": dark, "light": light}), tmp_path / "plan.csv")
+    assert not list(tmp_path.iterdir())
+    write_plan(plan_of(2, patterns={"white": dark, "again": replace(dark, pixel_mm=2.0)}), tmp_path / "plan.csv")
+    assert (read_plan(tmp_path / "plan.csv").patterns["again"].albedo == 0.0).all()
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (Image([[0.5]], 1.0, (0.0, 0.0), "../photo.npy"), "without a path"),
+        (Image([[2.0]], 1.0, (0.0, 0.0), "photo.npy"), "0 to 1 in every pixel"),
+        (Image([[np.nan]], 1.0, (0.0, 0.0), "photo.png"), "0 to 1 in every pixel"),
+    ],
+)
+def test_an_image_that_could_not_be_read_back_is_not_written(tmp_path, image, message):
+    (tmp_path / "own").mkdir()
+    with pytest.raises(ParameterError, match=message):
+        write_plan(plan_of(2, patterns={"white": image}), tmp_path / "own" / "plan.csv")
+    assert not list(tmp_path.glob("**/*.*"))
+
+
 def test_two_scans_of_one_name_that_follow_each_other_stay_two(tmp_path):
     plan = plan_of(4, scan=[0, 0, 1, 1], scan_names=("a", "a"))
     write_plan(plan, tmp_path / "plan.csv")

@@ -6,13 +6,13 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from probewise.errors import FileError, ParameterError, shortened
-from probewise.recordings.images import read_image
+from probewise.recordings.images import is_file_name_without_path, read_image
 from probewise.recordings.patterns import (
     Disc,
     HalfPlane,
@@ -161,7 +161,7 @@ def _parse_ramp(f: _CheckedFields) -> Pattern:
 def _parse_image(f: _CheckedFields) -> Pattern:
     name = f.text("file", "the name of a PNG or .npy file in the same folder")
     # Security: a recording may only refer to files in its own folder.
-    if not name or name in (".", "..") or PurePosixPath(name).name != name or PureWindowsPath(name).name != name:
+    if not is_file_name_without_path(name):
         raise f.error_at("file", name, "the name of a PNG or .npy file in the same folder, without a path")
     picture = f.path.parent / name
     if not picture.is_file():  # the error names the JSON that refers to the picture

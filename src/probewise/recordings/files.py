@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import operator
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,8 +17,8 @@ from probewise.errors import FileError, ParameterError, shown
 from probewise.progress import Progress, silent
 from probewise.recordings.atomic import write_bytes_atomically, write_text_atomically
 from probewise.recordings.description import Description, description_text, read_description, shortest_degrees
-from probewise.recordings.images import image_bytes
-from probewise.recordings.patterns import Image
+from probewise.recordings.images import image_bytes, is_file_name_without_path
+from probewise.recordings.patterns import Image, Pattern
 from probewise.recordings.plan import Plan, Recording, range_in_words, require_plan, require_recording
 from probewise.recordings.table import LARGEST, MISSING, CSVTable, count_numbers, csv_text, number_text, read_table
 
@@ -176,13 +176,30 @@ def _write_with_json(plan: Plan, path: Path, columns: dict[str, Sequence[str]]) 
     if unknown:
         raise ParameterError("pattern", unknown[0], "a pattern that plan.patterns describes")
     text = description_text(plan.instrumentation, plan.patterns)
-    images = [p for p in plan.patterns.values() if isinstance(p, Image)]
-    contents = [(path.parent / image.file, image_bytes(image.albedo, Path(image.file).suffix)) for image in images]
+    images = _images_by_file(plan.patterns)
+    contents = [(path.parent / file, image_bytes(image.albedo, Path(file).suffix)) for file, image in images.items()]
     # The CSV comes last: if it exists, everything it needs exists too.
     for image_path, content in contents:
         write_bytes_atomically(image_path, content)
     write_text_atomically(path.with_suffix(".json"), text)
     write_text_atomically(path, csv_text(columns))
+
+
+def _images_by_file(patterns: Mapping[str, Pattern]) -> dict[str, Image]:
+    """Return the images among patterns by their file.
+
+    Raises ParameterError if a file is no plain name, or two images that differ name one file.
+    """
+    images: dict[str, Image] = {}
+    for name, pattern in patterns.items():
+        if not isinstance(pattern, Image):
+            continue
+        file = f"file of patterns[{name!r}]"
+        if not is_file_name_without_path(pattern.file):
+            raise ParameterError(file, pattern.file, "the name of a PNG or .npy file, without a path")
+        if not np.array_equal(images.setdefault(pattern.file, pattern).albedo, pattern.albedo, equal_nan=True):
+            raise ParameterError(file, pattern.file, "another file than that of an image which differs")
+    return images
 
 
 def _read_with_json(path: Path, progress: Progress) -> tuple[Plan, FloatArray | None, list[str]]:

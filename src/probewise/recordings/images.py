@@ -6,7 +6,7 @@ import io
 import math
 import struct
 import zlib
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 
 import numpy as np
 from numpy.lib import format as npy
@@ -23,6 +23,11 @@ _LARGEST_PIXELS = 100_000_000
 # By version; 3.0 is only for structured arrays.
 _NPY_HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 Bytes8 = NDArray[np.uint8]
+
+
+def is_file_name_without_path(name: str) -> bool:
+    """Return whether `name` names a file in the recording's own folder, on any system."""
+    return name not in ("", ".", "..") and PurePosixPath(name).name == name == PureWindowsPath(name).name
 
 
 def read_image(path: Path) -> FloatArray:
@@ -44,8 +49,12 @@ def read_image(path: Path) -> FloatArray:
 def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
     """Encode albedo (n_rows, n_columns) as the file that `read_image` reads back: '.npy' or '.png'.
 
-    Raises ParameterError if `suffix` is another, or is '.png' and the albedo is not in steps of 1/255.
+    Raises ParameterError if `suffix` is another, an albedo is outside 0 to 1, or `suffix` is '.png' and the albedo is
+    not in steps of 1/255.
     """
+    bad = ~((albedo >= 0) & (albedo <= 1))
+    if bad.any():
+        raise ParameterError("albedo of an image", float(albedo[bad][0]), "0 to 1 in every pixel")
     values = albedo * 255.0
     if suffix.lower() == ".npy":
         out = io.BytesIO()
@@ -54,10 +63,8 @@ def image_bytes(albedo: FloatArray, suffix: str) -> bytes:
     if suffix.lower() != ".png":
         raise ParameterError("image file suffix", suffix, "'.png' or '.npy'")
     grey = np.rint(values)
-    if np.abs(grey - values).max(initial=0.0) > 1e-9 or grey.min(initial=0) < 0 or grey.max(initial=0) > 255:
-        raise ParameterError(
-            "image file suffix", suffix, "'.npy' for an albedo that is not in steps of 1/255 from 0 to 1"
-        )
+    if np.abs(grey - values).max(initial=0.0) > 1e-9:
+        raise ParameterError("image file suffix", suffix, "'.npy' for an albedo that is not in steps of 1/255")
     from PIL import Image as Pillow  # imported here: most recordings have no image
 
     out = io.BytesIO()

@@ -39,6 +39,7 @@ from probewise.effects import (
     StickSlip,
 )
 from probewise.effects.patches import distinct_scan_lines
+from probewise.effects.vocabulary import value_with_sd
 from probewise.errors import ParameterError
 from probewise.recordings import Disc, HalfPlane, Plan, Quadrant, Recording, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
@@ -436,3 +437,17 @@ def test_the_extent_of_a_recording_is_its_range_length_and_duration():
         Extent.of(Recording(plan, np.full(6, np.nan)))
     with pytest.raises(ParameterError, match="low < high"):
         Extent(2.0, 2.0, plan)
+
+
+def test_the_extent_of_a_recording_does_not_depend_on_the_unit():
+    readings = np.array([1.0, 2.0, 5.0, np.nan, 3.0, 2.0])
+    spans = [Extent.of(Recording(there_and_back(), unit * readings)).span / unit for unit in (1e-9, 1.0, 1e9)]
+    np.testing.assert_allclose(spans, 4.0)
+    assert Extent.of(Recording(there_and_back(), np.zeros(6))).span == 1e-6
+
+
+def test_a_value_with_a_tiny_sd_is_written_with_the_digits_of_the_sd():
+    assert value_with_sd(3.14e-9, 2.3e-10, "A") == "3.14e-09 ± 2.3e-10 A"
+    assert value_with_sd(0.25, 2.3e-9) == "0.25 ± 2.3e-09"
+    assert value_with_sd(-0.0, 2.3e-10) == "0 ± 2.3e-10"
+    assert value_with_sd(3.14e-6, 2.3e-7) == "0.00000314 ± 0.00000023"

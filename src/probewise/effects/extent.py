@@ -45,7 +45,7 @@ class Extent:
         if readings.size == 0:
             raise ParameterError("usable readings", 0, "at least one; the recording holds none")
         low, high = float(readings.min()), float(readings.max())
-        tiny = max(abs(low), abs(high), 1.0) * 1e-6
+        tiny = (max(abs(low), abs(high)) or 1.0) * 1e-6  # relative: the unit of a reading may be large
         return cls(low, max(high, low + tiny), recording.plan)
 
     @property

@@ -19,6 +19,8 @@ from probewise.sensor.stages import Effect, NoiseParameters
 
 V = TypeVar("V")
 
+_LEAST_WITH_POINT = 1e-7  # a smaller sd has no two digits among eight after the point
+
 
 @dataclass(frozen=True, eq=False)
 class Gates:
@@ -218,7 +220,10 @@ def single_column_bank(*parameters: ArrayLike) -> FloatArray:
 def value_with_sd(mean: float, sd: float, unit: str = "", *, factor: float = 1.0) -> str:
     """Return "mean ± sd unit", both numbers times `factor`, rounded to two significant digits of the sd."""
     mean, sd = factor * mean, factor * sd
-    if np.isfinite(sd) and sd > 0:
+    if 0 < sd < _LEAST_WITH_POINT and np.isfinite(mean):
+        digits = max(int(np.floor(np.log10(max(abs(mean), sd))) - np.floor(np.log10(sd))) + 2, 2)
+        written = f"{mean:z.{digits}g} ± {sd:.2g}"
+    elif np.isfinite(sd) and sd > 0:
         digits = int(np.clip(1 - np.floor(np.log10(sd)), 0, 8))
         written = f"{mean:z.{digits}f} ± {sd:.{digits}f}"  # "z": no minus sign on a rounded zero
     else:

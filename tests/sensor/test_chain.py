@@ -375,3 +375,38 @@ def test_predicting_twice_gives_the_same_and_leaves_the_plan_alone(model):
     first[:] = -1
     assert not np.any(sensor.predict(theta, plan) == -1)
     assert np.array_equal(theta, before)
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "message"),
+    [
+        ("height_mm", 0.0, "height_mm is 0.0; allowed: greater than 0"),
+        ("height_mm", -5.0, "height_mm is -5.0; allowed: greater than 0"),
+        ("led", 255.0, "led is 255.0; allowed: 0 .* to 1"),
+        ("led", -1.0, "led is -1.0; allowed: 0 .* to 1"),
+    ],
+)
+def test_a_commanded_height_or_led_that_cannot_be_is_refused(column, value, message):
+    plan = commanded(column, [np.nan, value])
+    with pytest.raises(ParameterError, match=message):
+        RAISED.predict(np.empty((1, 0)), plan)
+
+
+@pytest.mark.parametrize("ratio", [0.05, 0.5, 1.0, 3.0, 30.0])
+def test_a_commanded_height_scales_footprint_and_light_however_far_it_is(ratio):
+    plan = commanded("height_mm", [14.0 * ratio, np.nan])
+    expected = 10.0 + 50.0 * ndtr(np.array([2.0 / (4.0 * ratio), 2.0 / 4.0])) / np.array([ratio**2, 1.0])
+    np.testing.assert_allclose(RAISED.predict(np.empty((1, 0)), plan)[0], expected, rtol=1e-9)
+
+
+RAISED = Chain(
+    FixedMixture([1.0], [[0.0, 0.0]], [[[16.0, 0.0], [0.0, 16.0]]]),
+    FixedLevels(10.0, 60.0),
+    KnownScene({"edge": kinds.HalfPlane(0.0, 0.0)}),
+)
+
+
+def commanded(column, values):
+    return Plan.from_arrays(
+        x_mm=[2.0, 2.0], y_mm=0, patterns=RAISED.scene.patterns, unit="V", height_mm=14.0, covariates={column: values}
+    )

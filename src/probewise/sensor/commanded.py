@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from probewise._arrays import FloatArray
+from probewise._arrays import BoolArray, FloatArray
+from probewise.errors import ParameterError
 from probewise.recordings.plan import Plan
 from probewise.sensor.stages import Footprint
 
@@ -23,24 +24,40 @@ def has_commanded_height_or_led(plan: Plan) -> bool:
 
 
 def led_state(plan: Plan) -> FloatArray:
-    """Return the LED's state at each reading, 0 or 1, (n_points,), or (1,) without a column `led`; 1 at NaN."""
+    """Return the LED's state at each reading, 0 to 1, (n_points,), or (1,) without a column `led`; 1 at NaN.
+
+    Raises ParameterError for another state, which would multiply the signal.
+    """
     led = plan.covariates.get("led")
-    return np.ones(1) if led is None else np.where(np.isfinite(led), led, 1.0)
+    if led is None:
+        return np.ones(1)
+    _require_none_beyond("led", led, (led < 0.0) | (led > 1.0), "0 (off) to 1 (on), NaN where it was not recorded")
+    return np.where(np.isfinite(led), led, 1.0)
 
 
 def height_ratio(plan: Plan) -> FloatArray | None:
-    """Return h/h0 of each reading, (n_points,), 1 at NaN; None if no height is known or all are the description's."""
+    """Return h/h0 of each reading, (n_points,), 1 at NaN; None if no height is known or all are the description's.
+
+    Raises ParameterError for a height of 0 or below.
+    """
     height_mm, usual_mm = plan.covariates.get("height_mm"), plan.instrumentation.height_mm
     if height_mm is None or usual_mm is None:
         return None
+    _require_none_beyond("height_mm", height_mm, height_mm <= 0.0, "greater than 0, NaN where it was not commanded")
     ratio = np.where(np.isfinite(height_mm), height_mm / usual_mm, 1.0)
     return None if (ratio == 1.0).all() else ratio
 
 
+def _require_none_beyond(name: str, values: FloatArray, beyond: BoolArray, allowed: str) -> None:
+    """Raise ParameterError that names the first of the values of a column that are `beyond` what is allowed."""
+    if beyond.any():
+        raise ParameterError(name, float(values[beyond][0]), allowed)
+
+
 def footprint_at_commanded_height(footprint: Footprint, plan: Plan) -> Footprint:
-    """Scale the footprint by the commanded height over the description's; see `footprint_at_height_ratio`."""
+    """Scale the footprint by the commanded height over the description's, and divide its brightness by the square."""
     ratio = height_ratio(plan)
-    return footprint if ratio is None else footprint_at_height_ratio(footprint, ratio[None, :])
+    return footprint if ratio is None else _scaled_footprint(footprint, ratio[None, :])
 
 
 def footprint_at_height_ratio(footprint: Footprint, ratio: FloatArray) -> Footprint:
@@ -49,7 +66,10 @@ def footprint_at_height_ratio(footprint: Footprint, ratio: FloatArray) -> Footpr
     A ratio below 0.1 or above 10 counts as that.
     """
     # A fit may try heights that no arm can take: the result only has to stay finite.
-    ratio = np.clip(ratio, 0.1, 10.0)
+    return _scaled_footprint(footprint, np.clip(ratio, 0.1, 10.0))
+
+
+def _scaled_footprint(footprint: Footprint, ratio: FloatArray) -> Footprint:
     k = ratio[:, :, None]
     return replace(
         footprint,

@@ -138,6 +138,17 @@ def test_another_unit_is_warned_of(sensor: FittedSensor) -> None:
         predict(sensor, plan)
 
 
+def test_heights_that_are_not_those_of_the_calibration_are_warned_of(sensor: FittedSensor) -> None:
+    calibrated = replace(sensor, instrumentation=replace(sensor.instrumentation, height_mm=14.0))
+    raised = replace(_disc_plan(), covariates={"height_mm": np.full(21, 28.0)})
+    with pytest.warns(DoubtfulResultWarning, match="gives no height_mm of the sensor: predicted as at the height of"):
+        predict(calibrated, raised)
+    with pytest.warns(DoubtfulResultWarning, match="readings at 28 mm are predicted as at 14 mm"):
+        predict(calibrated, replace(raised, instrumentation=Instrumentation(height_mm=28.0)))
+    lower = predict(calibrated, replace(raised, instrumentation=Instrumentation(height_mm=14.0)))
+    assert np.ptp(lower.mean) < 0.5 * np.ptp(predict(calibrated, _disc_plan()).mean)
+
+
 def test_a_plan_without_the_battery_that_an_effect_reads_is_warned_of(make_sensor: Callable[..., FittedSensor]) -> None:
     plain = make_sensor()
     columns = np.append(plain.samples, np.full((len(plain.samples), 1), 0.05), axis=1)

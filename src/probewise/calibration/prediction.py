@@ -63,7 +63,8 @@ def predict(
     Warns
     -----
     DoubtfulResultWarning
-        If the plan's unit is not that of the calibration, or the plan lacks a column that an effect reads.
+        If the plan's unit or height is not that of the calibration, the plan commands heights but its description
+        gives none, or it lacks a column that an effect reads.
     """
     require_sensor(sensor, "in the order predict(sensor, plan)")
     if isinstance(plan, Recording):
@@ -82,6 +83,9 @@ def predict(
             DoubtfulResultWarning,
             stacklevel=2,
         )
+    doubt = _doubt_of_height_in_words(sensor, plan)
+    if doubt:
+        warnings.warn(doubt, DoubtfulResultWarning, stacklevel=2)
     scored = Recording(plan, recorded).usable
     step = plan.instrumentation.step
     chain = sensor.chain(KnownScene(plan.patterns))
@@ -104,3 +108,18 @@ def predict(
         noise = chain.noise_parameters(theta[block], plan, sensor.noise_sd[block, None])
         mixture.add(model.predict(theta[block], plan), noise)
     return Prediction(plan, *mixture.mean_sd_and_log_density(), recorded)
+
+
+def _doubt_of_height_in_words(sensor: FittedSensor, plan: Plan) -> str:
+    """Say why a plan's heights may not be those at which its readings are predicted; "" if they are."""
+    usual_mm, calibrated_mm = plan.instrumentation.height_mm, sensor.instrumentation.height_mm
+    if usual_mm is None:
+        commanded = np.isfinite(plan.covariates.get("height_mm", np.empty(0))).any()
+        said = "the plan has a column height_mm, but its description gives no height_mm of the sensor"
+        return f"{said}: predicted as at the height of the calibration" if commanded else ""
+    if calibrated_mm is None or usual_mm == calibrated_mm:
+        return ""
+    return (
+        f"the plan's description gives a height of {usual_mm:g} mm, the sensor was calibrated at {calibrated_mm:g} mm: "
+        f"readings at {usual_mm:g} mm are predicted as at {calibrated_mm:g} mm"
+    )

@@ -145,6 +145,8 @@ def test_heights_that_are_not_those_of_the_calibration_are_warned_of(sensor: Fit
         predict(calibrated, raised)
     with pytest.warns(DoubtfulResultWarning, match="readings at 28 mm are predicted as at 14 mm"):
         predict(calibrated, replace(raised, instrumentation=Instrumentation(height_mm=28.0)))
+    predict(calibrated, replace(raised, covariates={"height_mm": np.full(21, 14.0)}))
+    predict(replace(sensor, instrumentation=Instrumentation()), raised)
     lower = predict(calibrated, replace(raised, instrumentation=Instrumentation(height_mm=14.0)))
     assert np.ptp(lower.mean) < 0.5 * np.ptp(predict(calibrated, _disc_plan()).mean)
 

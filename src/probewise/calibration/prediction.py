@@ -114,9 +114,12 @@ def _doubt_of_height_in_words(sensor: FittedSensor, plan: Plan) -> str:
     """Say why a plan's heights may not be those at which its readings are predicted; "" if they are."""
     usual_mm, calibrated_mm = plan.instrumentation.height_mm, sensor.instrumentation.height_mm
     if usual_mm is None:
-        commanded = np.isfinite(plan.covariates.get("height_mm", np.empty(0))).any()
+        column = plan.covariates.get("height_mm", np.empty(0))
+        commanded_mm = column[np.isfinite(column)]
         said = "the plan has a column height_mm, but its description gives no height_mm of the sensor"
-        return f"{said}: predicted as at the height of the calibration" if commanded else ""
+        # Where all are the height of the calibration, or may be, nothing is lost.
+        elsewhere = commanded_mm != (commanded_mm[:1] if calibrated_mm is None else calibrated_mm)
+        return f"{said}: predicted as at the height of the calibration" if elsewhere.any() else ""
     if calibrated_mm is None or usual_mm == calibrated_mm:
         return ""
     return (

@@ -4,12 +4,13 @@ import json
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from probewise._arrays import FloatArray
-from probewise.calibration import Calibration, calibrate, default_prior, paper_prior, predict, problem_for
+from probewise.calibration import Calibration, SSFPrior, calibrate, default_prior, paper_prior, predict, problem_for
 from probewise.calibration.coverage import (
     Coverage,
     draw_truth,
@@ -155,6 +156,27 @@ def test_recordings_without_contrast_and_orders_without_gaussians_are_refused(re
         calibrate(recording, orders=(0, 1), rng=rng)
     with pytest.raises(ShapeError, match="data_sets"):
         problem_for(recording, default_prior(recording, 1), data_sets=np.zeros(3, dtype=int))
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [
+        ({"n_samples": 100}, "n_samples is 100; allowed: a whole number, 500 or more"),
+        ({"n_samples": 500.5}, "n_samples is 500.5"),
+        ({"pixel_mm": 0.0}, "pixel_mm is 0.0; allowed: greater than 0"),
+        ({"pixel_mm": "fine"}, "pixel_mm is 'fine'"),
+        ({"executor": 2}, "executor is 2; allowed: an Executor"),
+    ],
+)
+@pytest.mark.parametrize("quick", [True, False])
+def test_what_the_sensor_cannot_have_is_refused_before_the_search(
+    recording: Recording, asked: dict[str, Any], message: str, quick: bool
+) -> None:
+    def prior(recording: Recording, n_gaussians: int) -> SSFPrior:
+        raise AssertionError("a search began")
+
+    with pytest.raises(ParameterError, match=message):
+        calibrate(recording, prior=prior, quick=quick, rng=np.random.default_rng(1), **asked)
 
 
 def test_coverage_counts_survive_as_json() -> None:

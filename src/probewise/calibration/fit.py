@@ -15,7 +15,8 @@ import numpy as np
 
 from probewise._arrays import FloatArray, IntArray
 from probewise._display import ShowsItself
-from probewise._kinds import checked_whole, require_flag, require_rng
+from probewise._kinds import checked_finite_number, checked_whole, require_flag, require_like, require_rng
+from probewise._posterior_samples import MIN_SAMPLES
 from probewise.calibration.fields import choose_pixel_mm, mean_field, mixture_moments, sorted_by_mass
 from probewise.calibration.noise import draw_pooled_sd, noise_by_scan
 from probewise.calibration.order_problems import OrderProblems
@@ -181,6 +182,11 @@ def calibrate(
     checked_whole("n_live", n_live)
     wanted = _checked_orders(orders)
     fingerprint(recording)  # raises now, not after hours, where a file could not hold what the recording does
+    checked_whole("n_samples", n_samples, least=MIN_SAMPLES)
+    if pixel_mm is not None and not checked_finite_number("pixel_mm", pixel_mm, "greater than 0, or None") > 0:
+        raise ParameterError("pixel_mm", pixel_mm, "greater than 0, or None")
+    if executor is not None:
+        require_like("executor", executor, ("submit",), "an Executor of concurrent.futures, or None")
     require_flag("quick", quick)
     if quick and not refined:
         raise ParameterError("refined", refined, "True with quick=True, or leave quick out")

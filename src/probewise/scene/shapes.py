@@ -367,7 +367,7 @@ class AnyOf:
             require_shape(shape, f"shapes[{name!r}]")
         if not self.shapes:
             raise ParameterError("shapes", dict(self.shapes), "one shape or more, by name")
-        weights = self.weights or (1.0,) * len(self.shapes)
+        weights = tuple(self.weights) or (1.0,) * len(self.shapes)
         if len(weights) != len(self.shapes) or not all(0 < w < math.inf for w in weights):
             raise ParameterError("weights", self.weights, f"{len(self.shapes)} numbers greater than 0")
         object.__setattr__(self, "weights", tuple(w / sum(weights) for w in weights))

@@ -111,6 +111,15 @@ def test_a_table_may_say_n_a_where_a_number_is_missing_and_hold_dates():
     assert made(x_mm=[0, 1], readings=[1, 2], time_s=stamps).plan.time_s.tolist() == [0.0, 0.5]
 
 
+@pytest.mark.parametrize("text", ["infinity", "1_000"])
+def test_a_text_that_is_no_number_in_a_file_is_none_in_a_table(text):
+    table = {"x_mm": [0, 1], "y_mm": [0, 0], "reading": [1, 2], "lux": ["3", text]}
+    recording = Recording.from_table(table, patterns=EDGE, unit="V")
+    assert recording.notes == ("column lux holds no numbers, ignored",)
+    with pytest.raises(ParameterError, match="readings is"):
+        made(x_mm=[0, 1], readings=["3", text])
+
+
 def test_dates_with_and_without_a_time_zone_are_refused_together():
     begun = datetime.datetime(2026, 11, 23, 18, 0, tzinfo=datetime.UTC)
     with pytest.raises(ParameterError, match=r"time_s is .* dates that all have a time zone, or none of them"):

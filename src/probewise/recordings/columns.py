@@ -14,7 +14,7 @@ from probewise._arrays import FloatArray, IntArray, floats
 from probewise._kinds import require_kind, require_mapping
 from probewise.errors import ParameterError, ShapeError
 from probewise.recordings.patterns import PATTERNS, Pattern
-from probewise.recordings.table import MISSING
+from probewise.recordings.table import MISSING, count_numbers
 
 _A_PATTERN = "a pattern such as HalfPlane(normal_rad=0.0, offset_mm=0.0), of probewise.recordings"
 _THE_ONLY = "pattern"  # name of a single pattern that was given without one
@@ -87,7 +87,10 @@ def _number_or_nan(cell: Any) -> Any:
         if not (_is_missing(cell) or hasattr(cell, "__float__") or hasattr(cell, "__index__")):
             raise ValueError("no number")
         return math.nan if _is_missing(cell) else cell
-    return math.nan if cell.strip() in MISSING else float(cell)
+    text = cell.strip()
+    if text not in MISSING and not count_numbers([text]):  # float() would accept 'infinity' and '1_000' too
+        raise ValueError("no number")
+    return math.nan if text in MISSING else float(text)
 
 
 def dates_to_seconds(values: ArrayLike) -> ArrayLike:

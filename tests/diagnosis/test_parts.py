@@ -39,7 +39,7 @@ from probewise.diagnosis.residuals.covariate import Covariate
 from probewise.diagnosis.residuals.locate import places_of_effect, significant_places, window_columns_and_bounds
 from probewise.effects import VOCABULARY, Backlash, CorrelatedNoise, Extent
 from probewise.errors import ParameterError
-from probewise.recordings import HalfPlane, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
+from probewise.recordings import HalfPlane, Image, Instrumentation, Plan, Recording, Uniform, paper_plan, two_way_plan
 from probewise.recordings.plans import with_jittered_times
 from probewise.sensor import footprint_of, mixture_names
 
@@ -418,6 +418,33 @@ def test_joined_recordings_keep_scans_and_patterns_apart():
     np.testing.assert_array_equal(joined.plan.pattern, [0] * 8 + [1] * 6 + [0] * 8)
     assert joined.plan.patterns["edge (2)"] == Uniform(1.0)
     assert join([first]) is first
+
+
+def test_joined_recordings_keep_their_patterns_where_a_third_is_joined_to_them():
+    """What is joined a second time, such as the recording of an investigation, has a name "edge (2)" already."""
+
+    def over(albedo: float, n: int) -> Recording:
+        plan = replace(line(n).plan, pattern_names=("edge",), patterns={"edge": Uniform(albedo)})
+        return Recording(plan, line(n).readings)
+
+    joined = join([join([over(0.0, 4), over(1.0, 3)]), over(0.5, 2)])
+    seen = [joined.plan.patterns[joined.plan.pattern_names[code]].albedo for code in joined.plan.pattern]
+    assert seen == [0.0] * len(line(4)) + [1.0] * len(line(3)) + [0.5] * len(line(2))
+
+
+def test_images_of_one_name_that_differ_in_the_middle_alone_remain_two_patterns():
+    """The text of a large array leaves its middle out."""
+    one = np.zeros((60, 60))
+    other = one.copy()
+    other[30, 30] = 1.0
+    images = [Image(pixels, 1.0, (0.0, 0.0), "sheet.png") for pixels in (one, other, other.copy())]
+    recordings = [
+        Recording(replace(line(n).plan, pattern_names=("sheet",), patterns={"sheet": image}), line(n).readings)
+        for n, image in zip((4, 3, 2), images, strict=True)
+    ]
+    joined = join(recordings)
+    assert joined.plan.pattern_names[:2] == ("sheet", "sheet (2)")
+    np.testing.assert_array_equal(joined.plan.patterns["sheet (2)"].albedo, other)
 
 
 def test_a_recording_is_not_counted_twice():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 
@@ -64,13 +65,13 @@ def join_plans(plans: Sequence[Plan]) -> Plan:
     names: list[str] = []
     scan_names: list[str] = []
     codes, scans = [], []
-    for number, plan in enumerate(plans):
+    for plan in plans:
         renamed = []
         for name in plan.pattern_names:
             described = plan.patterns.get(name)
             own = name
             if described is not None and name in patterns and patterns[name] is not described:
-                own = name if repr(patterns[name]) == repr(described) else f"{name} ({number + 1})"
+                own = name if _is_same_pattern(patterns[name], described) else unused_name(name, {*names, *patterns})
             if described is not None:
                 patterns[own] = described
             if own not in names:
@@ -123,6 +124,12 @@ def _notes_on_missing_covariates(recordings: Sequence[Recording]) -> list[str]:
         for name in sorted({*other.plan.covariates} - {*first.plan.covariates, *COMMANDED}):
             out.append(f"column {name} of {_recording_label(other, k)} left out: {_recording_label(first, 0)} has none")
     return out
+
+
+def _is_same_pattern(one: Pattern, other: Pattern) -> bool:
+    """Return whether two patterns have the same kind and values; all pixels of an image count."""
+    own = (field.name for field in fields(one))
+    return type(one) is type(other) and all(np.array_equal(getattr(one, k), getattr(other, k)) for k in own)
 
 
 def _is_same_recording(one: Recording, other: Recording) -> bool:

@@ -246,7 +246,10 @@ def test_a_file_in_place_of_the_output_directory_is_refused(verb, sensor_file, r
 
 
 def test_a_prediction_does_not_overwrite_its_plan(sensor_file, recording_file, tmp_path, capsys):
-    refused(capsys, tmp_path / "x", "predict", sensor_file, recording_file, "--out", recording_file)
+    for its in (recording_file, recording_file.with_suffix(".json")):
+        before = its.read_bytes()
+        refused(capsys, tmp_path / "x", "predict", sensor_file, recording_file, "--out", its)
+        assert its.read_bytes() == before
 
 
 def test_a_run_that_stands_there_is_not_overwritten_by_a_new_one(sensor_file, tmp_path, capsys):

@@ -10,7 +10,7 @@ import pytest
 
 from probewise.calibration import read_sensor, write_sensor
 from probewise.cli import main
-from probewise.cli._output import staged_output
+from probewise.cli._output import holds_readings, staged_output
 from probewise.errors import FileError
 from probewise.recordings import read_recording, write_recording, write_text_atomically
 
@@ -75,6 +75,37 @@ def test_a_sensor_that_reads_in_another_unit_is_refused(sensor_file, recording_f
     assert main(["diagnose", str(recording_file), "--sensor", str(sensor_file), "--out", str(out)]) == 2
     assert "'LEGO'" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_search_does_not_replace_the_sensor_that_it_was_given(sensor_file, tmp_path, quick_frames, capsys):
+    before = sensor_file.read_bytes()
+    words = ("--sensor", sensor_file, "--truth", "500,250,90", "--trust", 1, "--max-readings", 1, "--out", tmp_path)
+    assert main([str(word) for word in ("explore", *words)]) == 0
+    assert (tmp_path / "sensor_kept.json").read_bytes() == before
+    assert "sensor_kept.json" in capsys.readouterr().out
+
+
+def test_a_calibration_does_not_replace_the_description_of_its_recording(recording_file, tmp_path, capsys):
+    recording = recording_file.rename(tmp_path / "sensor.csv")
+    recording_file.with_suffix(".json").rename(tmp_path / "sensor.json")
+    before = (tmp_path / "sensor.json").read_bytes()
+    words = ("calibrate", recording, "--orders", 1, "--live", 30, "--seed", 1, "--out", tmp_path)
+    assert main([str(word) for word in words]) == 0
+    assert (tmp_path / "sensor_kept.json").read_bytes() == before
+    assert "sensor_kept.json" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("header", ["x_mm,reading", "x_mm, reading", '"x_mm","reading"', "\nx_mm,reading"])
+def test_readings_are_seen_under_any_header_that_a_recording_may_have(header, tmp_path):
+    table = tmp_path / "next_plan.csv"
+    assert not holds_readings(table, "reading")
+    table.write_text(f"{header}\n1,\n2,\n")
+    assert not holds_readings(table, "reading")
+    table.write_text(f"{header}\n1,\n2,40\n")
+    assert holds_readings(table, "reading")
+    assert not holds_readings(table, "level")
+    table.write_text(f"{header}\n1\n2,40\n")
+    assert holds_readings(table, "level"), "a table that cannot be read is not replaced"
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from probewise.cli._common import print_result
-from probewise.cli._output import StagedFiles, checked_output_directory, staged_output
+from probewise.cli._output import StagedFiles, checked_output_directory, holds_readings, staged_output
 from probewise.cli._simulator import read_joined_table, refuse_sensor_options
 
 if TYPE_CHECKING:
@@ -74,15 +74,6 @@ def write_results(diagnosis: Diagnosis, drawn: dict[str, bytes], stage: StagedFi
 
 def _files_not_to_replace(arguments: argparse.Namespace, out: Path, reading: str) -> list[Path]:
     """List files that results must not replace: inputs, and an earlier next.csv with readings filled in."""
-    from probewise.errors import FileError
-    from probewise.recordings.table import read_table
-
     read = [*arguments.recordings, arguments.simulator]
     filled_in = out / "next.csv"
-    if filled_in.is_file():
-        try:
-            rows = read_table(filled_in)
-            read += [filled_in] if reading in rows.columns and any(rows.cells(reading)) else []
-        except FileError:
-            read.append(filled_in)
-    return read
+    return [*read, *([filled_in] if holds_readings(filled_in, reading) else [])]

@@ -98,6 +98,23 @@ def checked_output_file(path: Path, *inputs: Path) -> Path:
     return path
 
 
+def with_descriptions(tables: Sequence[Path]) -> list[Path]:
+    """Return each file of a table followed by its description, the JSON beside it."""
+    named = [table for table in tables if table.name]  # not "." and "/"
+    return [path for table in named for path in (table, table.with_suffix(".json"))]
+
+
+def holds_readings(table: Path, column: str) -> bool:
+    """Return whether a table has readings in this column, or cannot be read, so that it must not be replaced."""
+    from probewise.recordings.table import read_table  # imported here, since the help does not need it
+
+    try:
+        rows = read_table(table)
+    except FileError:
+        return table.is_file()
+    return column in rows.columns and any(rows.cells(column))
+
+
 @contextlib.contextmanager
 def staged_output(out: Path, *, inputs: Sequence[Path] = (), outdated: Sequence[str] = ()) -> Iterator[StagedFiles]:
     """Yield an empty directory; move its files into `out` only if the block succeeds.

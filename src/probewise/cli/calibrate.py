@@ -15,7 +15,7 @@ from probewise.cli._common import (
     print_result,
 )
 from probewise.cli._journal import refuse_journal
-from probewise.cli._output import checked_output_directory, staged_output
+from probewise.cli._output import checked_output_directory, staged_output, with_descriptions
 from probewise.errors import ParameterError
 from probewise.verbs import CALIBRATION, N_LIVE, ORDERS
 
@@ -99,11 +99,11 @@ def run(arguments: argparse.Namespace) -> int:
         prediction = predict(result.sensor, recording, progress=progress)
         progress("drawing the figures")
         drawn = report.encoded_figures(result, recording, prediction)
-        with staged_output(out) as stage:
+        with staged_output(out, inputs=with_descriptions([arguments.recording])) as stage:
             write_sensor(result.sensor, stage / "sensor.json")
             stage.write_figures(drawn)
             stage.write("report.html", report.page_html(result, recording, prediction, drawn, seed=arguments.seed))
-    for note in recording.notes:
+    for note in (*recording.notes, *stage.notes_on_renamed_inputs):
         print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"{result.sensor.summary()}\nseed {arguments.seed}; written to {out}", quiet=arguments.quiet)
     return 0

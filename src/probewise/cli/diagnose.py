@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 from probewise.cli._common import Verb, add_out_directory, add_path, add_seed_and_quiet, parse_path, print_result
 from probewise.cli._diagnose_system import diagnose_simulator
 from probewise.cli._journal import find_journal_sensor_file, is_journal, journal_recording_and_shape
-from probewise.cli._output import StagedFiles, checked_output_directory, staged_output
+from probewise.cli._output import (
+    StagedFiles,
+    checked_output_directory,
+    holds_readings,
+    staged_output,
+    with_descriptions,
+)
 from probewise.cli._simulator import add_simulator
 from probewise.errors import ParameterError
 
@@ -88,7 +94,8 @@ def run(arguments: argparse.Namespace) -> int:
         progress("drawing the figures")
         drawn = report.encoded_figures(diagnosis)
         source = ", ".join(path.name for path in arguments.recordings)
-        with staged_output(out, inputs=_files_not_to_replace(arguments, out), outdated=OF_ONE_RUN) as stage:
+        read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
+        with staged_output(out, inputs=files_not_to_replace(read, out), outdated=OF_ONE_RUN) as stage:
             write_results(diagnosis, drawn, stage, rng=files_rng)
             page = report.page_html(diagnosis, drawn, source=source, seed=arguments.seed, audit=audit)
             stage.write("report.html", page)
@@ -129,16 +136,12 @@ def generators_of_diagnosis(seed: int) -> Sequence[np.random.Generator]:
     return np.random.default_rng(seed).spawn(3)
 
 
-def _files_not_to_replace(arguments: argparse.Namespace, out: Path) -> list[Path]:
+def files_not_to_replace(read: Sequence[Path], out: Path) -> list[Path]:
     """List files that results must not replace: inputs, and an earlier next plan with readings filled in."""
     from probewise.diagnosis import NEXT_PLAN
 
-    read = [*arguments.recordings, *([] if arguments.sensor is None else [arguments.sensor])]
     filled_in = out / NEXT_PLAN
-    if filled_in.is_file():
-        header = filled_in.read_text(encoding="utf-8-sig", errors="replace").partition("\n")[0]
-        read += [filled_in] if "reading" in header.strip().split(",") else []
-    return [path for csv in read for path in (csv, csv.with_suffix(".json"))]
+    return with_descriptions([*read, *([filled_in] if holds_readings(filled_in, "reading") else [])])
 
 
 def write_results(

@@ -7,6 +7,7 @@ import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probewise.cli._arm import ARMS, ArmName, add_geometry, geometry_of, parse_arm, parse_place, prompter
@@ -92,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from probewise._progress import progress_shown
     from probewise.calibration import read_sensor
-    from probewise.cli.diagnose import OF_ONE_RUN, write_results
+    from probewise.cli.diagnose import OF_ONE_RUN, files_not_to_replace, write_results
     from probewise.diagnosis import join
     from probewise.investigation import Budget, Investigation, RoundsFolder, SimulatedRecorder, investigate
     from probewise.recordings import Recording, fingerprint, write_recording
@@ -153,10 +154,11 @@ def run(arguments: argparse.Namespace) -> int:
     found = Investigation(tuple(rounds))
     diagnosis = found.last.diagnosis
     drawing = progress_shown(quiet=arguments.quiet)
+    read = [Path(arguments.plan), *([] if arguments.sensor is None else [arguments.sensor])]
     with (
         reporting_what_is_kept(kept_message, results=True),
         drawing as progress,
-        staged_output(out, outdated=OF_ONE_RUN) as stage,
+        staged_output(out, inputs=files_not_to_replace(read, out), outdated=OF_ONE_RUN) as stage,
     ):
         progress("drawing the report")
         drawn = of_a_diagnosis.encoded_figures(diagnosis)
@@ -169,6 +171,8 @@ def run(arguments: argparse.Namespace) -> int:
     print_result(found.summary(), quiet=arguments.quiet)
     if concealed is not None:
         print_result(f"concealed    {', '.join(concealed) or 'nothing'}", quiet=arguments.quiet)
+    for note in stage.notes_on_renamed_inputs:
+        print_result(f"note: {note}", quiet=arguments.quiet)
     print_result(f"written to {out}", quiet=arguments.quiet)
     return 0
 

@@ -42,6 +42,22 @@ def test_a_damaged_file_is_refused(result: NestedResult, tmp_path: Path) -> None
         NestedResult.load(path)
 
 
+def test_a_file_with_a_wrong_byte_is_refused_or_read_as_it_was(result: NestedResult, tmp_path: Path) -> None:
+    path = tmp_path / "run.npz"
+    result.save(path)
+    whole = path.read_bytes()
+    refused = 0
+    for at in range(0, len(whole), len(whole) // 150):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 0xFF]) + whole[at + 1 :])
+        try:
+            back = NestedResult.load(path)
+        except FileError:
+            refused += 1
+        else:
+            np.testing.assert_array_equal(back.theta, result.theta)
+    assert refused > 100
+
+
 def test_a_file_of_another_format_says_so_even_where_its_arrays_have_other_names(
     result: NestedResult, tmp_path: Path
 ) -> None:

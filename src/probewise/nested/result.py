@@ -6,7 +6,6 @@ import io
 import json
 import math
 import platform
-import zipfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -289,7 +288,7 @@ class NestedResult(DeadPoints):
                 arrays = {name: file[name] for name in _ARRAYS} if found == _FORMAT else {}
         except FileNotFoundError as error:
             raise FileError(path, "there is no such file", "a file written by NestedResult.save") from error
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except Exception as error:  # a damaged archive can raise whatever its parts do
             # NumPy takes any other file for a pickle, and its message would advise to load it.
             why = "no NumPy archive" if "pickle" in str(error) else error
             raise FileError(path, f"unreadable ({why})", "a file written by NestedResult.save") from error

@@ -20,6 +20,7 @@ from probewise.nested.result import Agreement, Check, NestedResult, software_ver
 
 # p value below which runs disagree: one false alarm in 1000 merges.
 _DISAGREE = 1e-3
+_LEAST_ERROR = 1e-12
 
 
 def merge(results: Iterable[NestedResult], *, rng: np.random.Generator) -> NestedResult:
@@ -136,7 +137,8 @@ def agreement_of(results: Iterable[NestedResult]) -> Agreement:
         log_z_error += [result.log_z_error] if runs is None else runs.log_z_error
     if len(log_z) < 2:
         raise ParameterError("results", f"{len(log_z)} runs", "two runs or more")
-    weight = 1.0 / np.square(log_z_error)
+    # A constant likelihood has an exact evidence: the error is nought, or a last digit.
+    weight: FloatArray = np.maximum(log_z_error, _LEAST_ERROR) ** -2.0
     middle = float(weight @ log_z / weight.sum())
     chi_square = float(weight @ np.square(np.asarray(log_z) - middle))
     return Agreement(tuple(log_z), tuple(log_z_error), chi_square, float(chdtrc(len(log_z) - 1, chi_square)))

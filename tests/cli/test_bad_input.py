@@ -86,6 +86,8 @@ def test_a_damaged_recording_is_refused_in_one_line(verb, harm, recording_file, 
         ),
         (("study", "--model", "naive", "--learn-sensor"), "learn_sensor is True; allowed: False with"),
         (("study", "--model", "naive", "--width", "1.3"), "width is 1.3; allowed: 1.0 with"),
+        (("study", "--concealed", "--beside-paper"), "--beside-paper is 'given'; allowed: none with --concealed"),
+        (("study", "--concealed", "--seed", "-1"), "'-1' is not a whole number of 0 or more"),
         (("study", "--batch", "3", "--utility", "entropy"), "batch is 3; allowed: 1, or more with"),
     ],
 )

@@ -7,7 +7,7 @@ import shlex
 from functools import partial
 from typing import TYPE_CHECKING
 
-from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, print_result
+from probewise.cli._common import Verb, add_count, add_out_directory, add_quiet, positive_int, print_result, seed_number
 from probewise.cli._executor import add_executor, executor_and_progress, message_to_resume_campaign
 from probewise.cli._output import checked_output_directory, staged_output
 from probewise.cli._stopping import reporting_what_is_kept
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "without doubt about the sensor (writes report.html and concealed.csv; replaces all other rows)",
     )
     parser.add_argument(
-        "--seed", type=int, metavar="S", help="with --concealed: circles, noise and robot of another seed"
+        "--seed", type=seed_number, metavar="S", help="with --concealed: circles, noise and robot of another seed"
     )
     parser.add_argument("--size", choices=_SIZES, help="with --concealed: only this one of the three sizes")
     add_count(parser, "--clean", "with --concealed: circles of the row without a concealed effect")
@@ -104,6 +104,7 @@ def _run_concealed(arguments: argparse.Namespace, out: Path) -> int:
     from probewise.study import concealed_rows, concealed_table, run_concealed
 
     others = [f"--{name.replace('_', '-')}" for name in (*_FACTORS, "quoted") if getattr(arguments, name) is not None]
+    others += ["--beside-paper"] if arguments.beside_paper else []
     if others:
         raise ParameterError(others[0], "given", "none with --concealed, which has its own rows")
     out.mkdir(parents=True, exist_ok=True)

@@ -68,11 +68,12 @@ def test_an_empty_name_is_not_the_directory_one_is_in(verb, recording_file, caps
     assert "names no file or directory" in capsys.readouterr().err
 
 
-def test_a_sensor_that_reads_in_another_unit_is_refused(sensor_file, recording_file, tmp_path, capsys):
+@pytest.mark.parametrize("verb", ["diagnose", "audit"])
+def test_a_sensor_that_reads_in_another_unit_is_refused(verb, sensor_file, recording_file, tmp_path, capsys):
     text = recording_file.with_suffix(".json").read_text()
     recording_file.with_suffix(".json").write_text(text.replace('"LEGO"', '"mW"'))
     out = tmp_path / "out"
-    assert main(["diagnose", str(recording_file), "--sensor", str(sensor_file), "--out", str(out)]) == 2
+    assert main([verb, str(recording_file), "--sensor", str(sensor_file), "--out", str(out)]) == 2
     assert "'LEGO'" in capsys.readouterr().err
     assert not out.exists()
 

@@ -30,7 +30,12 @@ from probewise.diagnosis.audit.detectability import (
 )
 from probewise.diagnosis.fitting.coordinates import FARTHEST, LEAST_READINGS, CalibratedSensor, default_sensor
 from probewise.diagnosis.fitting.free_form import FreeFormSensor
-from probewise.diagnosis.fitting.sensor_prior import SensorPrior, require_sensor_prior, sensor_from_samples
+from probewise.diagnosis.fitting.sensor_prior import (
+    SensorPrior,
+    require_same_unit,
+    require_sensor_prior,
+    sensor_from_samples,
+)
 from probewise.diagnosis.joining import join_plans
 from probewise.diagnosis.light_sensor.sensor import LightSensor
 from probewise.diagnosis.verdict_report.diagnosis import Diagnosis
@@ -249,7 +254,8 @@ def audit_plan(
     Raises
     ------
     ParameterError
-        If the plan has no row, or a pattern that its description lacks, or the noise is not above 0.
+        If the plan has no row, or a pattern that its description lacks, or another unit than the sensor, or the noise
+        is not above 0.
     """
     if isinstance(plan, Recording):
         plan = plan.plan
@@ -259,6 +265,8 @@ def audit_plan(
     if len(plan) == 0:
         raise ParameterError("plan", "no row", "at least one")
     require_described(plan)
+    if sensor is not None:
+        require_same_unit(sensor, plan)
     if noise_sd is None and isinstance(sensor, FittedSensor):
         noise_sd = float(sensor.noise_sd.mean())
     expected, said = _expected_sensor_and_description(plan, sensor, noise_sd)

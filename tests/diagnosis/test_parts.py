@@ -469,6 +469,23 @@ def test_a_covariate_that_a_later_recording_lacks_stays_as_it_was_last_known():
     ]
 
 
+def test_a_range_or_height_that_a_later_recording_declares_in_another_way_is_told():
+    first, second = line(4), line(3)
+    low, high = (
+        Recording(
+            replace(own.plan, instrumentation=replace(own.plan.instrumentation, max=most, height_mm=height)),
+            own.readings,
+            name,
+        )
+        for own, most, height, name in ((first, 5.0, None, "one.csv"), (second, None, 20.0, "two.csv"))
+    )
+    assert join([low, high]).notes == (
+        "two.csv declares no value for max: taken is 5, that of one.csv",
+        "two.csv declares 20 for height_mm: taken is none, as one.csv",
+    )
+    assert join([low, replace(low, readings=low.readings + 0.1)]).notes == ()
+
+
 def test_recordings_of_other_units_are_not_joined():
     with pytest.raises(ParameterError, match="volt"):
         join([line(), line(unit="volt")])

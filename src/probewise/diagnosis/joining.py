@@ -21,7 +21,8 @@ def join(recordings: Sequence[Recording]) -> Recording:
     """Concatenate recordings: scans remain distinct, and so do patterns of one name with different descriptions.
 
     A covariate of the first, such as battery voltage, keeps its last known value in recordings that lack it; one that
-    the first lacks is left out; notes say so. Times are unchanged.
+    the first lacks is left out. The range, step and height that the first declares count for all; notes say so. Times
+    are unchanged.
 
     Raises
     ------
@@ -51,7 +52,7 @@ def join(recordings: Sequence[Recording]) -> Recording:
         join_plans([recording.plan for recording in recordings]),
         np.concatenate([np.where(r.usable, r.readings, np.nan) for r in recordings]),
         " + ".join(r.source for r in recordings if r.source),
-        (*notes, *_notes_on_missing_covariates(recordings)),
+        (*notes, *_notes_on_missing_covariates(recordings), *_notes_on_other_instrumentation(recordings)),
     )
 
 
@@ -123,6 +124,19 @@ def _notes_on_missing_covariates(recordings: Sequence[Recording]) -> list[str]:
             out.append(f"{_recording_label(other, k)} has no column {name}: taken to be there as it was last known")
         for name in sorted({*other.plan.covariates} - {*first.plan.covariates, *COMMANDED}):
             out.append(f"column {name} of {_recording_label(other, k)} left out: {_recording_label(first, 0)} has none")
+    return out
+
+
+def _notes_on_other_instrumentation(recordings: Sequence[Recording]) -> list[str]:
+    """List what later recordings declare of their readings in another way than the first, whose values are taken."""
+    first, out = recordings[0], []
+    for k, other in enumerate(recordings[1:], 1):
+        for name in ("min", "max", "step", "height_mm"):
+            own, taken = (getattr(recording.plan.instrumentation, name) for recording in (other, first))
+            if own != taken:
+                label, value = _recording_label(other, k), "no value" if own is None else f"{own:g}"
+                as_first = "none, as" if taken is None else f"{taken:g}, that of"
+                out.append(f"{label} declares {value} for {name}: taken is {as_first} {_recording_label(first, 0)}")
     return out
 
 

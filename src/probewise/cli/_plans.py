@@ -13,11 +13,15 @@ if TYPE_CHECKING:
     from probewise.recordings import Plan
 
 
+SHIPPED = ("paper", "two_way")
+"""Names of the plans that ship."""
+
+
 def read_or_shipped_plan(text: str) -> Plan:
     """Return the shipped plan "paper" or "two_way", or read a plan from the file of that name."""
     from probewise.recordings import paper_plan, read_plan, two_way_plan
 
-    shipped = {"paper": paper_plan, "two_way": two_way_plan}
+    shipped = dict(zip(SHIPPED, (paper_plan, two_way_plan), strict=True))
     return shipped[text]() if text in shipped else read_plan(text)
 
 

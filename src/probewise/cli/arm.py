@@ -40,7 +40,13 @@ from probewise.cli._common import (
     seed_number,
 )
 from probewise.cli._output import checked_output_file
-from probewise.cli._plans import plan_for_lego_arm, plan_for_own_instrument, without_measured_covariates
+from probewise.cli._plans import (
+    SHIPPED,
+    plan_for_lego_arm,
+    plan_for_own_instrument,
+    read_or_shipped_plan,
+    without_measured_covariates,
+)
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import FileError, LinkError, ParameterError
 
@@ -49,7 +55,6 @@ if TYPE_CHECKING:
     from probewise.cli._bench import Bench
     from probewise.recordings import Plan
 
-PAPER = "paper"
 MARKS = "marks"
 _COLUMNS = "x_mm,y_mm,orientation_deg,time_s,reading"
 _MOST_READINGS = 100_000  # limit of one scan
@@ -153,7 +158,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         arms=_ALL_ARMS,
     )
     record.add_argument(
-        "plan", metavar="PLAN.csv", help=f"plan or recording, its JSON beside it; or {PAPER} or two_way, which ship"
+        "plan",
+        metavar="PLAN.csv",
+        help=f"plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship",
     )
     record.add_argument("--out", type=parse_path, required=True, metavar="REC.csv", help="where the recording goes")
     record.add_argument(
@@ -496,12 +503,12 @@ def _record_plan(arguments: argparse.Namespace, geometry: Geometry) -> None:
     from probewise.arm.carry_out import BY_HAND_S, duration_s
     from probewise.cli._person import PersonAtBench, is_pty
     from probewise.cli._sheet_check import SheetCheck
-    from probewise.recordings import paper_plan, read_plan, read_recording, write_recording
+    from probewise.recordings import read_recording, write_recording
 
-    named = arguments.plan == PAPER
+    named = arguments.plan in SHIPPED
     out = checked_output_file(arguments.out, *([] if named else [Path(arguments.plan)]))
     own = _is_own_instrument(arguments)
-    asked = paper_plan() if named else read_plan(arguments.plan)
+    asked = read_or_shipped_plan(arguments.plan)
     if own:
         plan = plan_for_own_instrument(asked, unit=arguments.unit, range_=arguments.range, step=arguments.step)
     elif arguments.sensor is not None:

@@ -23,7 +23,7 @@ from probewise.cli._common import (
     print_result,
 )
 from probewise.cli._output import checked_output_directory, staged_output
-from probewise.cli._plans import plan_for_lego_arm, plan_for_own_instrument, read_or_shipped_plan
+from probewise.cli._plans import SHIPPED, plan_for_lego_arm, plan_for_own_instrument, read_or_shipped_plan
 from probewise.cli._stopping import reporting_what_is_kept
 from probewise.errors import ParameterError
 
@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from probewise.investigation import RoundsFolder, Take
     from probewise.recordings import Plan
     from probewise.world import World
-
-PLANS = ("paper", "two_way")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--plan",
         required=True,
         metavar="PLAN.csv",
-        help=f"the first plan: a plan or recording, its JSON beside it; or {' or '.join(PLANS)}, which ship",
+        help=f"the first plan: a plan or recording, its JSON beside it; or {' or '.join(SHIPPED)}, which ship",
     )
     parser.add_argument(
         "--origin-mm",
@@ -154,7 +152,8 @@ def run(arguments: argparse.Namespace) -> int:
     found = Investigation(tuple(rounds))
     diagnosis = found.last.diagnosis
     drawing = progress_shown(quiet=arguments.quiet)
-    read = [Path(arguments.plan), *([] if arguments.sensor is None else [arguments.sensor])]
+    read = [] if arguments.plan in SHIPPED else [Path(arguments.plan)]
+    read += [] if arguments.sensor is None else [arguments.sensor]
     with (
         reporting_what_is_kept(kept_message, results=True),
         drawing as progress,

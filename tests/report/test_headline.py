@@ -17,7 +17,19 @@ NAMES = sorted(VOCABULARY)
 PLAN = SimpleNamespace(instrumentation=Instrumentation())
 
 
-def found(verdict, combination=(), *, p_value=1e-9, after=0.5, rivals=(), shares=None, n=408, few=False, beside=()):
+def found(
+    verdict,
+    combination=(),
+    *,
+    p_value=1e-9,
+    after=0.5,
+    rivals=(),
+    shares=None,
+    n=408,
+    few=False,
+    beside=(),
+    withdrawn=False,
+):
     named = [EffectFound(name, 0.9, 20.0 - k, "", ()) for k, name in enumerate((*combination, *beside))]
     stated = [Hypothesis(tuple(names), 0.9 / max(len(rivals), 1)) for names in rivals]
     return SimpleNamespace(
@@ -29,7 +41,7 @@ def found(verdict, combination=(), *, p_value=1e-9, after=0.5, rivals=(), shares
         improvement=SimpleNamespace(p_value_after=after),
         effects=tuple(named) if combination != ("unknown",) else (),
         hypotheses=tuple(stated) or (Hypothesis(tuple(combination), 0.99),),
-        judged=SimpleNamespace(unknown_shares=shares or {}, too_little=few),
+        judged=SimpleNamespace(unknown_shares=shares or {}, too_little=few, withdrawn=withdrawn),
     )
 
 
@@ -93,6 +105,18 @@ def test_nothing_is_no_rival_of_something_missing():
         said
         == "These readings cannot tell whether anything is missing; if so, most likely a sensor that follows slowly."
     )
+
+
+def test_only_of_an_effect_that_was_withdrawn_it_is_said_that_it_predicts_worse():
+    said = headline(found("cannot_tell", rivals=(("lag",),), withdrawn=True))
+    assert said.endswith("a sensor that follows slowly fits best, but predicts new readings worse.")
+    said = headline(found("cannot_tell", rivals=(("lag",),)))
+    assert said == "Something is missing, but these readings cannot tell what."
+
+
+def test_many_rivals_of_which_none_is_probable_are_not_named():
+    said = headline(found("cannot_tell", rivals=[(name,) for name in NAMES[:12]]))
+    assert said == "Something is missing, but these readings cannot tell what."
 
 
 def test_what_is_missing_after_the_repair_is_said():

@@ -86,14 +86,15 @@ def _undecided_versions(diagnosis: Diagnosis) -> list[str]:
         plain = "These readings cannot tell whether anything is missing"
         return [f"{plain}; if so, most likely {hypothesis_in_words(leading)}.", f"{plain}."]
     rivals = [h.effects for h in diagnosis.hypotheses[:_MOST_RIVALS] if h.probability > _RIVAL]
-    said = [
-        f"Something is missing: {_join_rival_hypotheses(rivals[:n])}; these readings cannot tell which." for n in (3, 2)
-    ]
-    if len(rivals) < len(said):
+    said = []
+    if len(rivals) > 1:
         said = [
-            f"Something is missing; {hypothesis_in_words(name)} fits best, but predicts new readings worse."
-            for name in rivals
+            f"Something is missing: {_join_rival_hypotheses(rivals[:n])}; these readings cannot tell which."
+            for n in (3, 2)
         ]
+    elif diagnosis.judged.withdrawn:
+        leader = hypothesis_in_words(diagnosis.hypotheses[0].effects)
+        said = [f"Something is missing; {leader} fits best, but predicts new readings worse."]
     return [*said, "Something is missing, but these readings cannot tell what."]
 
 

@@ -6,7 +6,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from probewise._arrays import FloatArray
+from probewise._arrays import FloatArray, IntArray
 from probewise.calibration import SSFPrior, default_prior
 from probewise.calibration.compensation import CompensatedShapeProposal
 from probewise.calibration.faint_gaussian_reference import FaintGaussianReference, has_uniform_light
@@ -51,6 +51,12 @@ def references(
     }
 
 
+def _possible_rows(prior: SSFPrior, drawn: FloatArray, n_bright: int) -> IntArray:
+    """Return the rows of draws that the prior allows, with this number of bright Gaussians."""
+    alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
+    return alive[np.isfinite(prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == n_bright)]
+
+
 @pytest.mark.parametrize(("n", "m"), PARTS)
 def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
     references: dict[tuple[int, int], FaintGaussianReference], recording: Recording, n: int, m: int
@@ -61,8 +67,7 @@ def test_weights_turn_draws_of_the_reference_into_those_of_the_prior(
     rest, below = _sorted_draws(default_prior(recording, n - 1), 20_000, m, rng)
     drawn = reference.draw(rest, rng=rng)
     weight = np.zeros(len(drawn))
-    alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
-    alive = alive[np.isfinite(reference.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == m)]
+    alive = _possible_rows(reference.prior, drawn, m)
     coordinates = reference.prior.coordinates
     drawn[alive] = coordinates.leave(coordinates.enter(drawn[alive]))[0]
     weight[alive] = below * np.exp(-reference.log_density_over_prior(drawn[alive]))
@@ -93,8 +98,7 @@ def test_weights_turn_draws_from_below_and_about_a_peak_into_those_of_the_prior(
     seeded = MixedReference(references[2, 1], peaks, 0.0)
     drawn = seeded.draw(_sorted_draws(default_prior(recording, 1), 10_000, 1, rng)[0], rng=rng)
     weight = np.zeros(len(drawn))
-    alive = np.flatnonzero(np.isfinite(drawn).all(axis=1))
-    alive = alive[np.isfinite(seeded.prior.log_prob(drawn[alive])) & (count_bright(drawn[alive]) == 1)]
+    alive = _possible_rows(seeded.prior, drawn, 1)
     coordinates = seeded.prior.coordinates
     weight[alive] = np.exp(-seeded.log_density_over_prior(coordinates.leave(coordinates.enter(drawn[alive]))[0]))
     # The lighter of two uniform numbers is below a tenth of the other.

@@ -229,17 +229,14 @@ def update(
     )
     degrees = n_resampled - previous.n_resampled
     hurried, with_ease = previous.hurried or degrees >= _MANY_DEGREES, degrees <= 1 and not strained
-    return Particles(
-        found,
-        ancestor,
-        previous.start_variance,
-        n_resampled,
-        strained,
-        hurried,
-        previous.refitted and with_ease,
-        previous.log_z_limit,
-        previous.limit_is_searched,
-        previous.searched_at,
+    return replace(
+        previous,
+        weighted=found,
+        ancestor=ancestor,
+        n_resampled=n_resampled,
+        strained=strained,
+        hurried=hurried,
+        refitted=previous.refitted and with_ease,
     )
 
 

@@ -147,11 +147,12 @@ def independent_start_with_evidence(particles: Particles, found: BridgedEvidence
     """Give the samples a new evidence, and make them an independent start: each is its own ancestor."""
     had = particles.weighted
     weighted = replace(had, log_z=found.log_z, log_z_error=found.error, n_calls=had.n_calls + found.n_calls)
-    start = Particles(weighted, np.arange(len(had.theta)), found.error**2)
     return replace(
-        start,
-        refitted=particles.refitted,
-        log_z_limit=particles.log_z_limit,
-        limit_is_searched=particles.limit_is_searched,
-        searched_at=particles.searched_at,
+        particles,
+        weighted=weighted,
+        ancestor=np.arange(len(had.theta)),
+        start_variance=found.error**2,
+        n_resampled=0,
+        strained=False,
+        hurried=False,
     )

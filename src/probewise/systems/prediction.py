@@ -23,6 +23,7 @@ from probewise.recordings.table import csv_text, number_text
 from probewise.sensor import NoiseParameters, Stage
 from probewise.sensor.stages import effects_with_columns
 from probewise.systems.fitted import FittedSystem, require_fitted_system
+from probewise.systems.forms.proposals_of_columns import INTEGRAL_OVER
 from probewise.systems.forms.rebinding import has_value_per_run, rebind_forms
 from probewise.systems.simulator import Simulator, table_for
 from probewise.systems.system import System, SystemChain
@@ -231,7 +232,7 @@ def bind_effects(fitted: FittedSystem, table: RunTable) -> list[NamedEffect[Any]
 def _asks_for_earlier_times(effect: str) -> bool:
     """Return whether an effect depends on what was at earlier times of the run: lag, delays, and doses."""
     if effect.startswith(PROPOSAL):
-        return "integral over" in effect
+        return INTEGRAL_OVER in effect
     return effect.partition(":")[0] in ("lag", "delay", "input_delay")
 
 

@@ -14,6 +14,9 @@ from probewise.systems.forms.about import ReferenceFit
 from probewise.systems.forms.form import Form, mean_with_sd
 from probewise.systems.table import RunTable
 
+INTEGRAL_OVER = "integral over"
+"""How the name of a formula says that it depends on earlier times of the run: a dose."""
+
 _N_DOSES = 9  # doses that are tried as the one at which the reading has changed by 1 - 1/e of the whole change
 _LEAST_DOSE, _MOST_DOSE = 0.02, 3.0  # of the largest dose in a run: beyond the latter the change is a straight line
 
@@ -69,7 +72,7 @@ def _dose_proposals(about: ReferenceFit, name: str, values: FloatArray) -> Itera
     each: dict[str, Callable[[FloatArray], FloatArray]] = {f"|{name} - {centre:.4g}|": lambda c: np.abs(c - centre)}
     if values.min() >= 0 or values.max() <= 0:
         each[f"|{name}|"] = np.abs
-    summed = f"integral over {table.time}" if table.has_varying_time else "sum over rows"
+    summed = f"{INTEGRAL_OVER} {table.time}" if table.has_varying_time else "sum over rows"
     for what, rate in each.items():
 
         def dose_at_rows(rows: RunTable, rate: Callable[[FloatArray], FloatArray] = rate) -> FloatArray:

@@ -31,6 +31,7 @@ from probewise.experiment import (
 from probewise.experiment.acquisition import ArmReachAndTravel, predict_and_rate_readings
 from probewise.experiment.arm_error import arm_error_in_posterior
 from probewise.experiment.checking import ENOUGH_BITS, NAMES, OutlineCoverage, bits_about_left_out
+from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.noise_rivals import (
     CorrelatedLikelihood,
@@ -156,11 +157,44 @@ def test_laws_of_the_noise_are_densities(law):
     assert total == pytest.approx(1.0, abs=0.01)
 
 
+NOISE_ON_A_SCALE = DeclaredNoise(sd=2.0, step=1.0, low=4.0, high=36.0)
+
+
+@pytest.mark.parametrize(
+    "law",
+    [
+        OutlierLikelihood(NOISE_ON_A_SCALE, np.array([0.1]), np.array([4.0])),
+        LostReadingLikelihood(NOISE_ON_A_SCALE, 4.0, 4.0, 36.0),
+        CorrelatedLikelihood(NOISE_ON_A_SCALE),
+        SignalDependentLikelihood(NOISE_ON_A_SCALE, 4.0, 36.0),
+        FlickerLikelihood(NOISE_ON_A_SCALE, (1.0, 3.0)),
+    ],
+)
+def test_readings_at_an_end_of_the_scale_cover_everything_beyond(law):
+    """The probabilities of all readings of a scale, both ends among them, add up to one."""
+    cells = np.arange(4.0, 37.0)
+    total = sum(math.exp(law.log_prob(np.array([cell]), np.array([[35.3]]))[0]) for cell in cells)
+    assert total == pytest.approx(1.0, abs=3e-3)
+
+
+def test_readings_at_an_end_of_the_scale_show_no_lattice():
+    """A bright field reads 100 again and again: as likely under coarser rounding as without it."""
+    noise = DeclaredNoise(sd=1.0, step=1.0, low=0.0, high=100.0)
+    readings, level = np.full(6, 100.0), np.full((1, 6), 101.0)
+    plain = Rounded(sd=1.0, step=1.0, low=0.0, high=100.0)
+    assert LatticeLikelihood(noise).log_prob(readings, level)[0] == pytest.approx(
+        plain.log_prob(readings, level)[0], abs=1e-3
+    )
+
+
 @pytest.mark.slow
 def test_rounded_laws_of_the_noise_are_probabilities_of_cells():
     cells = np.arange(-200.0, 271.0)
     shares, sizes = np.array([0.1]), np.array([3.0])
-    for law in (OutlierLikelihood(1.5, 1.0, shares, sizes), LostReadingLikelihood(1.5, 1.0, 10.0, 10.0, 60.0)):
+    for law in (
+        OutlierLikelihood(DeclaredNoise(1.5, 1.0), shares, sizes),
+        LostReadingLikelihood(DeclaredNoise(1.5, 1.0), 10.0, 10.0, 60.0),
+    ):
         total = sum(math.exp(law.log_prob(np.array([cell]), np.array([[35.3]]))[0]) for cell in cells)
         assert total == pytest.approx(1.0, abs=1e-3)
 
@@ -371,7 +405,7 @@ def test_rows_of_the_study_are_summed_up():
 
 def test_a_memory_of_the_noise_is_heard():
     """Errors that repeat each other are likelier under it, errors that do not under the plain noise."""
-    law, level = CorrelatedLikelihood(1.0, 0.0), np.full((1, 12), 35.0)
+    law, level = CorrelatedLikelihood(DeclaredNoise(1.0, 0.0)), np.full((1, 12), 35.0)
     alike, apart = 35.0 + np.full(12, 1.5), 35.0 + 1.5 * np.tile([1.0, -1.0, -1.0, 1.0], 3)
     plain = experiment_of(REFERENCE).likelihood
     gained = [float((law.log_prob(read, level) - plain.log_prob(read, level))[0]) for read in (alike, apart)]
@@ -380,7 +414,7 @@ def test_a_memory_of_the_noise_is_heard():
 
 
 def test_readings_on_a_lattice_are_no_chance():
-    law, level = LatticeLikelihood(1.0, 0.0), np.full((1, 8), 35.0)
+    law, level = LatticeLikelihood(DeclaredNoise(1.0, 0.0)), np.full((1, 8), 35.0)
     level[0, 4:] = 12.0
     plain = experiment_of(REFERENCE).likelihood
     coarse = np.array([35.0, 35.0, 40.0, 30.0, 10.0, 15.0, 10.0, 10.0])
@@ -393,7 +427,7 @@ def test_readings_on_a_lattice_are_no_chance():
 def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
     """Before a shape is seen all is black: readings of 10.0 and 5.0 are no lost ones, and places without a shape."""
     readings, level = np.array(read), np.full((1, len(read)), 9.0)
-    rounded, lost = LatticeLikelihood(1.0, 0.0), laws(LostReadingLikelihood)[0]
+    rounded, lost = LatticeLikelihood(DeclaredNoise(1.0, 0.0)), laws(LostReadingLikelihood)[0]
     assert rounded.log_prob(readings, level)[0] > lost.log_prob(readings, level)[0] + 2.0
     shared = np.array([10.0, 9.31, 10.72, 8.4, 10.0])  # two were lost, the others were read
     level = np.full((1, 5), 9.6)
@@ -401,7 +435,7 @@ def test_one_or_two_values_that_recur_are_rounded_rather_than_lost(read):
 
 
 def test_readings_that_are_rounded_as_declared_recur_by_nature():
-    law, level = LatticeLikelihood(0.6, 1.0), np.full((1, 6), 10.2)
+    law, level = LatticeLikelihood(DeclaredNoise(0.6, 1.0)), np.full((1, 6), 10.2)
     plain = Rounded(sd=0.6, step=1.0, low=1.0, high=100.0)
     for read in ([10.0] * 6, [10.0, 11.0, 10.0, 10.0, 11.0, 10.0]):
         assert law.log_prob(np.array(read), level)[0] == pytest.approx(
@@ -410,7 +444,10 @@ def test_readings_that_are_rounded_as_declared_recur_by_nature():
 
 
 def test_noise_that_grows_with_the_light_is_heard():
-    law, level = SignalDependentLikelihood(1.0, 0.0, 10.0, 60.0), np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12)
+    law, level = (
+        SignalDependentLikelihood(DeclaredNoise(1.0, 0.0), 10.0, 60.0),
+        np.repeat([[10.0, 60.0]], 6, axis=1).reshape(1, 12),
+    )
     read = level[0] + np.where(level[0] > 50, 4.0, 0.5) * np.tile([1.0, -1.0], 6)
     plain = experiment_of(REFERENCE).likelihood
     assert law.log_prob(read, level)[0] > plain.log_prob(read, level)[0] + 5.0

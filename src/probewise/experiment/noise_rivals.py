@@ -18,11 +18,9 @@ from probewise.effects import (
     Outliers,
     SignalDependentNoise,
     lattice_step,
-    log_density,
 )
-from probewise.effects.density import log_gaussian_density
+from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.priors import LogUniform
-from probewise.sensor import NoiseParameters
 
 _REACH = 5.0  # noise sds beyond its range that a sensor may read
 _SHARES = LogUniform(2e-3, 0.2).from_unit((np.arange(8) + 0.5) / 8)
@@ -50,21 +48,19 @@ def _log_mean_over_nodes(nodes: list[FloatArray]) -> FloatArray:
 class OutlierLikelihood:
     """Likelihood with outliers, marginalised over their share and width.
 
-    `sd` and `step` are those of the declared noise (step 0: not rounded); `shares` and `sizes`, (n_nodes,), are equally
-    weighted nodes.
+    `shares` and `sizes` (in sds of the declared noise), (n_nodes,), are equally weighted nodes.
     """
 
-    sd: float
-    step: float
+    noise: DeclaredNoise
     shares: FloatArray
     sizes: FloatArray
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        narrow = _log_density_per_reading(readings, predicted, self.sd, self.step)
+        narrow = self.noise.log_density(readings, predicted)
         nodes = []
         for share, size in zip(self.shares, self.sizes, strict=True):
-            wide = _quick_log_density_per_reading(readings, predicted, self.sd * size, self.step)
+            wide = self.noise.quick_log_density(readings, predicted, sd=self.noise.sd * size)
             nodes.append(np.logaddexp(narrow + math.log1p(-share), wide + math.log(share)).sum(axis=1))
         return _log_mean_over_nodes(nodes)
 
@@ -73,24 +69,22 @@ class OutlierLikelihood:
 class LostReadingLikelihood:
     """Likelihood with lost readings, independent of the target.
 
-    Lost readings are `black`, exactly or within the noise, or anything between `low` and `high`. `sd` and `step` are
-    those of the declared noise, here and in the likelihoods below.
+    Lost readings are `black`, exactly or within the noise, or anything between `low` and `high`.
     """
 
-    sd: float
-    step: float
+    noise: DeclaredNoise
     black: float
     low: float
     high: float
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        kept = _log_density_per_reading(readings, predicted, self.sd, self.step)
-        to_black = _log_density_per_reading(readings, np.array([[self.black]]), self.sd, self.step)
-        exactly = _log_density_per_reading(readings, np.array([[self.black]]), self.sd * _EXACT, self.step)
-        low, high = min(self.low - _REACH * self.sd, 0.0), self.high + _REACH * self.sd
-        within = (readings >= low) & (readings <= high)
-        anywhere = np.where(within, math.log((self.step or 1.0) / (high - low)), -np.inf)
+        sd, black = self.noise.sd, np.array([[self.black]])
+        kept = self.noise.log_density(readings, predicted)
+        to_black = self.noise.log_density(readings, black)
+        exactly = self.noise.log_density(readings, black, sd=sd * _EXACT)
+        low, high = min(self.low - _REACH * sd, 0.0), self.high + _REACH * sd
+        anywhere = self.noise.log_uniform_density(readings, low, high)
         lost = logsumexp(np.broadcast_arrays(exactly, to_black, anywhere), axis=0) - math.log(3.0)
         return _log_mean_over_nodes(
             [np.logaddexp(kept + math.log1p(-share), lost + math.log(share)).sum(axis=1) for share in _SHARES.tolist()]
@@ -101,18 +95,17 @@ class LostReadingLikelihood:
 class CorrelatedLikelihood:
     """Likelihood with AR(1) noise, marginalised over the correlation."""
 
-    sd: float
-    step: float
+    noise: DeclaredNoise
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
         before = np.zeros_like(predicted)
         before[:, 1:] = (readings - predicted)[:, :-1]
-        first = _log_density_per_reading(readings[:1], predicted[:, :1], self.sd, self.step)[:, 0]
+        first = self.noise.log_density(readings[:1], predicted[:, :1])[:, 0]
         nodes = []
         for rho in CorrelatedNoise().prior.from_unit_cube(_NODES)[:, 0].tolist():
-            sd = self.sd * math.sqrt(1.0 - rho**2)
-            later = _log_density_per_reading(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd, self.step)
+            sd = self.noise.sd * math.sqrt(1.0 - rho**2)
+            later = self.noise.log_density(readings[1:], predicted[:, 1:] + rho * before[:, 1:], sd=sd)
             nodes.append(first + later.sum(axis=1))
         return _log_mean_over_nodes(nodes)
 
@@ -124,8 +117,7 @@ class SignalDependentLikelihood:
     The signal runs from 0 at `dark` to 1 at `bright`.
     """
 
-    sd: float
-    step: float
+    noise: DeclaredNoise
     dark: float
     bright: float
 
@@ -134,9 +126,7 @@ class SignalDependentLikelihood:
         seen = np.clip((predicted - self.dark) / (self.bright - self.dark), 0.0, 1.0)
         return _log_mean_over_nodes(
             [
-                _log_density_per_reading(readings, predicted, self.sd * np.sqrt(1.0 + ratio * seen), self.step).sum(
-                    axis=1
-                )
+                self.noise.log_density(readings, predicted, sd=self.noise.sd * np.sqrt(1.0 + ratio * seen)).sum(axis=1)
                 for ratio in SignalDependentNoise().prior.from_unit_cube(_NODES)[:, 0].tolist()
             ]
         )
@@ -149,8 +139,7 @@ class FlickerLikelihood:
     `amplitudes` are equally weighted nodes. A sine of uniform phase is approximated by a mixture over a few phases.
     """
 
-    sd: float
-    step: float
+    noise: DeclaredNoise
     amplitudes: tuple[float, ...]
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
@@ -158,10 +147,9 @@ class FlickerLikelihood:
         sines = np.cos((np.arange(_PHASES) + 0.5) / _PHASES * np.pi)
         nodes = []
         for amplitude in self.amplitudes:
-            sd = math.hypot(self.sd, _PER_PHASE * amplitude)
+            sd = math.hypot(self.noise.sd, _PER_PHASE * amplitude)
             phases = [
-                _quick_log_density_per_reading(readings, predicted + amplitude * sine, sd, self.step)
-                for sine in sines.tolist()
+                self.noise.quick_log_density(readings, predicted + amplitude * sine, sd=sd) for sine in sines.tolist()
             ]
             nodes.append(_log_mean_over_nodes(phases).sum(axis=1))
         return _log_mean_over_nodes(nodes)
@@ -176,26 +164,33 @@ class LatticeLikelihood:
     its step is then marginalised over.
     """
 
-    sd: float
-    step: float
+    noise: DeclaredNoise
 
     def log_prob(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
         """Return log likelihoods of readings, (n_points,), given predictions, (n_samples, n_points) -> (n_samples,)."""
-        least = max(_COARSE * self.sd, 1.5 * self.step)
+        inside = self.noise.is_inside(readings)
+        if inside.all():
+            return self._log_prob_inside(readings, predicted)
+        at_end = self.noise.log_density(readings[~inside], predicted[:, ~inside]).sum(axis=1)
+        return np.asarray(at_end + self._log_prob_inside(readings[inside], predicted[:, inside]))
+
+    def _log_prob_inside(self, readings: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Return log likelihoods of readings that lie inside the scale, (n_samples,)."""
+        least = max(_COARSE * self.noise.sd, 1.5 * self.noise.step)
         steps, n_free = self._lattice_steps_and_n_free(readings)
         nodes = [
             self._log_prob_if_rounded_to(coarse, n_free, readings, predicted) for coarse in steps if coarse > least
         ]
         if not nodes:
-            return np.asarray(_log_density_per_reading(readings, predicted, self.sd, self.step).sum(axis=1))
+            return np.asarray(self.noise.log_density(readings, predicted).sum(axis=1))
         return _log_mean_over_nodes(nodes)
 
     def _lattice_steps_and_n_free(self, readings: FloatArray) -> tuple[list[float], int]:
         """Return possible steps of a lattice, equally weighted, and how many readings determine it."""
         values = np.unique(readings)
-        recur = not self.step and len(values) < len(readings)
+        recur = not self.noise.step and len(values) < len(readings)
         if recur and len(values) == 1:
-            return [times * self.sd for times in _STEPS], 1
+            return [times * self.noise.sd for times in _STEPS], 1
         if recur and len(values) == 2:
             return [float(values[1] - values[0])], _FREE
         return [lattice_step(readings)], _FREE
@@ -204,10 +199,10 @@ class LatticeLikelihood:
         self, coarse: float, n_free: int, readings: FloatArray, predicted: FloatArray
     ) -> FloatArray:
         """Return the log likelihood under rounding to `coarse`, (n_samples,)."""
-        fine = self.step or _EXACT * self.sd
-        surprise = (len(readings) - n_free) * math.log(coarse / fine)
-        density = _log_density_per_reading(readings, predicted, self.sd, coarse) - math.log(coarse)
-        return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(self.step) if self.step else 0.0))
+        step = self.noise.step
+        surprise = (len(readings) - n_free) * math.log(coarse / (step or _EXACT * self.noise.sd))
+        density = self.noise.log_density(readings, predicted, step=coarse) - math.log(coarse)
+        return np.asarray(density.sum(axis=1) + surprise + (len(readings) * math.log(step) if step else 0.0))
 
 
 NoiseLikelihood = (
@@ -220,13 +215,13 @@ NoiseLikelihood = (
 )
 
 
-def noise_likelihoods(sd: float, step: float, ends: tuple[float, float]) -> dict[str, NoiseLikelihood]:
+def noise_likelihoods(noise: DeclaredNoise, ends: tuple[float, float]) -> dict[str, NoiseLikelihood]:
     """Return the noise models by their names in the vocabulary.
 
     Parameters
     ----------
-    sd, step
-        Sd and rounding step of the declared noise; step 0: not rounded.
+    noise
+        The declared noise.
     ends
         Readings over black and over white.
     """
@@ -235,31 +230,10 @@ def noise_likelihoods(sd: float, step: float, ends: tuple[float, float]) -> dict
     shares, sizes = Outliers().bank()[:, 0].T
     amplitudes = HeavyTailedPrior(0.01 * (high - low), positive=True).from_unit((np.arange(6) + 0.5) / 6)
     return {
-        "outliers": OutlierLikelihood(sd, step, shares, sizes),
-        "dropouts": LostReadingLikelihood(sd, step, dark, low, high),
-        "correlated_noise": CorrelatedLikelihood(sd, step),
-        "signal_dependent_noise": SignalDependentLikelihood(sd, step, dark, bright),
-        "flicker": FlickerLikelihood(sd, step, tuple(amplitudes.tolist())),
-        "quantisation": LatticeLikelihood(sd, step),
+        "outliers": OutlierLikelihood(noise, shares, sizes),
+        "dropouts": LostReadingLikelihood(noise, dark, low, high),
+        "correlated_noise": CorrelatedLikelihood(noise),
+        "signal_dependent_noise": SignalDependentLikelihood(noise, dark, bright),
+        "flicker": FlickerLikelihood(noise, tuple(amplitudes.tolist())),
+        "quantisation": LatticeLikelihood(noise),
     }
-
-
-def _log_density_per_reading(
-    readings: FloatArray, predicted: FloatArray, sd: float | FloatArray, step: float
-) -> FloatArray:
-    """Return the log density of each reading, or log probability of its cell, (n_samples, n_points)."""
-    if not step:
-        return log_gaussian_density(readings, predicted, sd)
-    noise = NoiseParameters(np.atleast_2d(np.asarray(sd)), np.zeros((1, 1)), step=np.array([[step]]))
-    return np.asarray(log_density(noise, readings, predicted) + math.log(step))
-
-
-def _quick_log_density_per_reading(readings: FloatArray, predicted: FloatArray, sd: float, step: float) -> FloatArray:
-    """Return the same as `_log_density_per_reading`, faster if the noise is wider than the cell.
-
-    Then the density at the middle of the cell is used, with the variance of a uniform cell added.
-    """
-    if sd < step:
-        return _log_density_per_reading(readings, predicted, sd, step)
-    wide = math.hypot(sd, step / math.sqrt(12.0))
-    return log_gaussian_density(readings, predicted, wide) + (math.log(step) if step else 0.0)

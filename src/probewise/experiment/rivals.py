@@ -27,10 +27,10 @@ from probewise.effects import (
     OffsetDrift,
 )
 from probewise.errors import ParameterError
+from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.experiment.effect_with_run_prior import EffectWithRunPrior
 from probewise.experiment.noise_rivals import noise_likelihoods
 from probewise.experiment.pace import EACH_S, DescribedEffect, EffectInRunTime, FromRest
-from probewise.inference import GaussianKnown, Rounded
 from probewise.inference.problem import Likelihood
 from probewise.inquiry import cards_of
 from probewise.recordings.plan import Instrumentation, Plan
@@ -113,9 +113,9 @@ def rivals_of(
         effect = VOCABULARY[name].for_extent(Extent(ends[0], ends[1], _plan_there_and_back(reach_mm)))
         if effect is not None and name not in carried:
             found += [SensorModelRival(name, effect=way) for way in _forms_of_effect_in_run(effect, field_mm)]
-    noise = declared_noise(likelihood)
+    noise = DeclaredNoise.of(likelihood)
     if noise is not None:
-        laws = noise_likelihoods(*noise, (model.levels.i_min, model.levels.i_max))
+        laws = noise_likelihoods(noise, (model.levels.i_min, model.levels.i_max))
         found += [SensorModelRival(name, likelihood=law) for name, law in laws.items()]
     return tuple(found)
 
@@ -151,15 +151,6 @@ class GainLoss(GainDrift):
             f"the signal {way} by {100 * abs(mean[0]):.2g} % in the end, {100 * abs(mean[0]) / mean[1] * 60:.2g} % in "
             "the first minute of this: the lamp or its battery changes"
         )
-
-
-def declared_noise(likelihood: Likelihood) -> tuple[float, float] | None:
-    """Return the noise's sd and rounding step (0: not rounded) of a likelihood of known sd; None for any other."""
-    if isinstance(likelihood, Rounded):
-        return likelihood.sd, likelihood.step
-    if isinstance(likelihood, GaussianKnown) and np.ndim(likelihood.sd) == 0:
-        return float(np.asarray(likelihood.sd)), 0.0
-    return None
 
 
 def _plan_there_and_back(length_mm: float) -> Plan:

@@ -11,11 +11,11 @@ import numpy as np
 
 from probewise._arrays import FloatArray
 from probewise.errors import DoubtfulResultWarning, NotConvergedError
+from probewise.experiment.declared_noise import DeclaredNoise
 from probewise.experiment.evidence import BridgedEvidence, posterior_sampled_about_points
 from probewise.experiment.kinds import HypothesisKind
 from probewise.experiment.particles import Particles
 from probewise.experiment.refitted import fit_kind, sampled_about_fits
-from probewise.experiment.rivals import declared_noise
 from probewise.inference.problem import SensorProblem
 from probewise.nested.importance import Weighted
 from probewise.nested.result import NestedResult
@@ -72,11 +72,11 @@ def sample_near_other_kinds(
 
     No samples are drawn if the largest log evidence by fits is below `hopeless`.
     """
-    noise = declared_noise(kind.likelihood)
+    noise = DeclaredNoise.of(kind.likelihood)
     if kind.effect is not None:
         if noise is None:
             return SamplesAnew(None)
-        sd = math.hypot(noise[0], noise[1] / math.sqrt(12.0))
+        sd = math.hypot(noise.sd, noise.step / math.sqrt(12.0))
         found = fit_kind(kind, problem, donors, noise_sd=sd, rng=rng)
         is_reproduced = found.n_as_good_as_best >= _REPRODUCED
         if found.highest_log_z < hopeless:

@@ -22,7 +22,9 @@ from probewise.scene import (
     Rectangle,
     RegularPolygon,
     StripesRegion,
+    mean_angles,
     outlines,
+    with_angles_near,
 )
 
 SHAPES = {
@@ -74,6 +76,26 @@ def test_regions_are_one_a_hypothesis_and_equal_one_by_one(shape):
     for i in range(12):
         one = shape.region(theta[i : i + 1])
         assert np.array_equal(whole.albedo(points)[i], one.albedo(points)[0])
+
+
+def test_parameters_with_turned_angles_describe_the_same_shapes(shape):
+    """Rectangles swap their sides with every odd turn; a point at an edge may fall on either side of it."""
+    rng = np.random.default_rng(2)
+    theta, points = draws(shape, 40), rng.uniform(0, 1, (300, 2)) * [1048, 520]
+    angles = np.where(["angle_rad" in name for name in shape.prior.names], rng.uniform(4, 9, theta.shape[1]), np.nan)
+    turned = with_angles_near(shape, theta, angles)
+    assert np.mean(shape.region(turned).albedo(points) != shape.region(theta).albedo(points)) < 1e-3
+    assert np.array_equal(turned, theta) != np.isfinite(angles).any()
+
+
+def test_angles_at_both_ends_of_their_range_have_a_mean_between_them():
+    """An upright rectangle: half its samples turn by 0.02, the others, with the sides swapped, by pi/2 - 0.02."""
+    theta = np.array([[500.0, 250.0, 80.0, 120.0, 0.02], [500.0, 250.0, 120.0, 80.0, np.pi / 2 - 0.02]])
+    weight = np.array([0.5, 0.5])
+    near = with_angles_near(Rectangle(), theta, mean_angles(Rectangle(), theta, weight))
+    sides = {tuple(row) for row in near[:, 2:4].tolist()}
+    assert sides in ({(80.0, 120.0)}, {(120.0, 80.0)})
+    assert np.ptp(near[:, 4]) == pytest.approx(0.04)
 
 
 @pytest.mark.parametrize("name", [name for name in SHAPES if "inside" in name])

@@ -31,6 +31,7 @@ from probewise.inference.problem import checked_log_prob
 from probewise.nested.importance import Weighted
 from probewise.recordings.plan import Recording
 from probewise.scene.shapes import AnyOf
+from probewise.scene.symmetry import with_angles_near
 
 _STEP_SD = 0.25  # of each independent error and of the shape's parameters, either way, over which slopes are taken
 _STEP_MM, _STEP_RAD = 0.05, 1e-3  # over which those of the prediction are
@@ -137,9 +138,9 @@ def _posterior_mean_shifts(
 ) -> FloatArray:
     """Return the shift of the shape's posterior mean by each error of one sd, (n_params, n_errors)."""
     shape, n_sensor = experiment.shape, int(experiment.shape_columns[0])
-    columns = np.arange(len(mean))
+    likely, columns = shape, np.arange(len(mean))
     if isinstance(shape, AnyOf):
-        columns = shape.prior.columns[shape.shape_names.index(likely_shape)]
+        likely, columns = shape.shapes[likely_shape], shape.prior.columns[shape.shape_names.index(likely_shape)]
     own = np.arange(n_sensor, n_sensor + len(columns))
     thetas, weights, by_error, by_shape = [], [], [], []
     kinds = zip(posterior.kinds, posterior.particles, posterior.probability.tolist(), strict=True)
@@ -147,7 +148,8 @@ def _posterior_mean_shifts(
         if probability < _LEAST or kind.shape not in ("", likely_shape):
             continue
         some = particles.weighted.weight > 0
-        theta = particles.weighted.theta[some]
+        theta = particles.weighted.theta[some].copy()
+        theta[:, own] = with_angles_near(likely, theta[:, own], mean[columns])
         thetas.append(theta[:, own])
         weights.append(probability * particles.weighted.weight[some])
         by_error.append(_log_likelihood_slopes_by_error(kind, theta, recording, off, dark))

@@ -130,7 +130,7 @@ def step(
         carried = experiment.inference_method.updated(state.posterior, problem.recording, rng=rng)
     wary = carried.with_warier_odds
     posterior = wary.joined(rng=rng)
-    if experiment.trust < 1 and _may_stop_and_chance_off(experiment, posterior, None, "", rng)[0]:
+    if _may_stop_and_chance_off(experiment, posterior, None, "", rng)[0]:
         carried = experiment.inference_method.reconsidered(carried, problem.recording, rng=rng)
         wary = carried.with_warier_odds
         posterior = wary.joined(rng=rng)

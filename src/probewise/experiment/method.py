@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from probewise._arrays import FloatArray
+from probewise.experiment.lost_modes import with_lost_modes_found
 from probewise.experiment.posterior import Posterior
 from probewise.experiment.posterior_update import updated, with_rivals_sampled_again
 from probewise.experiment.sampled_anew import FromScratch
@@ -43,9 +44,9 @@ class Method(Protocol):
         ...
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Return the posterior with rivals sampled again whose samples may have lost the truth.
+        """Return the posterior with kinds sampled again whose samples may have lost the truth.
 
-        It is called before a run that doubts its sensor ends.
+        It is called before a run ends.
         """
         ...
 
@@ -84,10 +85,17 @@ class SequentialMonteCarlo:
         return updated(previous, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng))
 
     def reconsidered(self, posterior: Posterior, recording: Recording, *, rng: np.random.Generator) -> Posterior:
-        """Return the posterior with rivals sampled again whose samples may have lost the truth."""
-        return with_rivals_sampled_again(
-            posterior, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng)
-        )
+        """Return the posterior with kinds sampled again whose samples may have lost the truth.
+
+        The check for lost modes has a generator of its own, so that a run in which it finds none goes on as without it.
+        """
+        own = rng.spawn(1)[0]
+        if any(kind.left_out for kind in posterior.kinds):
+            posterior = with_rivals_sampled_again(
+                posterior, recording, self.n_particles, rng=rng, from_scratch=self._solver_from_scratch(rng)
+            )
+        problems = [kind.problem(recording) for kind in posterior.kinds]
+        return with_lost_modes_found(posterior, problems, rng=own, from_scratch=self._solver_from_scratch(own))
 
     def _solver_from_scratch(self, rng: np.random.Generator) -> FromScratch:
         """Return the function that solves a problem by nested sampling."""

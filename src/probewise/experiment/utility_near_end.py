@@ -25,7 +25,7 @@ from probewise.experiment.checking import (
 from probewise.experiment.configuration import MOST_OFF, Experiment
 from probewise.experiment.pace import Pace
 from probewise.experiment.posterior import Posterior
-from probewise.experiment.stopping_rule import OFF_SDS
+from probewise.experiment.stopping_rule import OFF_SDS, shape_samples
 from probewise.inquiry import UtilityInput, UtilityMap, entropy_bits
 from probewise.inquiry.given_reading import GivenReading
 from probewise.recordings.plan import Plan
@@ -130,7 +130,7 @@ def _map_of_candidates(
 
 def _mean_shape_theta(experiment: Experiment, utility_input: UtilityInput) -> FloatArray:
     """Return the posterior mean of the shape's parameters, (1, n_params)."""
-    theta = utility_input.theta[:, experiment.shape_columns]
+    theta = shape_samples(experiment, utility_input.theta, utility_input.weight)
     return np.asarray((utility_input.weight @ theta)[None] / utility_input.weight.sum())
 
 
@@ -145,15 +145,16 @@ def _draw_theta_lengths_weights(
     asked = np.where(probability > _COUNTS, probability**_FAIRNESS, 0.0)
     counts = np.where(asked > 0, np.maximum(_HYPOTHESES * asked / asked.sum(), least), 0).astype(int)
     columns = np.array(experiment.goal.columns) if experiment.goal is not None else np.empty(0, dtype=int)
-    theta, lengths, weight = [], [], []
+    theta, whole, weight = [], [], []
     for kind, particles, n, p in zip(posterior.kinds, posterior.particles, counts, probability, strict=True):
         own = particles.weighted.samples(int(n), rng=rng) if n else np.empty((0, len(kind.prior.names)))
         theta.append(own)
         if n:
-            lengths.append(kind.to_whole_theta(own, rng)[:, columns])
+            whole.append(kind.to_whole_theta(own, rng))
             weight.append(np.full(n, p / n))
     share = np.concatenate(weight)
-    return theta, np.concatenate(lengths), share / share.sum()
+    shapes = shape_samples(experiment, np.concatenate(whole), share)
+    return theta, shapes[:, columns - experiment.shape_columns[0]], share / share.sum()
 
 
 def _candidate_designs(

@@ -23,6 +23,7 @@ from probewise.scene.regions import (
 )
 from probewise.scene.scenes import HypothesisScene, KnownScene
 from probewise.scene.shapes import SHAPES, AnyOf, Circle, Ellipse, Field, PlacedPrior, Rectangle, RegularPolygon
+from probewise.scene.symmetry import mean_angles, with_angles_near
 
 __all__ = [
     "SHAPES",
@@ -52,8 +53,10 @@ __all__ = [
     "UniformRegion",
     "disc_region",
     "edge_distance",
+    "mean_angles",
     "outlines",
     "region_of",
+    "with_angles_near",
 ]
 
 Placed = PlacedPrior

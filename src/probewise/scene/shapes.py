@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -20,6 +21,25 @@ from probewise.scene.albedo import Region, Shape, require_shape
 from probewise.scene.regions import EllipseRegion, MixtureOfRegions, PolygonRegion, UniformRegion, disc_region
 
 Bounds = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A symmetry: turned by `by_rad`, parameter number `angle`, a shape is the same with the two sides `swapped`."""
+
+    by_rad: float
+    angle: int
+    swapped: tuple[int, int] | None = None
+
+
+@runtime_checkable
+class HasTurn(Protocol):
+    """A shape with an angle, which is the same shape after a turn."""
+
+    @property
+    def turn(self) -> Turn:
+        """The smallest such turn."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -173,6 +193,8 @@ class Ellipse:
     semi_axes_mm: Bounds = (20.0, 150.0)
     inside: bool = False
 
+    turn: ClassVar[Turn] = Turn(np.pi, angle=4)
+
     def __post_init__(self) -> None:
         reach = 1.0 if self.inside else None
         _require_bounds_fit_field("Ellipse", "semi_axes_mm", self.semi_axes_mm, self.field, reach=reach)
@@ -208,6 +230,8 @@ class Rectangle:
     field: Field = Field()
     sides_mm: Bounds = (40.0, 300.0)
     inside: bool = False
+
+    turn: ClassVar[Turn] = Turn(np.pi / 2, angle=4, swapped=(2, 3))
 
     def __post_init__(self) -> None:
         reach = 1 / math.sqrt(2) if self.inside else None
@@ -249,6 +273,11 @@ class RegularPolygon:
         own = Product({"radius_mm": Uniform(*self.radius_mm), "angle_rad": Uniform(0.0, 2 * np.pi / self.n_sides)})
         # The circumscribed circle: slightly more room than a polygon needs, the same on all sides.
         return PlacedPrior(self.field, own, _half_extent_of_circle if self.inside else None)
+
+    @property
+    def turn(self) -> Turn:
+        """One corner to the next."""
+        return Turn(2 * np.pi / self.n_sides, angle=3)
 
     def region(self, theta: FloatArray) -> PolygonRegion:
         """Build a polygon for each hypothesis, theta (n_samples, 4)."""

@@ -1,0 +1,46 @@
+"""A last check before a run ends: nested sampling on all readings looks for what the samples have lost.
+
+Samples that are carried from reading to reading follow the modes that they have. One that held a percent of the
+posterior after six readings may hold all of it after ten; if its last samples died between, nothing brings it back, and
+the rest is narrow and wrong.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from probewise.experiment.doubtful_evidence import HAS_A_SAY, TOLD_APART, with_bridged_evidence
+from probewise.experiment.particles import particles_from_posterior
+from probewise.experiment.posterior import Posterior
+from probewise.experiment.sampled_anew import FromScratch, search_from_scratch
+from probewise.inference.problem import SensorProblem
+
+_CHECKED_FOR = 5  # readings that a check is good for, if the samples follow them with ease
+
+
+def with_lost_modes_found(
+    posterior: Posterior, problems: list[SensorProblem], *, rng: np.random.Generator, from_scratch: FromScratch
+) -> Posterior:
+    """Return the posterior with modes that its samples had lost; as it is if they had lost none.
+
+    Every probable shape is searched, with the sensor as it is. `problems` are those of the kinds, given all readings.
+    Samples are replaced if the evidence of those found is larger by more than the errors of both.
+    """
+    particles, n_readings = list(posterior.particles), len(problems[0].recording)
+    for k, (kind, probability) in enumerate(zip(posterior.kinds, posterior.probability.tolist(), strict=True)):
+        own, problem = particles[k], problems[k]
+        is_recent = n_readings < own.searched_at + _CHECKED_FOR and not (own.strained or own.hurried)
+        if kind.left_out or probability < HAS_A_SAY or is_recent:
+            continue
+        particles[k] = own = replace(own, searched_at=n_readings)
+        n = len(own.ancestor)
+        anew = search_from_scratch(problem, own.weighted, n, -math.inf, rng, from_scratch)
+        if anew.samples is None or anew.samples.log_z < own.log_z + TOLD_APART:
+            continue
+        fresh = with_bridged_evidence(particles_from_posterior(anew.samples, n, problem, rng=rng), problem, rng)
+        if fresh.log_z > own.log_z + TOLD_APART:
+            particles[k] = replace(fresh, searched_at=n_readings, refitted=True)
+    return replace(posterior, particles=tuple(particles))

@@ -1,0 +1,56 @@
+"""Parameters that describe the same shape: an angle counts within its symmetry, and a turn may swap two sides."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from probewise._arrays import FloatArray, IntArray
+from probewise.scene.albedo import Shape
+from probewise.scene.shapes import AnyOf, HasTurn, Turn
+
+
+def mean_angles(shape: Shape, theta: FloatArray, weight: FloatArray) -> FloatArray:
+    """Return the circular mean of each angle of a shape, (n_params,); NaN for what is not an angle.
+
+    `theta` (n_samples, n_params) are weighted samples, `weight` (n_samples,). For a set of shapes, each angle's mean is
+    taken over the samples of its own shape.
+    """
+    out = np.full(theta.shape[1], np.nan)
+    for rows, columns, turn in _turns(shape, theta):
+        phase = np.exp(2j * math.pi * theta[rows, columns[turn.angle]] / turn.by_rad)
+        out[columns[turn.angle]] = float(np.angle(weight[rows] @ phase)) % (2 * math.pi) * turn.by_rad / (2 * math.pi)
+    return out
+
+
+def with_angles_near(shape: Shape, theta: FloatArray, angles_rad: FloatArray) -> FloatArray:
+    """Return samples of the same shapes, (n_samples, n_params), with each angle within half a turn of a given one.
+
+    Mean, sd and quantiles of the result are meaningful where those of the samples as drawn are not: an angle of 0.01
+    and one of pi - 0.01 are nearly the same ellipse. `angles_rad` is (n_params,); NaN leaves a column as it is.
+    """
+    out = theta
+    for rows, columns, turn in _turns(shape, theta):
+        near = angles_rad[columns[turn.angle]]
+        turns = np.round((theta[rows, columns[turn.angle]] - near) / turn.by_rad) if np.isfinite(near) else np.zeros(1)
+        if not turns.any():
+            continue
+        out = theta.copy() if out is theta else out
+        out[rows, columns[turn.angle]] -= turns * turn.by_rad
+        if turn.swapped is not None:
+            odd = rows[turns % 2 == 1]
+            sides = columns[list(turn.swapped)]
+            out[np.ix_(odd, sides)] = out[np.ix_(odd, sides[::-1])]
+    return out
+
+
+def _turns(shape: Shape, theta: FloatArray) -> list[tuple[IntArray, IntArray, Turn]]:
+    """List rows, columns and symmetry of each shape among the samples that has an angle."""
+    if isinstance(shape, AnyOf):
+        which = shape.shape_index(theta)
+        parts = zip(shape.shapes.values(), shape.prior.columns, strict=True)
+        found = [(np.flatnonzero(which == k), columns, part) for k, (part, columns) in enumerate(parts)]
+    else:
+        found = [(np.arange(len(theta)), np.arange(theta.shape[1]), shape)]
+    return [(rows, columns, part.turn) for rows, columns, part in found if rows.size and isinstance(part, HasTurn)]

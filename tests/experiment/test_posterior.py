@@ -1,6 +1,7 @@
 """Kinds of hypotheses weighed against each other at every reading, against sums over a lattice of all hypotheses."""
 
 import math
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.special import logsumexp
 
 from probewise.arm.instrument import Pose, Reading
 from probewise.errors import NotConvergedError
+from probewise.experiment.lost_modes import with_lost_modes_found
 from probewise.experiment.method import nested_sampling_from_scratch
 from probewise.experiment.posterior import prior_posterior
 from probewise.experiment.posterior_update import updated
@@ -150,3 +152,42 @@ def test_readings_that_no_kind_allows_are_refused(small):
             rng=random,
             from_scratch=partial(nested_sampling_from_scratch, n_live=experiment.n_live, rng=random),
         )
+
+
+def last_of(small, n=4):
+    """The posterior of one kind, large circles, given some readings; and its problem."""
+    experiment = small.experiment(
+        shape=small.circle((20.0, 150.0)),
+        model=small.sensor(),
+        likelihood=small.gaussian(4.0),
+        noise_sd=4.0,
+        n_particles=1000,
+    )
+    *_, now = followed(experiment, n)
+    return now, [kind.problem(experiment.problem(readings(n)).recording) for kind in now.kinds]
+
+
+def checked(now, problems):
+    from_scratch = partial(nested_sampling_from_scratch, n_live=200, rng=rng(1))
+    return with_lost_modes_found(now, problems, rng=rng(2), from_scratch=from_scratch)
+
+
+def test_a_mode_that_the_samples_lost_is_found_before_a_run_ends(small):
+    """The samples are confined to the fiftieth of the posterior with the largest radii: ln Z is ln 50 too small."""
+    now, problems = last_of(small)
+    (whole,) = now.particles
+    theta, weight = whole.weighted.theta, whole.weighted.weight
+    kept = theta[:, 2] >= np.quantile(theta[:, 2], 0.98)
+    log_weight = np.where(kept, np.log(np.maximum(weight, 1e-300)) - math.log(weight[kept].sum()), -np.inf)
+    few = replace(whole.weighted, log_weight=log_weight, log_z=whole.log_z - math.log(50.0))
+    found = checked(replace(now, particles=(replace(whole, weighted=few),)), problems).particles[0]
+    assert found.log_z == pytest.approx(whole.log_z, abs=0.5)
+    away = np.abs(found.weighted.mean() - whole.weighted.mean()) / whole.weighted.sd()
+    assert (away < 0.4).all()
+
+
+def test_samples_that_lost_nothing_stay_as_they_are(small):
+    now, problems = last_of(small)
+    again = checked(now, problems)
+    assert again.particles[0].weighted is now.particles[0].weighted
+    assert checked(again, problems).particles[0] is again.particles[0]  # it was checked just now

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from probewise.effects import VOCABULARY
+from probewise.effects import VOCABULARY, HeightGradient, HeightOffset, SensorTilt, SlowSinking
 from probewise.recordings import Disc, HalfPlane, Instrumentation, Plan, Quadrant, Uniform
 from probewise.scene import KnownScene
 from probewise.sensor import Chain, FixedLevels, FixedMixture, Stage
@@ -230,6 +230,33 @@ def test_an_effect_agrees_with_pixels(name):
     np.testing.assert_allclose(found[2], found[0], atol=1e-9)
     np.testing.assert_allclose(model.predict(theta[:1], PLAN)[0], found[0], atol=1e-7)
     assert np.abs(found[0] - chain().predict(np.zeros((1, 0)), PLAN)[0]).max() > 0.3
+
+
+HEIGHTS = np.append(np.linspace(8.0, 22.0, 15), H0)  # the last is not commanded
+
+
+@pytest.mark.parametrize(
+    ("effect", "values", "rival"),
+    [
+        (HeightGradient(), (0.1,), Rival(height=lambda k: HEIGHTS[k] + 0.1 * X[k])),
+        (HeightOffset(scans=("b",)), (1.5,), Rival(height=lambda k: HEIGHTS[k] + 1.5 * in_scan(1)(k))),
+        (SlowSinking(), (3.0,), Rival(height=lambda k: HEIGHTS[k] + 3.0 * T[k] / 3600 * H0)),
+        (
+            SensorTilt(),
+            (0.9, -1.3),
+            Rival(
+                height=lambda k: HEIGHTS[k],
+                place=lambda k, x, y: (x + 0.9 * HEIGHTS[k] / H0, y - 1.3 * HEIGHTS[k] / H0),
+            ),
+        ),
+    ],
+    ids=lambda part: getattr(part, "name", ""),
+)
+def test_an_error_of_height_adds_to_the_commanded_height(effect, values, rival):
+    """And a tilt moves the spot in proportion to that height."""
+    raised = replace(PLAN, covariates={**PLAN.covariates, "height_mm": np.append(HEIGHTS[:-1], np.nan)})
+    found = chain(effect).predict(np.array([values]), raised)[0]
+    np.testing.assert_allclose(found, rival.readings(), atol=1e-4 * 50)
 
 
 def test_effects_of_scene_footprint_and_pose_stack_as_physics_does():

@@ -11,7 +11,7 @@ from probewise.effects.linear import LinearEffect, ScanGroupEffect, scans_in_wor
 from probewise.effects.motion import candidate_scan_groups, scan_indicator
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
-from probewise.sensor.commanded import footprint_at_height_ratio
+from probewise.sensor.commanded import footprint_at_added_height
 from probewise.sensor.stages import Footprint, Stage
 
 _USUAL_MM = 14.0  # the height assumed where a recording gives none
@@ -19,9 +19,10 @@ _USUAL_MM = 14.0  # the height assumed where a recording gives none
 
 @dataclass(frozen=True)
 class HeightGradient(LinearEffect[Footprint]):
-    """A table that slopes: height h = h0 + mm_per_mm X; footprint x h/h0, signal x (h0/h)^2.
+    """A table that slopes: mm_per_mm X adds to the height; footprint x h/h0, signal x (h0/h)^2.
 
-    h0 is the height in the recording's description, or 14 mm where it gives none.
+    h = h0 + mm_per_mm X with h0 of the recording's description, or 14 mm where it gives none; where a height is
+    commanded, h is that height + mm_per_mm X.
     """
 
     typical: float = 0.001
@@ -39,7 +40,7 @@ class HeightGradient(LinearEffect[Footprint]):
         return cls(typical=0.01 * _nominal_height_mm(extent.plan) / extent.length_mm)
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_height_ratio(value, 1 + theta[:, :1] * plan.x_mm / _nominal_height_mm(plan))
+        return footprint_at_added_height(value, theta[:, :1] * plan.x_mm / _nominal_height_mm(plan), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "grows" if mean[0] > 0 else "shrinks"
@@ -51,7 +52,10 @@ class HeightGradient(LinearEffect[Footprint]):
 
 @dataclass(frozen=True)
 class HeightOffset(ScanGroupEffect[Footprint]):
-    """One mounting or scan at another height: h = h0 + mm there; footprint x h/h0, signal x (h0/h)^2."""
+    """One mounting or scan at another height: mm adds to the height there; footprint x h/h0, signal x (h0/h)^2.
+
+    h0 and h are those of `HeightGradient`.
+    """
 
     typical_mm: float = 0.15
 
@@ -69,7 +73,8 @@ class HeightOffset(ScanGroupEffect[Footprint]):
         return cls(choices=choices, typical_mm=0.01 * _nominal_height_mm(extent.plan)) if choices else None
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_height_ratio(value, 1 + theta * scan_indicator(plan, self.scans) / _nominal_height_mm(plan))
+        added = theta * scan_indicator(plan, self.scans) / _nominal_height_mm(plan)
+        return footprint_at_added_height(value, added, plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "higher" if mean[0] > 0 else "lower"

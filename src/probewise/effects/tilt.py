@@ -10,12 +10,16 @@ from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
+from probewise.sensor.commanded import height_ratio
 from probewise.sensor.stages import Poses, Stage
 
 
 @dataclass(frozen=True)
 class SensorTilt(LinearEffect[Poses]):
-    """A tilt fixed in the lab frame: the footprint shifts by (dx_mm, dy_mm) = h tan(tilt) at any orientation."""
+    """A tilt fixed in the lab frame: the footprint shifts by (dx_mm, dy_mm) = h tan(tilt) at any orientation.
+
+    The shift is that at the description's height; it grows with a commanded one.
+    """
 
     typical_mm: float = 0.3
 
@@ -32,7 +36,11 @@ class SensorTilt(LinearEffect[Poses]):
         return cls(typical_mm=0.003 * extent.length_mm)
 
     def apply(self, value: Poses, theta: FloatArray, plan: Plan) -> Poses:
-        return replace(value, x_mm=value.x_mm + theta[:, :1], y_mm=value.y_mm + theta[:, 1:2])
+        dx_mm, dy_mm = theta[:, :1], theta[:, 1:2]
+        ratio = height_ratio(plan)
+        if ratio is not None:
+            dx_mm, dy_mm = dx_mm * ratio, dy_mm * ratio
+        return replace(value, x_mm=value.x_mm + dx_mm, y_mm=value.y_mm + dy_mm)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         return (

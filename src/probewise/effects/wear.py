@@ -12,7 +12,7 @@ from probewise.effects.extent import Extent
 from probewise.effects.linear import LinearEffect
 from probewise.effects.vocabulary import value_with_sd
 from probewise.recordings.plan import Plan
-from probewise.sensor.commanded import footprint_at_height_ratio
+from probewise.sensor.commanded import footprint_at_added_height
 from probewise.sensor.stages import Footprint, Poses, Stage
 
 
@@ -44,7 +44,7 @@ class SlowTurn(LinearEffect[Poses]):
 
 @dataclass(frozen=True)
 class SlowSinking(LinearEffect[Footprint]):
-    """The sensor sinks or rises: h/h0 = 1 + per_hour t; footprint x h/h0, signal x (h0/h)^2."""
+    """The sensor sinks or rises: per_hour t h0 adds to the height; footprint x h/h0, signal x (h0/h)^2."""
 
     typical_per_hour: float = 0.1
 
@@ -61,7 +61,7 @@ class SlowSinking(LinearEffect[Footprint]):
         return cls(typical_per_hour=0.01 / (extent.duration_s / 3600))
 
     def apply(self, value: Footprint, theta: FloatArray, plan: Plan) -> Footprint:
-        return footprint_at_height_ratio(value, 1 + theta[:, :1] * (plan.time_s / 3600))
+        return footprint_at_added_height(value, theta[:, :1] * (plan.time_s / 3600), plan)
 
     def sentence(self, mean: FloatArray, sd: FloatArray) -> str:
         way = "rises" if mean[0] > 0 else "sinks"

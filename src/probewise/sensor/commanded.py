@@ -69,6 +69,15 @@ def footprint_at_height_ratio(footprint: Footprint, ratio: FloatArray) -> Footpr
     return _scaled_footprint(footprint, np.clip(ratio, 0.1, 10.0))
 
 
+def footprint_at_added_height(footprint: Footprint, added: FloatArray, plan: Plan) -> Footprint:
+    """Add a height to the commanded one: `added` is a share of the description's h0, (n_samples or 1, n_points).
+
+    The footprint given is that at the commanded height h, so it is scaled by (h + added h0) / h.
+    """
+    commanded = height_ratio(plan)
+    return footprint_at_height_ratio(footprint, 1 + (added if commanded is None else added / commanded))
+
+
 def _scaled_footprint(footprint: Footprint, ratio: FloatArray) -> Footprint:
     k = ratio[:, :, None]
     return replace(

@@ -62,6 +62,11 @@ class Rows:
             edge_mm=edge_mm,
         )
 
+    def commanded(self, name: str, *, otherwise: float) -> FloatArray:
+        """Return a commanded column, `otherwise` where it is NaN or there is none, shape (n_points,)."""
+        column = self.covariates.get(name, np.full(len(self.time_s), np.nan))
+        return np.where(np.isfinite(column), column, otherwise)
+
     def in_scans(self, names: tuple[str, ...]) -> BoolArray:
         """Return whether each row belongs to one of these scans, shape (n_points,)."""
         chosen = [k for k, name in enumerate(self.scan_names) if name in names]

@@ -42,7 +42,7 @@ class View:
     seen
         Seen white fraction u, shape (n_points,).
     dimming
-        Factor on the signal, from the true height, shape (n_points,).
+        Factor on the signal, from the true height and the LED, shape (n_points,).
     rows
         Table of the readings with the sensor's true poses.
     """
@@ -69,7 +69,7 @@ class World:
     concealed
         Effects that a plain model leaves out. They act in the order of the stages; within a stage, as listed.
     height_mm
-        Height of the sensor at which the footprint and the levels hold.
+        Height of the sensor at which the footprint and the levels hold, and the usual one.
     """
 
     spot: Spot
@@ -129,18 +129,18 @@ class World:
             time_s=np.array([time_s]),
             scan=np.zeros(1, dtype=np.int64),
             scan_names=("",),
-            covariates={},
+            covariates={} if height_mm is None else {"height_mm": np.array([height_mm])},
             across=np.array([edge_normal(surface)]),
             edge_mm=distance_to_nearest_edge(surface, np.array([x_mm]), np.array([y_mm])),
         )
-        view = self._view_of_rows([(surface, np.zeros(1, dtype=np.int64))], rows, height_mm)
+        view = self._view_of_rows([(surface, np.zeros(1, dtype=np.int64))], rows)
         return float(self._recorded_readings(view, rng)[0])
 
     def view(self, plan: Plan, surfaces: Mapping[str, Surface] | None = None) -> View:
         """Compute what the sensor sees at each reading of a plan, by integrating light: the costly part of `expected`.
 
-        It does not depend on effects from the stage "response" on: a world that differs in those only may turn the same
-        view into readings.
+        The plan's columns `height_mm` and `led` are commands; at NaN the sensor is as usual. The view does not depend
+        on effects from the stage "response" on: a world that differs in those only may turn it into readings.
         """
         found = self._surfaces_with_rows(plan, surfaces)
         across, edge_mm = np.empty((len(plan), 2)), np.empty(len(plan))
@@ -206,12 +206,15 @@ class World:
         """
         return Recording(plan, self._recorded_readings(self.view(plan, surfaces) if view is None else view, rng))
 
-    def _view_of_rows(self, surfaces: _Surfaces, sent: Rows, height_mm: float | None = None) -> View:
+    def _view_of_rows(self, surfaces: _Surfaces, sent: Rows) -> View:
         place = self._apply_changes("place", sent.place_mm, sent)
         there = replace(sent, place_mm=place, orientation_rad=self._apply_changes("turn", sent.orientation_rad, sent))
         pattern = self._apply_changes("pattern", np.zeros_like(place), there)
-        center = place + self._apply_changes("tilt", np.zeros_like(place), there)
-        scale = self._apply_changes("height", np.full(len(place), height_mm or self.height_mm), there) / self.height_mm
+        height_mm = sent.commanded("height_mm", otherwise=self.height_mm)
+        # A tilt moves the spot in proportion to the height.
+        lever = (height_mm / self.height_mm)[:, None]
+        center = place + lever * self._apply_changes("tilt", np.zeros_like(place), there)
+        scale = self._apply_changes("height", height_mm, there) / self.height_mm
         if scale.min() <= 0:
             raise ParameterError("height_mm", float(scale.min() * self.height_mm), "greater than 0 at every reading")
         retouch = self._apply_retouches if any(isinstance(effect, Retouches) for effect in self.concealed) else None
@@ -231,7 +234,8 @@ class World:
                 seen[chosen] += part.share * white(part.spot, x_mm, y_mm)
         there = replace(there, edge_mm=edge_mm)
         # Illumination by the LED falls with the inverse square of the distance.
-        return View(self._apply_changes("seen", seen, there), scale**-2.0, there)
+        dimming = sent.commanded("led", otherwise=1.0) * scale**-2.0
+        return View(self._apply_changes("seen", seen, there), dimming, there)
 
     def _recorded_readings(self, view: View, rng: np.random.Generator | None) -> FloatArray:
         """Turn a view into readings with noise, rounding and losses; without `rng`, with rounding only."""

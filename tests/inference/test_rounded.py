@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
+from probewise.arm import ReadingScale
 from probewise.errors import ParameterError
 from probewise.inference import GaussianKnown, Rounded
 
@@ -26,6 +27,32 @@ def test_all_readings_together_have_mass_one():
     readings = np.arange(1.0, 101.0)
     each = [Rounded(0.4, 1.0, 1.0, 100.0).log_prob(np.array([r]), np.array([[37.3]]))[0] for r in readings]
     assert np.exp(each).sum() == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "step"),
+    [(1.0, 100.0, 3.0), (2.0, 101.0, 3.0), (-0.7, 4.9, 0.2), (0.0, 1.0, 0.3), (0.5, 3.5, 1.0), (1.5, 4.5, 1.0)],
+)
+@pytest.mark.parametrize("sd", [0.3, 1.5])
+def test_a_step_that_does_not_divide_the_scale_leaves_the_masses_those_of_the_sensor(low, high, step, sd):
+    """By brute force: the readings that the arm's scale makes of noisy values, about and beyond its ends too."""
+    scale, rounded = ReadingScale(low, high, step), Rounded(sd * step, step, low, high)
+    noise = norm.ppf((np.arange(4000) + 0.5) / 4000) * sd * step
+    predicted = np.concatenate([low + step * np.linspace(-2.0, 3.0, 7), high + step * np.linspace(-3.0, 2.0, 7)])
+    possible = np.unique([scale.convert(v) for v in np.linspace(low - 5 * step, high + 5 * step, 3001)])
+    masses = np.exp([rounded.log_prob(np.array([r]), predicted[:, None]) for r in possible])
+    for mass, level in zip(masses.T, predicted, strict=True):
+        read = np.array([scale.convert(v) for v in level + noise])
+        shares = [(np.abs(read - r) < 1e-9).mean() for r in possible]
+        np.testing.assert_allclose(mass, shares, atol=1e-3)
+        assert mass.sum() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_an_unrounded_reading_at_the_end_of_the_scale_covers_all_beyond():
+    """The cells' width only says how finely the others are told apart."""
+    fine = Rounded(1.0, 0.03, 0.0, 10.0, whole_steps=False)
+    found = fine.log_prob(np.array([10.0, 9.99]), np.array([[11.0, 10.5]]))
+    assert found == pytest.approx(norm.logcdf(1.015) + norm.logpdf(0.51) + np.log(0.03), abs=1e-3)
 
 
 def test_fine_steps_are_a_density_times_the_step():

@@ -192,7 +192,8 @@ def experiment_for(
         return pose(NaiveSensor(levels, scene), Naive(levels.i_min, sd, levels.i_max, sd), doubt_p=0.0)
     chain = chain_of(sensor, scene, estimated=trust < 1 and not learn_sensor)
     # Unrounded readings get cells scaled to the noise; the end cells are open.
-    likelihood = Rounded(noise_sd, scale.step or noise_sd / _CELLS_PER_SD, scale.low, scale.high)
+    step = scale.step or noise_sd / _CELLS_PER_SD
+    likelihood = Rounded(noise_sd, step, scale.low, scale.high, whole_steps=scale.step is not None)
     if learn_sensor:
         free = replace(chain, ssf=AdjustedMixture(sensor.mixture()), levels=FreeLevels())
         return pose(free, likelihood, sensor_prior=sensor_prior(sensor))
